@@ -10,9 +10,10 @@
     model = calib.identify_dynamics(fit.robot, "log.csv", validate="other.csv")
     calib.export(model, "calibrated/", urdf="robot.urdf")
 
-Every verb takes a file where it takes a value; results print themselves, convert (`to_dict`, `to_dataframe`), draw
-(`plot`) and write the folders that the commands write (`save`). Units are SI: m, rad, s, kg, N m. While a call runs,
-BLAS has one thread, which is fastest here; OPENBLAS_NUM_THREADS or OMP_NUM_THREADS, where set, count instead.
+Where a function takes a robot, measurements or a result, it also takes a file. Results can be printed, converted
+(`to_dict`, `to_dataframe`), drawn (`plot`) and written to the folders that the commands write (`save`). Units are SI:
+m, rad, s, kg, N m. During a call, BLAS uses one thread, which is fastest for the small matrices here; where
+OPENBLAS_NUM_THREADS or OMP_NUM_THREADS is set, that number of threads is used.
 """
 
 from __future__ import annotations
@@ -38,11 +39,11 @@ if TYPE_CHECKING:
     from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
     from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
     from calib.procedure.session.commands import new_session
-    from calib.results.registry import open_result
     from calib.results.result import Result
+    from calib.results.result_classes import open_result
     from calib.robot.calibrated import CalibratedChain
 
-# what `import calib` offers, and where it lives: loaded when first asked for, so that `calib --help` starts at once
+# names that `import calib` provides, and their modules, which are loaded at first use to keep `calib --help` fast
 _HOMES = {
     "api.reading": ("load", "read_poses", "read_recording"),
     "api.kinematic": ("select_poses", "fit_geometry", "PoseSelection", "GeometryFit"),
@@ -52,7 +53,7 @@ _HOMES = {
     "procedure.session.commands": ("new_session",),
     "apps.fleet.fleet": ("run_sessions",),
     "robot.calibrated": ("CalibratedChain",),
-    "results.registry": ("open_result",),
+    "results.result_classes": ("open_result",),
     "results.result": ("Result",),
     "apps.compensation.api": ("compensate", "JointCommands"),
     "apps.joining.joining": ("join",),

@@ -1,6 +1,6 @@
-"""Checks of the Python API's arguments by their annotations; the error for a wrong type names the argument.
+"""Checks of the Python API's arguments against their annotated types; the error for a wrong type names the argument.
 
-Loads nothing heavy: the command line builds default settings before it knows what it is asked for.
+The module imports nothing that loads slowly: the command line creates default settings before it knows the command.
 """
 
 import sys
@@ -27,16 +27,17 @@ _TABLE = "found a DataFrame: write it by frame.to_csv('table.csv', index=False) 
 
 
 def checked(target: C) -> C:
-    """Return a function or settings class that raises an error for arguments of a type other than annotated.
+    """Return a function or settings class that raises an error for arguments of a type other than the annotated one.
 
-    A function runs with one thread of BLAS, `calib.workers.threads`; one that takes `progress` shows it in notebooks,
-    in a line below the cell until it returns. Settings are read as an option file's table is,
-    see `calib.config.parse`; without arguments nothing is loaded for that.
+    A function runs with one BLAS thread (`calib.workers.threads`). If it has an argument `progress`, a notebook shows
+    the progress in a line below the cell until the function returns. Arguments of a settings class are checked by
+    `calib.config.parse`, as the keys of an option file are; this loads nothing where there are no arguments.
 
-    Numbers may be numpy's, and any sequence or array stands for a tuple; text is neither number nor sequence.
+    numpy numbers are accepted as numbers, and any sequence or array as a tuple. Text is neither a number nor a
+    sequence.
 
     Raises:
-        UsageError: when called: ``fit_geometry: settings: expected FitSettings or None, found 0.25``.
+        UsageError: at the call: ``fit_geometry: settings: expected FitSettings or None, found 0.25``.
     """
     function: Any = target
     if not isinstance(target, type):
@@ -96,7 +97,10 @@ def _checked(function: Any) -> Any:
 
 @contextmanager
 def _reporter(function_signature: Signature, arguments: Mapping[str, object]) -> Iterator[dict[str, object]]:
-    """Yield a notebook's reporter as an argument for a function that takes one and was given none; otherwise {}."""
+    """Yield the argument `progress` that shows progress in a notebook, as a dictionary.
+
+    The dictionary is empty for a function without this argument, for a call that has it, and outside notebooks.
+    """
     notebook = sys.modules.get("IPython")
     lacks_reporter = "progress" in function_signature.parameters and arguments.get("progress") is None
     if not lacks_reporter or notebook is None or not hasattr(notebook.get_ipython(), "kernel"):
@@ -128,7 +132,7 @@ def _refuse_other_types(
 
 
 def _fits(value: Any, hint: Any) -> bool:
-    """Return whether a value matches an annotated type; an annotation that states no type matches every value."""
+    """Return whether a value has an annotated type; annotations that are not types accept every value."""
     kind, inner = get_origin(hint), get_args(hint)
     if kind in (Union, UnionType):
         return any(_fits(value, alternative) for alternative in inner)

@@ -1,7 +1,7 @@
 """Reports of internal errors: one message, and a file to send to the developers.
 
-The file holds the command, versions, and where the program stood; of a person's data only what the error's own message
-quotes.
+The file contains the command, versions and the traceback. It contains no data of the user except what the error's
+message quotes.
 """
 
 import platform
@@ -18,7 +18,7 @@ from calib.errors import CalibError, brief
 
 # Exit code of an internal error.
 CODE = 4
-# Where a report goes; README says the same and, once there is a public address, Issues of [project.urls].
+# Address for reports, also in README and, once it is public, under Issues of [project.urls].
 TRACKER = "the issue tracker of the repository you cloned (git remote -v)"
 PACKAGES = ("armature-calib", "numpy", "scipy", "numba", "pin", "pydantic", "typer", "matplotlib", "clarabel")
 
@@ -29,7 +29,8 @@ def report(error: BaseException, command: Sequence[str], folder: Path | None = N
     Args:
         error: the error, with its traceback.
         command: the words after ``calib``.
-        folder: folder of the report; by default the current one, or the system's for temporary files.
+        folder: folder of the report; None takes the current folder or, if it cannot be written, the system's folder for
+            temporary files.
     """
     name = f"calib-bug-{datetime.now():%Y%m%d-%H%M%S}-{id(error) % 9973}.txt"
     content = "\n".join([f"calib {shlex.join(command)}", *_head(), "", *traceback.format_exception(error)])

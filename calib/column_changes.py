@@ -1,9 +1,9 @@
-"""Search for a small change of columns (sign, order, coupling) that explains the data far better.
+"""Search for a small change of columns (sign, order, coupling) with which a model explains the data much better.
 
-Columns of poses or recordings may be mislabelled: a sign, an exchange, a zero, a unit, the hand of the
-axes, a joint that counts from the horizontal instead of from the link before it, or that moves nothing measured. Each
-`Change` of a table is applied, the model's residuals on the changed data are compared with those on the data as
-recorded, and the best change is chosen.
+Columns of poses or recordings may be mislabelled. Possible errors are a sign, exchanged columns, a zero, a unit,
+left-handed axes, a joint that is measured from the horizontal instead of from the link before it, and a joint with no
+effect on the measurements. Each possible error is a `Change` in a table. Every change is applied to the data, the
+model's residuals are compared with those of the data as recorded, and the best change is chosen.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -16,10 +16,10 @@ from calib.errors import Finding, finding
 
 Data = TypeVar("Data")
 
-# Ratio of the residuals of two changes up to which nobody can tell which of them it is (our choice).
+# Largest ratio of the residuals of two changes that cannot be distinguished (our choice).
 MAX_RIVAL_RATIO = 1.2
-# Ratio up to which two changes explain the data equally but for rounding: a wrist joint's zero off by 180° reverses the
-# joint behind it. The change that stands first in the table counts (our choice).
+# Largest ratio of the residuals of two changes that differ by rounding only: a wrist joint's zero off by 180° has the
+# same effect as reversing the joint after it. The first change in the table is then chosen (our choice).
 MAX_TIE_RATIO = 1.0001
 
 
@@ -29,10 +29,10 @@ class Change(Generic[Data]):
 
     Attributes:
         code: code of the finding on this change.
-        make: maps the data as recorded to the changed data.
+        make: function from the data as recorded to the changed data.
         joints: indices of the joints concerned, from 0.
         values: further values of the finding.
-        max_left: the change is significant if it reduces the rms residual below this share.
+        max_left: largest share of the rms residual that may remain; the change is significant below this share.
     """
 
     code: str
@@ -47,9 +47,9 @@ class Explanation:
     """Changes of columns with which the model explains the data better than without.
 
     Attributes:
-        changes: one or more.
+        changes: the changes, one or more.
         before, after: (k,) mean squared residuals without and with the changes.
-        rival: another change that explains the data nearly as well as a single one; None if absent.
+        rival: another change that alone explains the data nearly as well; None if there is none.
     """
 
     changes: tuple[Change, ...]
@@ -59,12 +59,15 @@ class Explanation:
 
     @property
     def code(self) -> str:
-        """Code of the finding, from the first change."""
+        """Code of the finding, that of the first change."""
         return self.changes[0].code
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """Joints of all changes of the same kind as the first; a single change keeps their order."""
+        """Indices of the joints of all changes that have the code of the first change.
+
+        They are in rising order; those of a single change keep the order of the change.
+        """
         of_kind = [change.joints for change in self.changes if change.code == self.code]
         if len(of_kind) == 1:
             return of_kind[0]
@@ -72,11 +75,16 @@ class Explanation:
 
     @property
     def factor(self) -> float:
-        """Ratio of the rms residual with the changes to that without."""
+        """Ratio of the rms residual with the changes to the rms residual without."""
         return _share(self.after, self.before)
 
     def finding(self, names: Sequence[str], **values: object) -> Finding:
-        """Return the finding on these changes, with joint names and other values."""
+        """Return the finding on these changes.
+
+        Args:
+            names: names of all joints.
+            values: further values of the finding.
+        """
         joints = [names[j] for j in self.joints]
         details: dict[str, object] = {"joints": joints}
         if joints:
@@ -102,9 +110,9 @@ def best_changes(
     Args:
         data: the data as recorded.
         table: the changes to try.
-        left: maps data to (k,) mean squared residuals; if k > 1 their geometric mean is compared.
-        at_least: maps data to a quickly computed lower bound of `left`, by which hopeless changes are skipped; None
-            without one.
+        left: function from data to (k,) mean squared residuals; if k > 1 their geometric mean is compared.
+        at_least: function from data to a lower bound of `left` that is fast to compute, by which hopeless changes are
+            skipped; None if there is none.
         max_changes: largest number of changes to combine.
     """
     candidates = list(table)
@@ -137,7 +145,10 @@ def best_changes(
 
 
 class _Trial(NamedTuple):
-    """A change of columns that was tried: share of the rms residual that remains, and mean squared residuals (k,)."""
+    """A change of columns that was tried.
+
+    The fields are the share of the rms residual that remains, the change, and mean squared residuals (k,).
+    """
 
     share: float
     change: Change
@@ -150,7 +161,7 @@ def reversal(n: int, joint: int) -> np.ndarray:
 
 
 def standing(n: int, joint: int) -> np.ndarray:
-    """Return the matrix (n, n) that holds one of n columns at zero."""
+    """Return the matrix (n, n) that sets one of n columns to zero."""
     return np.diag(np.where(np.arange(n) == joint, 0.0, 1.0))
 
 
@@ -162,19 +173,22 @@ def exchange(n: int, first: int, second: int) -> np.ndarray:
 
 
 def coupling(n: int, joint: int, source: int, factor: float) -> np.ndarray:
-    """Return the matrix (n, n) that adds one of n columns, times `factor`, to another (coupled joints)."""
+    """Return the matrix (n, n) that adds `factor` times the column `source` to the column `joint` (coupled joints)."""
     matrix = np.eye(n)
     matrix[joint, source] = factor
     return matrix
 
 
 def couplings(n: int) -> list[tuple[int, int, float]]:
-    """Return the joints whose values may be relative to the previous joint: joint, previous joint, +1 or -1."""
+    """Return the possible couplings of each joint with the one before it: joint, previous joint, +1 or -1.
+
+    A joint's values may be relative to the previous joint.
+    """
     return [(joint, joint - 1, factor) for joint in range(1, n) for factor in (1.0, -1.0)]
 
 
 def assigned(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return each joint's column (n,) and sign (n,).
+    """Return the column (n,) and the sign (n,) of each joint with the smallest total cost; each column is used once.
 
     Args:
         cost: (2, n, n) cost of column k for joint j, unchanged and with reversed sign.

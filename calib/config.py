@@ -1,10 +1,10 @@
 """Option files: TOML read within size limits, checked against frozen dataclasses, with error messages of one form.
 
-A table of a file is a dataclass under `strict`; its fields are the keys, and their annotated types
-(`calib.config_types`) say what a key may hold, in which unit, and which words a complaint uses. pydantic does the
-checking. It is imported where a file is read and not before: 0.1 CPU seconds that ``calib --help`` and a fit without
-options need not wait for. Complaints read ``file: key: what was expected, what was found, did you mean …``. `schema`
-gives the same as a JSON schema.
+A table of a file is described by a dataclass with the decorator `strict`. The dataclass's fields are the keys. Their
+annotated types (`calib.config_types`) define allowed values, units, and the wording of error messages. pydantic
+performs the checks. It is imported only where a file is read, since the import takes 0.1 CPU seconds, which ``calib
+--help`` and a fit without options do not need. Error messages have the form ``file: key: what was expected, what was
+found, did you mean …``. `schema` returns the same description as a JSON schema.
 """
 
 import re
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 # A TOML file, or its content.
 Tables = str | Path | Mapping[str, object]
-# Levels of tables in tables, and bytes of a file (our choices).
+# Largest number of levels of nested tables, and largest size of a file in bytes (our choices).
 MAX_LEVELS = 32
 MAX_BYTES = 8_000_000
-# Expected types, by pydantic's names of errors.
+# Descriptions of expected types, by pydantic's names of errors.
 _PLAIN = {
     "float": "a number",
     "int": "a whole number",
@@ -38,10 +38,10 @@ _PLAIN = {
     "tuple": "a list",
     "too_short": "at least one number",
 }
-# Stands in a field's description for the texts that it may hold instead of its default.
+# Placeholder in a field's description, replaced by the texts that are allowed besides the default.
 OTHERS = "{others}"
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
-# Entry of a docstring: names, and their description.
+# Pattern of an entry in a docstring: names, and their description.
 _ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)
 
 
@@ -49,7 +49,7 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> ParsedT
     """Return the tables of the TOML file at `path`.
 
     Raises:
-        CalibError: of class `error`, for a file that is missing, too large, no TOML, nested too deeply, or with an
+        CalibError: of class `error`, for a file that is missing, too large, not TOML, nested too deeply, or has an
             integer of more than 64 bits.
     """
     from calib.files import check_regular
@@ -91,8 +91,8 @@ def parse(kind: type[T], table: object, where: str, error: type[CalibError] = Us
     """Return a parsed table as a checked instance of the dataclass `kind`.
 
     Args:
-        kind: a dataclass under `strict`.
-        table: lists and tables in it as tomllib makes them.
+        kind: a dataclass decorated with `strict`.
+        table: the table, with lists and tables of the types that tomllib returns.
         where: name of the table in messages.
         error: class of the errors raised.
 
@@ -111,8 +111,13 @@ def read(kind: type[T], source: Tables | None, name: str, foreign_tables: Collec
     """Return the parsed content of a TOML file or of its tables in memory, and its name for messages.
 
     Args:
-        name: name for messages, if `source` is no file.
-        foreign_tables: names of tables that another reader takes.
+        kind: the dataclass that describes the file.
+        source: the file, or its tables; None for empty tables.
+        name: name for messages, if `source` is not a file.
+        foreign_tables: names of tables that are ignored because another function reads them.
+
+    Raises:
+        CalibError: the content is invalid (see `parse`).
     """
     if source is None or isinstance(source, Mapping):
         tables, where = plain_values(source or {}), name
@@ -135,7 +140,7 @@ def plain_values(value: object) -> Any:
 
 
 def strict(kind: type[T]) -> type[T]:
-    """Make a dataclass the schema of a file's table: keys that are not its fields are refused."""
+    """Return a dataclass as the description of a file's table; keys that are not its fields are refused."""
     kind.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]
     return kind
 
@@ -148,7 +153,7 @@ def _adapter(kind: type[T]) -> "TypeAdapter[T]":
 
 
 def schema(kind: type, title: str) -> ParsedTable:
-    """Return the JSON schema (draft 2020-12) of files for the dataclass `kind`."""
+    """Return the JSON schema (draft 2020-12) of the files that the dataclass `kind` describes."""
     from pydantic.json_schema import GenerateJsonSchema
 
     json_schema = _for_toml(_adapter(kind).json_schema())
@@ -160,7 +165,7 @@ def schema(kind: type, title: str) -> ParsedTable:
 
 
 def _for_toml(json_schema: object) -> Any:
-    """Return a schema without nulls (TOML has none), hidden fields and redundant titles."""
+    """Return a JSON schema without null (TOML has none), hidden fields and redundant titles."""
     if isinstance(json_schema, list):
         return [_for_toml(item) for item in json_schema]
     if not isinstance(json_schema, dict):
@@ -194,11 +199,12 @@ def _for_toml(json_schema: object) -> Any:
 
 
 def inherited(table: Mapping[str, Any], kind: type) -> ParsedTable:
-    """Return a file's table whose ``[files.NAME]`` tables inherit missing keys from the table for all files.
+    """Return an option file's table in which ``[files.NAME]`` tables inherit missing keys from the table for all files.
 
     Args:
-        table: the file.
-        kind: the dataclass of one file; its fields are the keys that are handed down, tables key by key.
+        table: content of the option file.
+        kind: the dataclass that describes one file's table; its fields are the keys that are inherited, those of nested
+            tables key by key.
     """
     files = table.get("files")
     if not isinstance(files, Mapping):
@@ -228,7 +234,7 @@ def own_table(files: Mapping[str, T], path: str | Path) -> T | None:
 
 
 def described(source: object) -> dict[str, str]:
-    """Return the description of each argument or attribute from the docstrings of a function or class."""
+    """Return the description of each argument or attribute, from the docstring of a function or class."""
     descriptions: dict[str, str] = {}
     for base in reversed(getattr(source, "__mro__", (source,))):
         descriptions |= _entries(base.__doc__ or "")
@@ -239,7 +245,7 @@ def described(source: object) -> dict[str, str]:
 
 
 def _others(kind: type, key: str) -> list[str]:
-    """Return the texts that a key may hold instead of its default, in their order."""
+    """Return the texts that a key may have instead of its default, in their order."""
     default = getattr(kind, key)
     hint = get_type_hints(kind, include_extras=True)[key]
     for annotation in hint.__metadata__:
@@ -249,7 +255,7 @@ def _others(kind: type, key: str) -> list[str]:
 
 
 def _entries(docstring: str) -> dict[str, str]:
-    """Return names and descriptions under ``Args:`` or ``Attributes:``, without code marks."""
+    """Return names and descriptions under ``Args:`` or ``Attributes:`` of a docstring, without the marks of code."""
     parts = re.split("^(?:Args|Attributes):$", cleandoc(docstring), maxsplit=1, flags=re.M)
     if len(parts) == 1:
         return {}
@@ -267,18 +273,18 @@ def _entries(docstring: str) -> dict[str, str]:
 def check_keys(
     table: Mapping[str, object], keys: Collection[str], where: str, error: type[CalibError] = UsageError
 ) -> None:
-    """Raise an error for a key that is not in `keys`; its message suggests the most similar key."""
+    """Raise an error for a key of `table` that is not in `keys`; the message suggests the most similar key."""
     for key in table:
         if key not in keys:
             raise error(f"{where}: {_no_key(key, keys)}")
 
 
 def located(loc: Sequence[int | str], table: object = None) -> str:
-    """Return a file location in TOML notation: ``sigma.position``, ``files."a.csv".kind``, ``[[term]] number 2``.
+    """Return a location in a file in TOML notation: ``sigma.position``, ``files."a.csv".kind``, ``[[term]] number 2``.
 
     Args:
-        loc: keys, and indices in lists.
-        table: the file's content; tables in lists are named besides: ``[[joint]] number 2 ('elbow')``.
+        loc: keys, and indices in lists, from the outermost to the innermost.
+        table: the file's content. If it is given, tables in lists are also named: ``[[joint]] number 2 ('elbow')``.
     """
     result = ""
     content = table
@@ -302,7 +308,7 @@ def located(loc: Sequence[int | str], table: object = None) -> str:
 
 
 def _content(table: object, key: int | str) -> object:
-    """Return the value under a key of a table or at an index of a list; None where there is none."""
+    """Return the value of a key of a table, or at an index of a list; None if there is no such value."""
     if isinstance(table, Mapping):
         return table.get(key)
     if isinstance(table, (list, tuple)) and isinstance(key, int) and key < len(table):
@@ -316,7 +322,7 @@ def _no_key(key: str, keys: Collection[str]) -> str:
 
 
 def _complaint(errors: "list[ErrorDetails]", kind: type, source: str, parsed_table: object) -> str:
-    """Return the message for pydantic's first error; an unknown key takes precedence over a missing one."""
+    """Return the message for the first of pydantic's errors; an unknown key takes precedence over a missing one."""
     unknown = [error for error in errors if error["type"] == UNKNOWN]
     first = unknown[0] if unknown else errors[0]
     loc, name, value = tuple(first["loc"]), first["type"], first["input"]
@@ -353,17 +359,19 @@ def _complaint(errors: "list[ErrorDetails]", kind: type, source: str, parsed_tab
 
 
 def _without_index(loc: tuple[int | str, ...]) -> tuple[int | str, ...]:
-    """Return the location of the list of values that holds the value at a location."""
+    """Return a location without the indices at its end: the location of the list that contains the value."""
     while loc and isinstance(loc[-1], int):
         loc = loc[:-1]
     return loc
 
 
 def _fixed_length(kind: object, loc: Sequence[int | str], name: str) -> int:
-    """Return how many values the list of fixed length at a location has; 0 where there is no such list.
+    """Return the number of values of the fixed-length list at a location; 0 where there is no such list.
 
     Args:
-        loc: of an error; ``missing`` is that of the first value that the list lacks.
+        kind: the dataclass that describes the table.
+        loc: location of an error; for the error ``missing``, location of the first missing value of the list.
+        name: name of the error.
     """
     if name == "missing" and not isinstance(loc[-1], int):
         return 0
@@ -373,7 +381,7 @@ def _fixed_length(kind: object, loc: Sequence[int | str], name: str) -> int:
 
 
 def _keys(kind: object) -> list[str]:
-    """Return the keys of the table that a dataclass describes."""
+    """Return the keys of the table that the dataclass `kind` describes."""
     hints = get_type_hints(kind, include_extras=True)
     return [key for key, hint in hints.items() if Hidden() not in getattr(hint, "__metadata__", ())]
 
@@ -386,7 +394,7 @@ def _needed(kind: Any) -> str:
 
 
 def _type_at(kind: Any, loc: Sequence[int | str]) -> Any:
-    """Return the dataclass that describes the table at a location."""
+    """Return the type of the value at a location in the table that `kind` describes; for a table, its dataclass."""
     for part in loc:
         if is_dataclass(kind):
             kind = get_type_hints(kind)[str(part)]

@@ -1,7 +1,7 @@
 """Types of keys in option files: annotations of dataclass fields with bounds, units and messages.
 
-pydantic checks by them and `calib.config` makes its complaints readable; it is imported where a file is read and not
-before.
+pydantic checks values by these annotations, and `calib.config` converts its errors to readable messages. pydantic is
+imported only where a file is read.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ if TYPE_CHECKING:
 ParsedTable: TypeAlias = dict[str, Any]
 """A table of a TOML or JSON file as its parser returns it; who reads a value checks it."""
 
-# Pydantic's name of the error.
+# Pydantic's name of the error for an unknown key.
 UNKNOWN = "unexpected_keyword_argument"
-# Signs of an expression (our choice).
+# Largest number of characters of an expression (our choice).
 MAX_LETTERS = 200
-# Class of an operation, as `ast` has it, and its function of two values.
+# Class of an operation in `ast`, with its function of two values.
 Operations = Mapping[type[ast.operator], Callable[[Any, Any], Any]]
 _BINARY: Operations = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
 _NAMES = {"pi": math.pi, "inf": math.inf}
 
 
 class _Short(reprlib.Repr):
-    """Shortened texts of values, about one line each; dates as in TOML."""
+    """Shortened texts of values, about one line each; dates are written as in TOML."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -56,7 +56,7 @@ _SHORT = _Short()
 
 
 def shown(value: object) -> str:
-    """Return a value as text for messages, at most one line long."""
+    """Return the text of a value for messages, at most one line long."""
     try:
         return _SHORT.repr(value)
     except ValueError:
@@ -64,15 +64,18 @@ def shown(value: object) -> str:
 
 
 def number(value: object, place: str, quantity: str = "", error: type[CalibError] = UsageError) -> float:
-    """Return a number in SI, from a number of TOML or a text: an expression with pi, followed by a unit.
+    """Return a number in SI, read from a number in TOML or from a text.
+
+    A text is an expression, which may contain pi, followed by an optional unit.
 
     Args:
         value: ``0.4``, ``"-pi/2"``, ``"90 deg"``; infinite values are accepted.
         place: name of the value in messages.
-        quantity: a key of `calib.units.QUANTITIES`; "" for a plain number.
+        quantity: a key of `calib.units.QUANTITIES`; "" for a number without unit.
+        error: class of the errors raised.
 
     Raises:
-        CalibError: of class `error`, if the value is no number or has a unit of another quantity.
+        CalibError: of class `error`, if the value is not a number or has a unit of another quantity.
     """
     try:
         return _number(value, quantity)
@@ -83,7 +86,11 @@ def number(value: object, place: str, quantity: str = "", error: type[CalibError
 def numbers(
     value: object, count: int, place: str, quantity: str = "", error: type[CalibError] = UsageError
 ) -> tuple[float, ...]:
-    """Return a list of `count` numbers in SI; see `number`."""
+    """Return a list of `count` numbers in SI, each read by `number`.
+
+    Raises:
+        CalibError: of class `error`, if the value is not a list of so many numbers.
+    """
     if not isinstance(value, (list, tuple)) or len(value) != count:
         raise error(f"{place}: expected a list of {count} numbers, found {shown(value)}")
     return tuple(number(item, place, quantity, error) for item in value)
@@ -119,14 +126,15 @@ def _expression(text: str, quantity: str) -> float:
 
 
 def evaluated(node: ast.expr, names: Mapping[str, Any] = _NAMES, operations: Operations = _BINARY) -> Any:
-    """Return the value of an expression of numbers, names, signs and operations; refuse anything else.
+    """Return the value of an arithmetic expression of numbers, names, signs, operations and functions.
 
     Args:
-        names: values by name, and functions of one value.
-        operations: class of the operation, as `ast` has it → function of two values.
+        node: the parsed expression.
+        names: values by name, and functions of one argument.
+        operations: class of each operation in `ast`, with its function of two values.
 
     Raises:
-        ValueError: naming the invalid part of the expression.
+        ValueError: the expression contains anything else; the message is the invalid part.
     """
     inner = partial(evaluated, names=names, operations=operations)
     match node:
@@ -146,7 +154,7 @@ def evaluated(node: ast.expr, names: Mapping[str, Any] = _NAMES, operations: Ope
 
 
 def _float(value: object) -> float:
-    """Return a number of TOML as a float; NaN for anything else."""
+    """Return a TOML number as a float; NaN for any other value."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         return math.nan
     try:
@@ -156,14 +164,14 @@ def _float(value: object) -> float:
 
 
 class _Refused(ValueError):
-    """Error that states the expected and the given value."""
+    """Error whose message states the expected and the given value."""
 
     def __init__(self, expected: str, value: object, hint: str = "") -> None:
         super().__init__(f"expected {expected}, found {shown(value)}{hint and f'; {hint}'}")
 
 
 class _Read(ABC):
-    """Type of a key: pydantic passes the value to `read`, which returns it converted or raises an error."""
+    """Base class of key types; pydantic passes a value to `read`, which returns it converted or raises an error."""
 
     @abstractmethod
     def read(self, value: object) -> object: ...
@@ -186,13 +194,13 @@ class Real(_Read):
     """A finite number, converted to float.
 
     Attributes:
-        above, least, most: what it has to be above, and its least and largest values; beyond `most`, another unit is
-            suspected. With both `above` and `least` numbers between them are of another unit likewise.
-        unit: of `most`, for the complaint.
-        quantity: read texts with units of it, too, see `number`; "1" for texts without unit.
-        infinite: whether infinity counts.
-        zero: whether 0 counts beside all that.
-        words: what was expected; by default said from the bounds.
+        above, least, most: the number must be above `above`, and from `least` to `most`. Beyond `most`, and between
+            `above` and `least` if both are given, the error message suggests that the unit is wrong.
+        unit: unit of `most`, for the error message.
+        quantity: texts with units of this quantity are also read (see `number`); "1" for texts without unit.
+        infinite: True: infinity is allowed.
+        zero: True: 0 is allowed, even if it is outside the bounds.
+        words: description of the expected value in error messages; empty makes it from the bounds.
     """
 
     above: float | None = None
@@ -213,7 +221,7 @@ class Real(_Read):
         return result
 
     def _expected(self, value: float) -> str:
-        """Return a description of the expected number if it is out of bounds; empty otherwise."""
+        """Return a description of the expected number if `value` is out of bounds; empty otherwise."""
         finite = math.isfinite(value) or (self.infinite and not math.isnan(value))
         if not finite or (self.above is not None and value <= self.above):
             return "a number" if self.above is None else f"a number above {self.above:g}"
@@ -239,7 +247,7 @@ class Real(_Read):
 
 @dataclass(frozen=True)
 class Whole(_Read):
-    """A whole number from `least` to `most`; `start` is subtracted from it, and `of` names its unit in messages."""
+    """A whole number from `least` to `most`, from which `start` is subtracted; `of` names its unit in messages."""
 
     least: int = 0
     most: int = 2**63 - 1
@@ -262,7 +270,8 @@ class OneOf(_Read):
     """One of a few allowed texts; `hint` is added to the error message.
 
     Attributes:
-        allowed: the texts; or ``module:Name`` of the `Literal` that holds them, of a module that is loaded late.
+        allowed: the texts; or ``module:Name`` of a `Literal` with them, if the module is to be imported only when
+            needed.
     """
 
     allowed: tuple[str, ...] | str
@@ -270,7 +279,7 @@ class OneOf(_Read):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The accepted texts."""
+        """The allowed texts."""
         if not isinstance(self.allowed, str):
             return self.allowed
         module, _, name = self.allowed.partition(":")
@@ -278,7 +287,7 @@ class OneOf(_Read):
 
     @property
     def words(self) -> str:
-        """The texts as a list for messages; empty if they belong to a module loaded later."""
+        """The allowed texts as a list for messages; empty if they are given by the name of a module."""
         if isinstance(self.allowed, str):
             return ""
         return f"{', '.join(self.allowed[:-1])} or {self.allowed[-1]}"
@@ -296,7 +305,10 @@ class OneOf(_Read):
 
 @dataclass(frozen=True)
 class Expect:
-    """Description of the expected value, for error messages; numbers, texts and flags are not converted."""
+    """Description of the expected value for error messages.
+
+    Numbers, texts and flags of another type are not converted.
+    """
 
     words: str
 
@@ -314,7 +326,10 @@ class Expect:
 
 
 def _unconverted(inner_schema: Any) -> Any:
-    """Return pydantic's strict schema of a number, text, flag or list of them; nan and infinity are refused."""
+    """Return pydantic's schema of a number, text, flag or list of these, without conversion of types.
+
+    nan and infinity are refused.
+    """
     if inner_schema["type"] in ("int", "float", "str", "bool"):
         inner_schema["strict"] = True
     if inner_schema["type"] == "float":
@@ -326,11 +341,11 @@ def _unconverted(inner_schema: Any) -> Any:
 
 @dataclass(frozen=True)
 class Checked:
-    """A function applied to a value before the annotations to its left check it.
+    """A function that pydantic applies to a value before the annotations to the left of this one check it.
 
     Attributes:
-        read: raises `ValueError` with the error message.
-        json: JSON schema that replaces that of the annotations to its left.
+        read: function from the value to the value to be checked; raises `ValueError` with the error message.
+        json: JSON schema that replaces the schema of the annotations to the left; None keeps it.
     """
 
     read: Callable[[object], object]
@@ -340,7 +355,7 @@ class Checked:
         return self.around(handler(source))
 
     def around(self, inner: CoreSchema) -> CoreSchema:
-        """Return pydantic's schema `inner`, applied after the function."""
+        """Return pydantic's schema that applies the function, then checks the result by the schema `inner`."""
         from pydantic_core import core_schema as core
 
         return core.no_info_before_validator_function(self.read, inner)
@@ -351,7 +366,10 @@ class Checked:
 
 @dataclass(frozen=True)
 class Spread:
-    """One value for all, or a list, stored as a tuple; of length `count` if given."""
+    """One value, or a list of values, stored as a tuple.
+
+    If `count` is given, the list must have this length, and one value is repeated that often.
+    """
 
     count: int | None = None
     words: str = "a number, or a list with one per joint"
@@ -374,7 +392,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Hidden:
-    """A field that files cannot set: its name is an unknown key."""
+    """Annotation of a field that files cannot set: in a file, its name is an unknown key."""
 
     def __get_pydantic_core_schema__(self, source: object, handler: GetCoreSchemaHandler) -> CoreSchema:
         from pydantic_core import PydanticCustomError
@@ -391,7 +409,7 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Typed:
-    """Command-line form of a setting: the option's name, and the unit of its number (SI in Python)."""
+    """Form of a setting on the command line: the option's name, and the unit of its number (SI in Python)."""
 
     name: str = ""
     unit: str = ""
@@ -399,7 +417,7 @@ class Typed:
 
 @dataclass(frozen=True)
 class OneOrMany(_Read):
-    """A number, converted to float, or a list of numbers, converted to a tuple; the two differ in meaning."""
+    """A number, converted to float, or a list of numbers, converted to a tuple; the two have different meanings."""
 
     of: Real
 

@@ -1,7 +1,8 @@
-"""The exceptions of the toolkit, and findings: one base class, and subclasses with the data a caller needs.
+"""Exceptions of the toolkit, and findings: one base class, and subclasses with the data that a caller needs.
 
-Every message says what was found, where, and what to try. ``poses`` and ``trajectories`` import nothing from here and
-raise their own subclasses of `ValueError`. Also the small texts that messages share: lists, counts, commands.
+Every message states what was found, where, and what to try. The packages ``poses`` and ``trajectories`` do not import
+this module, and raise their own subclasses of `ValueError`. The module also has functions for short texts in messages:
+lists, counts, commands.
 """
 
 from __future__ import annotations
@@ -23,23 +24,23 @@ if TYPE_CHECKING:
     import numpy as np
 
 T = TypeVar("T")
-# Errors of a write, whatever the file.
+# Errors of writing that do not depend on the file, such as a full disk.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
-# Share of common letters from which on a name is suggested.
+# Smallest similarity (0 to 1) of a name that is suggested.
 SIMILAR = 0.6
-# Exit codes of wrong input, and of data that determine no result.
+# Exit codes for wrong input, and for data that do not determine a result.
 USAGE_CODE = 2
 NO_RESULT_CODE = 3
 
 
 @dataclass(frozen=True)
 class Finding:
-    """An observation about data or a result; its text is in the catalogue.
+    """An observation about data or a result; its text is in the catalogue ``calib/procedure/findings.toml``.
 
     Attributes:
-        code: in `calib.procedure.findings`.
-        values: what its rule and its sentence need [SI], as JSON holds them.
-        accepted: whether the options say that it is intended.
+        code: code of the finding in the catalogue.
+        values: values for its sentence and its limits [SI], of types that JSON has.
+        accepted: True where the options state that the finding is intended.
     """
 
     code: str
@@ -48,7 +49,7 @@ class Finding:
 
 
 def finding(code: str, **values: object) -> Finding:
-    """Return a finding with plain values: numpy numbers converted to Python's, sequences to tuples."""
+    """Return a finding with plain values: numpy numbers are converted to Python's, sequences to tuples."""
     return Finding(code, {name: _plain(value) for name, value in values.items()})
 
 
@@ -60,23 +61,27 @@ def _plain(value: object) -> object:
 
 
 class CalibError(Exception):
-    """Base class of all errors that this toolkit raises on purpose."""
+    """Base class of all errors that the toolkit raises for wrong input or data."""
 
 
 class CalibWarning(UserWarning):
-    """A warning that users of a result must read."""
+    """A warning about a result, which is shown even where other warnings are hidden."""
 
 
 class UsageError(CalibError):
-    """A wrong or contradictory command, option or options file."""
+    """Raised for a wrong or contradictory command, option or options file."""
 
 
 class RobotError(CalibError):
-    """A robot description that is unreadable or inconsistent."""
+    """Raised for a robot description that is unreadable or inconsistent."""
 
 
 class NoPosture(CalibError):
-    """Samples at which the loops do not close or the posture is singular; ``samples``: their indices from 0."""
+    """Raised where a parallel robot's loops do not close, or its posture is singular.
+
+    Attributes:
+        samples: indices of the samples concerned, from 0.
+    """
 
     def __init__(self, message: str, samples: Sequence[int] = ()):
         self.samples = tuple(samples)
@@ -84,11 +89,11 @@ class NoPosture(CalibError):
 
 
 class MeasurementError(CalibError):
-    """Measured data that contradict their description (columns, units, robot).
+    """Raised for measured data that contradict their description (columns, units, robot).
 
     Attributes:
-        file, row, column: where it was found; ``row`` counts data rows from 1 (the header is not a row), None where
-            the complaint is about the whole file.
+        file, row, column: location of the contradiction. ``row`` counts data rows from 1, without the header; it is
+            None where the message concerns the whole file.
     """
 
     def __init__(self, message: str, file: str | Path | None = None, row: int | None = None, column: str | None = None):
@@ -106,11 +111,12 @@ class MeasurementError(CalibError):
 
 
 class Unidentifiable(CalibError):
-    """Error: the data do not identify all parameters.
+    """Raised where the data do not identify all parameters.
 
     Attributes:
-        names: the parameters concerned.
-        singular_values: singular values of the column-scaled observation matrix, in falling order.
+        names: names of the parameters concerned.
+        singular_values: singular values of the column-scaled observation matrix, largest first; None where they are not
+            known.
     """
 
     def __init__(self, message: str, names: Sequence[str] = (), singular_values: np.ndarray | None = None):
@@ -119,7 +125,11 @@ class Unidentifiable(CalibError):
 
 
 class NotConverged(CalibError):
-    """Error: an iteration stopped before reaching its tolerance; ``last`` is its last estimate."""
+    """Raised where an iteration stopped before it reached its tolerance.
+
+    Attributes:
+        last: last estimate of the iteration.
+    """
 
     def __init__(self, message: str, last: object = None):
         self.last = last
@@ -127,19 +137,19 @@ class NotConverged(CalibError):
 
 
 class CannotSimulate(NotConverged):
-    """Robot parameters that cannot be simulated, nor any parameters near them."""
+    """Raised for robot parameters that cannot be simulated, where no parameters near them can be simulated either."""
 
 
 class Diverged(NotConverged):
-    """Error: the estimates of an iteration diverged."""
+    """Raised where the estimates of an iteration diverged."""
 
 
 class TaskLost(CalibError):
-    """A task whose worker process died at every attempt; the results of the other tasks are valid.
+    """Raised for a task whose worker process died at every attempt; the results of the other tasks are valid.
 
     Attributes:
         number: number of the task, from 0.
-        task: the argument of the function.
+        task: argument of the task's function.
     """
 
     def __init__(self, message: str, number: int = 0, task: object = None):
@@ -148,15 +158,15 @@ class TaskLost(CalibError):
 
 
 class SessionError(CalibError):
-    """A session folder that is busy, damaged, or in the wrong state for a command."""
+    """Raised for a session folder that is locked, damaged, or in the wrong state for a command."""
 
 
 class Busy(SessionError):
-    """A session folder that another command works on."""
+    """Raised for a session folder that another command is using."""
 
 
 def require(holds: object, message: str, kind: type[Exception] = CalibError, *details: object) -> None:
-    """Raise `kind(message, *details)` unless `holds` is true."""
+    """Raise `kind(message, *details)` if the condition `holds` is false."""
     if not holds:
         raise kind(message, *details)
 
@@ -167,17 +177,17 @@ def refuse_robot(where: object, message: str) -> NoReturn:
 
 
 def refuse_data(file: str | Path, message: str, column: str | None = None, row: int | None = None) -> NoReturn:
-    """Raise `MeasurementError` for a file or block of measured data, with its column or row (from 1)."""
+    """Raise `MeasurementError` for a file or block of measured data, with its column and row (from 1) if given."""
     raise MeasurementError(message, file, row, column)
 
 
 def refuse_option(where: object, message: str) -> NoReturn:
-    """Raise `UsageError` for an option, a command or an options file; `where` names it."""
+    """Raise `UsageError` for an option, a command or an options file, named by `where`."""
     raise UsageError(f"{where}: {message}")
 
 
 def one_of(name: T, choices: Collection[str], role: str, kind: type[Exception] = CalibError, *details: object) -> T:
-    """Return `name` if it is among `choices`, else raise ``role 'name' is not one of ... (did you mean ...?)``."""
+    """Return `name` if it is one of `choices`, else raise ``role 'name' is not one of ... (did you mean ...?)``."""
     if name not in choices:
         raise kind(f"{role} '{name}' is not one of {', '.join(choices)}{suggestion(str(name), choices)}", *details)
     return name
@@ -187,9 +197,10 @@ def one_of(name: T, choices: Collection[str], role: str, kind: type[Exception] =
 def refused_as(
     kind: type[Exception], kinds: type[BaseException] | tuple[type[BaseException], ...], message: str, *details: object
 ) -> Iterator[None]:
-    """Convert exceptions of `kinds` in the block to `kind(message, *details)`; ``{}`` in it: the original message.
+    """Convert exceptions of the classes `kinds` raised in the block to `kind(message, *details)`.
 
-    An error of the operating system says its reason without the file's name, which `details` or `message` have.
+    ``{}`` in `message` is replaced by the original message. For an error of the operating system, this is its reason
+    without the file name, which `details` or `message` contain.
     """
     try:
         yield
@@ -213,7 +224,7 @@ def command_line(*arguments: object, program: str = "calib") -> str:
 
 
 def brief(error: BaseException, max_length: int = 200) -> str:
-    """Return an error's message in one line of at most `max_length` characters."""
+    """Return the message of an error in one line of at most `max_length` characters."""
     message = " ".join(str(error).split())
     if len(message) <= max_length:
         return message
@@ -221,7 +232,7 @@ def brief(error: BaseException, max_length: int = 200) -> str:
 
 
 def suggestion(name: str, choices: Collection[str]) -> str:
-    """Return `` (did you mean '...'?)`` with the most similar of `choices`, or ""."""
+    """Return `` (did you mean '...'?)`` with the most similar of `choices`; "" if none is similar."""
     by_lower_case = {str(choice).lower(): choice for choice in choices}
     similar = difflib.get_close_matches(name.lower(), by_lower_case, 1, SIMILAR)
     if not similar:
@@ -230,7 +241,7 @@ def suggestion(name: str, choices: Collection[str]) -> str:
 
 
 def listing(names: Iterable[object], max_names: int = 12) -> str:
-    """Return the first `max_names` names separated by commas, and the number of further ones."""
+    """Return the first `max_names` names separated by commas, and the number of the others."""
     texts = [str(name) for name in names]
     result = ", ".join(texts[:max_names])
     if len(texts) > max_names:
@@ -239,7 +250,10 @@ def listing(names: Iterable[object], max_names: int = 12) -> str:
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
-    """Return a count with its noun, as ``1 pose`` or ``3 poses``; `plural` if it is not noun + s."""
+    """Return a count with its noun, such as ``1 pose`` or ``3 poses``.
+
+    `plural` is needed for nouns whose plural is not formed with s.
+    """
     if number != 1:
         noun = plural or f"{noun}s"
     return f"{number} {noun}"
@@ -247,7 +261,10 @@ def counted(number: int, noun: str, plural: str = "") -> str:
 
 @contextmanager
 def as_ours() -> Iterator[None]:
-    """Convert errors of ``poses`` and ``trajectories`` to errors of this toolkit, the original as cause."""
+    """Convert errors of ``poses`` and ``trajectories`` in the block to errors of this toolkit.
+
+    The original error is kept as the cause.
+    """
     try:
         yield
     except ValueError as error:
@@ -262,10 +279,12 @@ def as_ours() -> Iterator[None]:
 def complaint(error: Exception, arguments: Iterable[str] = ()) -> tuple[str, int] | None:
     """Return message and exit code of an expected error; None for an internal error.
 
-    Expected are this toolkit's errors, the operating system's for a named file or a full disk, and lack of memory.
+    Expected errors are those of this toolkit, those of the operating system for a named file or a full disk, and lack
+    of memory.
 
     Args:
-        arguments: of the command; the largest file among them is named where memory is lacking.
+        error: the error.
+        arguments: arguments of the command; for lack of memory, the message names the largest file among them.
     """
     code = exit_code(error)
     if code is not None:
@@ -286,7 +305,10 @@ def complaint(error: Exception, arguments: Iterable[str] = ()) -> tuple[str, int
 
 
 def _lack_of_memory(error: BaseException | None) -> BaseException | None:
-    """Return the error itself or the one behind it that says that memory was lacking, be it to load a library."""
+    """Return the error, or the one that caused it, that reports a lack of memory (also when loading a library).
+
+    None if there is no such error.
+    """
     while error and not (isinstance(error, MemoryError) or re.search("map segment|allocate memory", str(error))):
         error = error.__cause__ or error.__context__
     return error
@@ -294,9 +316,9 @@ def _lack_of_memory(error: BaseException | None) -> BaseException | None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Hide warnings of numpy, scipy, matplotlib and others from the console; show `CalibWarning`.
+    """Hide warnings of numpy, scipy, matplotlib and other libraries in the block; show `CalibWarning` at its end.
 
-    With CALIB_DEBUG everything passes.
+    With the environment variable CALIB_DEBUG all warnings are shown.
     """
     if os.environ.get("CALIB_DEBUG"):
         yield
@@ -310,7 +332,10 @@ def quiet() -> Iterator[None]:
 
 
 def exit_code(error: Exception) -> int | None:
-    """Return the exit code of this toolkit's errors: 3 if not identifiable or not converged, else 2; else None."""
+    """Return the exit code of an error of this toolkit; None for any other error.
+
+    It is 3 where data are not identifiable or a fit did not converge, else 2.
+    """
     if isinstance(error, (NotConverged, Unidentifiable)):
         return NO_RESULT_CODE
     if isinstance(error, CalibError):

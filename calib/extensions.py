@@ -1,14 +1,15 @@
-"""Extension points: where several packages add to one table, each loaded at first use.
+"""Extension points: named tables to which several packages add entries, each loaded at first use.
 
-A package directly below one of `HOSTS` adds by a table ``OFFERS`` in its ``__init__.py``: name of a point →
-``module:name`` below the package (``:name`` for the package itself, ``module:`` for a module), or several of them. The
-module that asks declares the point with the type of what is offered there::
+A package directly below one of `HOSTS` adds entries by a table ``OFFERS`` in its ``__init__.py``. The table maps the
+name of an extension point to ``module:name`` below the package (``:name`` for an object of the package itself,
+``module:`` for a module), or to several of these. The module that uses the entries declares the extension point with
+the type of its entries::
 
     METHODS: Point[Sequence[Method]] = Point("methods", "methods of identification")
     methods = [method for methods in METHODS.all() for method in methods]
 
-A name that is none of `POINTS` is refused when the tables are read. A package that is deleted takes its offers along;
-the rest works without.
+A name that is not one of `POINTS` is refused when the tables are read. If a package is deleted, its entries disappear
+and all others still work.
 """
 
 from __future__ import annotations
@@ -38,10 +39,10 @@ T = TypeVar("T")
 
 
 class Point(Generic[T]):
-    """A door: a typed extension point where packages add to the toolkit; `T` is the type of each offer.
+    """An extension point (called a door), to which packages add offers of type `T`.
 
     Attributes:
-        name: one of `POINTS`.
+        name: name of the extension point, one of `POINTS`.
         about: description of the offers.
     """
 
@@ -52,10 +53,10 @@ class Point(Generic[T]):
         self.about = about
 
     def all(self) -> list[T]:
-        """Return all offers, in the order of the packages' names; empty without any.
+        """Return all offers in the order of the packages' names; empty if there are none.
 
         Raises:
-            UsageError: where a table names a point that does not exist, or what it offers cannot be loaded.
+            UsageError: a table names an extension point that does not exist, or an offer cannot be loaded.
         """
         return [_load(package, place) for package, table in _offers().items() for place in table.get(self.name, ())]
 
@@ -63,7 +64,8 @@ class Point(Generic[T]):
         """Return the first offer.
 
         Raises:
-            UsageError: if there is no offer, or as for `all`.
+            UsageError: there is no offer, a table names an extension point that does not exist, or an offer cannot be
+                loaded.
         """
         for offer in self.all():
             return offer
@@ -72,13 +74,17 @@ class Point(Generic[T]):
 
 
 def merged(point: Point[Mapping[str, T]]) -> dict[str, T]:
-    """Return one table merged from the tables offered at a point."""
+    """Return one table that contains all entries of the tables offered at an extension point."""
     return {key: value for table in point.all() for key, value in table.items()}
 
 
 @cache
 def _offers() -> dict[str, dict[str, tuple[str, ...]]]:
-    """Return each package's table of offers, by the package's full name; refuse misspelt names of points."""
+    """Return the table of offers of each package, by the package's full name.
+
+    Raises:
+        UsageError: a table names an extension point that does not exist.
+    """
     tables = {}
     for name in _packages():
         table = getattr(_import(name), "OFFERS", {})
@@ -90,7 +96,7 @@ def _offers() -> dict[str, dict[str, tuple[str, ...]]]:
 
 
 def _packages() -> list[str]:
-    """Return the full names of the packages directly below one of `HOSTS`, sorted by their own names."""
+    """Return the full names of the packages directly below one of `HOSTS`, sorted by the last part of their names."""
     found = []
     for host in HOSTS:
         try:
@@ -118,4 +124,4 @@ def _import(module: str) -> Any:
         raise
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
-        raise UsageError(f"the extension {module} does not load: {reason}; mend it or remove its folder") from error
+        raise UsageError(f"the extension {module} does not load: {reason}; correct it or remove its folder") from error

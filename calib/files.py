@@ -1,4 +1,4 @@
-"""Atomic writing of files."""
+"""Atomic writing of files, checks of target files before work begins, and lock files."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ from calib.records import plain, shielded
 if TYPE_CHECKING:  # the commands' help is written without loading it
     import numpy as np
 
-# By which figures and recordings are known as ours.
+# Name of the program in the metadata of figures and recordings, by which its own files are recognised.
 MAKER = "armature-calib"
-# SHA-256 of the results in a folder, by name, as they were written.
+# File with the SHA-256 of each result in a folder when it was written, by file name.
 RESULTS = ".armature-calib.json"
-# Rows that are written at a time: of tables of anything, and of numbers.
+# Number of rows that are written at once: of general tables, and of tables of numbers.
 TABLE_CHUNK = 1000
 NUMBERS_CHUNK = 10_000
 
@@ -42,7 +42,10 @@ _staged: ContextVar[list[tuple[str, Path]] | None] = ContextVar("staged", defaul
 
 @contextmanager
 def together() -> Iterator[None]:
-    """Put all files written in the block into place at its end, or none of them if one cannot be written."""
+    """Write all files of the block, or none: they replace their targets at the end of the block only.
+
+    If one file cannot be written, no target is changed.
+    """
     if _staged.get() is not None:  # part of a larger whole
         yield
         return
@@ -63,7 +66,10 @@ def together() -> Iterator[None]:
 
 @contextmanager
 def results(targets: Results, inputs: Iterable[str | Path | None] = (), overwrite: bool = False) -> Iterator[None]:
-    """Write the block's files together as results: targets are checked (`check_results`), checksums recorded."""
+    """Write all files of the block, or none, as results.
+
+    The targets are checked by `check_results`, and checksums of the files are stored.
+    """
     check_results(targets, inputs, overwrite)
     with together():
         yield
@@ -82,12 +88,13 @@ def check_results(targets: Results, inputs: Iterable[str | Path | None] = (), ov
     """Raise an error, before any work is done, for target files that cannot be written, are inputs, or coincide.
 
     Args:
-        targets: files to be written, each with its allowed suffixes; an existing file is replaced if an earlier run
-            wrote it and it is unchanged since (by the checksums in `RESULTS`), or with `overwrite`.
-        inputs: input files.
+        targets: files to be written, each with its allowed suffixes. An existing file may be replaced if an earlier run
+            wrote it and it has not changed since (by the checksums in the file `RESULTS`).
+        inputs: input files; None is ignored.
+        overwrite: True allows to replace any existing file.
 
     Raises:
-        UsageError: with the file concerned.
+        UsageError: a target is refused; the message names the file.
     """
     inputs = tuple(inputs)
     for number, (target, suffixes) in enumerate(targets):
@@ -113,13 +120,15 @@ def _written(path: Path) -> dict[str, str]:
 
 @contextmanager
 def locked(path: Path, busy: str, kind: type[CalibError] = UsageError) -> Iterator[str]:
-    """Hold a lock file for the block; yield the name of the last holder if that process was killed, else "".
+    """Hold a lock file during the block, and yield the name of its last holder if that process was killed, else "".
 
-    The lock is the kernel's (flock), so that it ends with the process; the file says whose it is.
+    The lock is the operating system's (flock), so that it ends with the process. The file contains the name of the
+    process that holds it.
 
     Args:
-        busy: the message where another process holds it; ``{}`` stands for its name.
-        kind: of that error.
+        path: the lock file.
+        busy: message of the error where another process holds the lock; ``{}`` is replaced by the name of that process.
+        kind: class of that error.
     """
     import fcntl
 
@@ -146,12 +155,13 @@ def locked(path: Path, busy: str, kind: type[CalibError] = UsageError) -> Iterat
 
 
 def write(path: str | Path, content: str | bytes | Iterable[str]) -> Path:
-    """Write `content`, whole or in parts, to `path` by a temporary file in its folder and a rename (see `together`).
+    """Write `content`, whole or in parts, to `path`, by a temporary file in the same folder and a rename.
 
-    A killed process or a full disk leaves the old file as it was.
+    If the process is killed or the disk is full, the old file is unchanged. Within a block of `together`, the rename
+    takes place at the end of the block.
 
     Raises:
-        CalibError: where the folder is missing, read-only or full; nothing is left behind.
+        CalibError: the folder cannot be created, or is read-only or full; the temporary file is removed.
     """
     path = Path(path)
     temporary = None
@@ -192,12 +202,12 @@ def _encoded(content: str | bytes | Iterable[str]) -> Iterator[bytes]:
 
 
 def staged_name(path: Path) -> tuple[str, str]:
-    """Return prefix and suffix of the temporary file for `path`: the prefix contains the process id."""
+    """Return prefix and suffix of the temporary file for `path`; the prefix contains the process id."""
     return f".{path.name}.{os.getpid()}.", ".part"
 
 
 def clear_leftovers(path: Path) -> None:
-    """Remove temporary files of `path` from killed processes; those of running processes stay."""
+    """Remove temporary files for `path` that killed processes left; those of running processes are kept."""
     pattern = re.compile(rf"\.{re.escape(path.name)}\.(\d+)\.[^.]+\.part")
     for name in os.listdir(path.parent):
         match = pattern.fullmatch(name)
@@ -230,11 +240,11 @@ def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Seque
 
     Args:
         out: the file to write.
-        inputs: what is read; recordings may have their cut (``log.npz@0:9``).
-        suffixes: those that `out` may have; all without any.
+        inputs: input files, None ignored; the name of a recording may have a time range appended (``log.npz@0:9``).
+        suffixes: allowed suffixes of `out`; empty allows all.
 
     Raises:
-        UsageError: with the file concerned.
+        UsageError: the file is refused; the message names it.
     """
     require(not (_reached(out) and out.is_dir()), f"{out} is a folder; give a file to write to", UsageError)
     check_writable(out.absolute().parent, out)
@@ -244,10 +254,14 @@ def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Seque
 
 
 def check_writable(folder: Path, target: Path | None = None) -> None:
-    """Refuse, before any work is done, a folder that cannot be created or written to, for `target` (default: itself).
+    """Raise an error, before any work is done, for a folder that cannot be created or written to.
+
+    Args:
+        folder: the folder.
+        target: the file or folder to be written, named in the message; None names `folder`.
 
     Raises:
-        UsageError: with the target, the folder and the reason.
+        UsageError: the folder cannot be written; the message gives target, folder and reason.
     """
     nearest = folder
     for nearest in (folder, *folder.absolute().parents):
@@ -262,10 +276,11 @@ def check_writable(folder: Path, target: Path | None = None) -> None:
 
 
 def _reached(path: Path) -> bool:
-    """Return whether a file or folder exists at `path`; refuse an invalid path.
+    """Return whether a file or folder exists at `path`.
 
     Raises:
-        UsageError: for a link to nowhere or to itself, a name too long, a file taken for a folder.
+        UsageError: the path is invalid: a link to a missing file or to itself, a name too long, a file in place of a
+            folder.
     """
     try:
         path.stat()
@@ -284,11 +299,11 @@ def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]
 
     Args:
         targets: files to be written.
-        inputs: to be read, recordings with their cut (``log.npz@0:9``), too; names that are no path on the disk (robots
-            of the library), and None, are passed over.
+        inputs: input files and folders. The name of a recording may have a time range appended (``log.npz@0:9``). Names
+            that do not exist on the disk (robots of the library), and None, are ignored.
 
     Raises:
-        UsageError: with the file that is both.
+        UsageError: a target is an input; the message names it.
     """
     existing: list[Path] = []
     for path in inputs:
@@ -318,11 +333,11 @@ def check_regular(path: str | Path, streams: bool = False) -> None:
     """Raise an error if the path is a pipe or a device.
 
     Args:
-        path: of a file, or a folder.
-        streams: allow what a shell hands over (``<(command)``, ``/dev/stdin``): for what is read once.
+        path: path of a file or a folder.
+        streams: True allows streams from a shell (``<(command)``, ``/dev/stdin``), for files that are read only once.
 
     Raises:
-        OSError: with the reason.
+        OSError: the path is a pipe or a device, is missing, or its name is not UTF-8.
     """
     if str(path).encode(errors="ignore").decode() != str(path):
         raise OSError(errno.EILSEQ, "its name is not UTF-8: rename the file", str(path))
@@ -333,7 +348,7 @@ def check_regular(path: str | Path, streams: bool = False) -> None:
 
 
 def fingerprint(path: Path) -> str:
-    """Return the SHA-256 of a file in hex; the file is read again only if it changed."""
+    """Return the SHA-256 of a file in hex. The file is read again only if it changed since the last call."""
     status = path.stat()
     return _digest(path.absolute(), status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
@@ -351,7 +366,8 @@ def write_json(path: str | Path, value: object) -> Path:
     """Write a record (`calib.records`), or any nesting of records, mappings and lists, as indented JSON.
 
     Raises:
-        CalibError: for a number that is not finite, since JSON has none, with its place; nothing is written.
+        CalibError: a number is not finite, which JSON cannot represent; the message names its key, and nothing is
+            written.
     """
     value = plain(value)
     try:
@@ -367,7 +383,10 @@ def write_json(path: str | Path, value: object) -> Path:
 
 
 def _not_finite(value: object, path: str) -> Iterator[str]:
-    """Yield the paths of numbers that are not finite, as ``fit.nominal.position_mm.rms``."""
+    """Yield the names of numbers that are not finite, such as ``fit.nominal.position_mm.rms``.
+
+    `path` is the name of `value`.
+    """
     if isinstance(value, Mapping):
         for key, item in value.items():
             yield from _not_finite(item, f"{path}.{key}" if path else str(key))
@@ -381,11 +400,12 @@ def _not_finite(value: object, path: str) -> Iterator[str]:
 def write_table(
     path: str | Path, header: Sequence[str], rows: Iterable[Sequence[object]], notes: Sequence[str] = ()
 ) -> Path:
-    """Write a CSV table below comment lines `notes`; floats have 12 significant digits, None and NaN are empty.
+    """Write a CSV table below comment lines `notes`.
 
-    Cells with commas, quotes or line breaks are quoted, those of the header too: names come from people's files. So is
-    a whole header that would be taken for one with other separators, or for a comment. A text that a spreadsheet would
-    take for a formula (``=1+1``) gets an apostrophe before it (`calib.records.shielded`).
+    Floats have 12 significant digits; None and NaN are empty cells. Cells with commas, quotes or line breaks are
+    quoted, also in the header, since names may be taken from users' files. All cells of a header are quoted if it could
+    be mistaken for a header with other separators, or for a comment. A text that a spreadsheet would read as a formula
+    (``=1+1``) gets an apostrophe before it (`calib.records.shielded`).
     """
 
     def parts() -> Iterator[str]:
@@ -404,9 +424,13 @@ def write_table(
 def write_numbers(
     path: str | Path, header: Sequence[str], values: np.ndarray, names: Sequence[str] = (), notes: Sequence[str] = ()
 ) -> Path:
-    """Write values (N, k) as CSV, optionally with a name per row, twice as fast as `write_table`.
+    """Write values (N, k) as CSV, twice as fast as `write_table`.
 
     Args:
+        path: the file.
+        header: names of the columns.
+        values: the numbers.
+        names: names of the rows, written as first column; empty for no such column.
         notes: comment lines above the header.
     """
     line = ",".join(["%.12g"] * values.shape[1]) + "\n"
@@ -427,7 +451,7 @@ def write_numbers(
 
 
 def remarks(notes: Sequence[str]) -> str:
-    """Return lines as comments of a CSV, TOML or YAML file."""
+    """Return the lines `notes` as comments of a CSV, TOML or YAML file."""
     return "".join(f"# {note}\n" for note in notes)
 
 
@@ -454,14 +478,14 @@ def _headed(header: Sequence[str]) -> io.StringIO:
 
 
 def umask() -> int:
-    """Return the permission bits that new files of this process do not get (umask)."""
+    """Return the permission bits that are removed from new files of this process (umask)."""
     mask = os.umask(0)
     os.umask(mask)
     return mask
 
 
 def shipped_text(package: str, file: str) -> str:
-    """Return the text of a file that is shipped in a package."""
+    """Return the text of a file that is installed with a package."""
     from importlib import resources  # 3 ms
 
     return resources.files(package).joinpath(file).read_text(encoding="utf-8")

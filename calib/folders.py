@@ -1,7 +1,7 @@
-"""Folders of results: written completely to a temporary folder, then moved to their place.
+"""Folders of results: written completely to a temporary folder, then moved to their final path.
 
-Estimates in them, of geometry and of dynamics alike: ``estimate.csv``, a row per parameter, and ``covariance.csv``, a
-matrix by parameters' names.
+The module also reads and writes the estimates in them, of geometry and dynamics alike: ``estimate.csv`` has one row per
+parameter, ``covariance.csv`` is a matrix with parameter names.
 """
 
 import csv
@@ -32,7 +32,10 @@ OFFSETS, PARAMETERS = "joint_offsets.csv", "parameters.json"
 
 
 class InFolder:
-    """Attribute of a folder type: the path of a file in that folder (its ``path``), by the file's name."""
+    """Descriptor of a class for folders: the attribute's value is the path of a named file in the folder.
+
+    The class must have an attribute ``path``, the folder.
+    """
 
     def __init__(self, name: str):
         self.name = name
@@ -48,13 +51,14 @@ def check_target(
 
     Args:
         out: folder for the results.
-        ours: names, or patterns of them (``plot_torque_*.png``), of all files that may be written there.
+        ours: names, or patterns of names (``plot_torque_*.png``), of all files that may be written into the folder.
         marks: names of files by which an earlier result of this kind is recognised.
-        what: that kind, for messages.
-        inputs: what is read, recordings with their cut (``log.npz@0:9``), too; none of it is written over.
+        kind: name of this kind of result, for messages.
+        inputs: input files and folders, which must not be overwritten. The name of a recording may have a time range
+            appended (``log.npz@0:9``).
 
     Raises:
-        UsageError: with the file or folder concerned.
+        UsageError: the folder is refused; the message names the file or folder concerned.
     """
     if os.path.isfile(out):  # False for names that no file can have
         raise UsageError(f"{out} is a file; results go into a folder (--out)")
@@ -80,13 +84,13 @@ def files_of(folder: Path, ours: Collection[str]) -> list[str]:
 
 
 def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], object]) -> Path:
-    """Run `write` on a temporary folder next to `out`, then move its files to `out`.
+    """Call `write` with a temporary folder next to `out`, then move the files in it to `out`; return `out`.
 
-    A new folder appears complete. In a folder of an earlier run each file is replaced, further files that match `ours`
-    (names or patterns) are removed, and all others stay.
+    A new folder appears complete, by one rename. In a folder of an earlier run each file is replaced, other files that
+    match `ours` (names or patterns) are removed, and all remaining files are kept.
 
     Raises:
-        UsageError: if the disk refuses to write.
+        UsageError: the folder cannot be written.
     """
     requested = out
     try:
@@ -117,13 +121,21 @@ def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], objec
 
 
 def _move_files(staging: Path, out: Path, ours: Collection[str]) -> None:
-    """Replace the files of an earlier run one by one, the metrics last: their presence marks the folder as complete."""
+    """Replace the files of an earlier run one by one.
+
+    The metrics are replaced last, since their presence marks the folder as complete.
+    """
     fresh = sorted(path.name for path in staging.iterdir())
     with refused_as(UsageError, OSError, f"cannot write to {out}: {{}}"):
         for name in sorted(fresh, key=lambda name: name == METRICS):
+            if (staging / name).is_dir():
+                shutil.rmtree(out / name, ignore_errors=True)
             os.replace(staging / name, out / name)
         for name in set(files_of(out, ours)) - set(fresh):
-            (out / name).unlink(missing_ok=True)
+            if (out / name).is_dir():
+                shutil.rmtree(out / name)
+            else:
+                (out / name).unlink(missing_ok=True)
 
 
 ESTIMATE, COVARIANCE = "estimate.csv", "covariance.csv"
@@ -131,7 +143,7 @@ AGAIN = "fit, or identify, again"
 
 
 class EstimateRow(NamedTuple):
-    """A row of ``estimate.csv``; σ is None if not stated."""
+    """A row of ``estimate.csv``; sigma is None where the cell is empty."""
 
     name: str
     unit: str
@@ -144,10 +156,10 @@ def read_estimate(folder: Path) -> tuple[EstimateRow, ...]: ...
 @overload
 def read_estimate(folder: Path, kind: type[Row]) -> tuple[Row, ...]: ...
 def read_estimate(folder: Path, kind: type = EstimateRow) -> tuple[object, ...]:
-    """Return the rows of ``estimate.csv`` in a folder as named tuples `kind`, whose fields are columns.
+    """Return the rows of ``estimate.csv`` in a folder as named tuples `kind`, whose fields are the columns.
 
     Raises:
-        RobotError: where it is missing or damaged.
+        RobotError: the file is missing or damaged.
     """
     path = folder / ESTIMATE
     with refused_as(RobotError, (OSError, ValueError), f"{path} cannot be read ({{}}); {AGAIN}"):
@@ -155,7 +167,7 @@ def read_estimate(folder: Path, kind: type = EstimateRow) -> tuple[object, ...]:
 
 
 def write_covariance(path: Path, names: Sequence[str], covariance: np.ndarray) -> None:
-    """Write the covariance (p, p) of p names as a table with a header and a first column of names."""
+    """Write the covariance (p, p) of p named parameters as a CSV table with the names as header and as first column."""
     files.write_numbers(path, ("name", *names), covariance, names)
 
 
@@ -163,10 +175,10 @@ def read_covariance(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
     """Return p parameter names and their covariance (p, p).
 
     Args:
-        path: of the table, or of the folder that holds ``covariance.csv``.
+        path: path of the table, or of the folder that contains ``covariance.csv``.
 
     Raises:
-        RobotError: if the file is missing or damaged.
+        RobotError: the file is missing or damaged.
     """
     if path.is_dir():
         path = path / COVARIANCE

@@ -1,11 +1,12 @@
-"""Records: results stored by their type, and read back by the same type.
+"""Records: results that are stored as JSON or CSV according to their type, and read back by the same type.
 
-A record is a frozen dataclass (or named tuple) of numbers, texts, arrays and other records. `plain` turns it into what
-JSON holds, field by field under the fields' names; `read_record` turns that into an equal record. A new number is a new
-field: nothing else has to be written. What a record computes and readers of the file want is a `stored` property.
+A record is a frozen dataclass (or named tuple) of numbers, texts, arrays and other records. `plain` converts it to
+values that JSON has, with the field names as keys. `read_record` converts these values to an equal record. To store a
+further number, a field is added to the class; nothing else need be changed. A `stored` property is a value that a
+record computes and that is written for readers of the file.
 
-JSON has no NaN: arrays annotated `Array`, and numbers annotated `Number`, hold it as null; in any other field a number
-that is not finite is a mistake, which `calib.files.write_json`, the writer of all records, refuses. Arrays of records
+JSON has no NaN. In arrays annotated `Array` and numbers annotated `Number`, NaN is written as null. In any other field
+a number that is not finite is an error, raised by `calib.files.write_json`, which writes all records. Arrays of records
 are read-only (`Frozen`).
 """
 
@@ -35,20 +36,20 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 FieldValues: TypeAlias = dict[str, Any]
 """Values of fields of a record by name, to be passed on as keywords."""
-# What a spreadsheet's formula begins with, and our own mark.
+# Characters with which a spreadsheet's formula begins, and the apostrophe that `shielded` adds.
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")
 
 
 def shielded(text: str) -> str:
-    """Return a text as a table cell: with an apostrophe if a spreadsheet would read it as a formula.
+    """Return a text as a table cell: with an apostrophe before it if a spreadsheet would read it as a formula.
 
-    Numbers stay as they are.
+    Numbers are not changed.
     """
     return text if text[:1] not in _FORMULA or is_number(text) else f"'{text}"
 
 
 def field_values(record: DataclassInstance) -> FieldValues:
-    """Return the values of a dataclass's fields by name, as they are: for a record of a class that has more fields."""
+    """Return the values of a dataclass's fields by name, to create a record of a class with further fields."""
     return {field.name: getattr(record, field.name) for field in fields(record) if field.init}
 
 
@@ -58,11 +59,13 @@ def plain_text(cell: str) -> str:
 
 
 def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
-    """Return the rows of a CSV file as named tuples `kind`, whose fields are the columns; defaults may be missing.
+    """Return the rows of a CSV file as named tuples `kind`, whose fields are the columns.
+
+    Columns of fields with a default may be missing.
 
     Raises:
-        ValueError: where a column is missing or a cell is no number where one belongs.
-        OSError: where the file is missing.
+        ValueError: a column is missing, or a cell is not a number where the field is one.
+        OSError: the file is missing.
     """
     with path.open(newline="", encoding="utf-8") as file:
         rows = csv.DictReader(file)
@@ -96,13 +99,17 @@ def _cell(hint: type, row: Mapping[str, str], name: str, where: str) -> Any:
 def read_json(
     path: Path, advice: str = "make it again", kind: Any = dict, current: Callable[[Any], object] | None = None
 ) -> Any:
-    """Return the content of a JSON file of this toolkit as a value of type `kind` (see `read_record`).
+    """Return the content of a JSON file of this toolkit as a value of type `kind`, converted by `read_record`.
 
     Args:
-        current: moves what an earlier version wrote to today's keys.
+        path: the file.
+        advice: what to do if the file cannot be read, for the message.
+        kind: type of the result.
+        current: function that converts the content of a file of an earlier version to the present keys; None for no
+            conversion.
 
     Raises:
-        UsageError: where the file is missing, damaged or of other content, with `advice`.
+        UsageError: the file is missing, damaged or has other content; the message contains `advice`.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -114,7 +121,7 @@ def read_json(
 
 
 def read_lines(path: Path) -> list[str]:
-    """Return the lines of a text file, empty if it is missing; invalid characters are replaced."""
+    """Return the lines of a text file, empty if the file is missing; invalid characters are replaced."""
     if not path.exists():
         return []
     return path.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -122,7 +129,7 @@ def read_lines(path: Path) -> list[str]:
 
 @dataclass(frozen=True)
 class _Null:
-    """Pydantic type of a number, or an array of numbers, with null in JSON in place of `value`."""
+    """Pydantic type of a number, or an array of numbers, in which null in JSON is read as `value`."""
 
     value: float = math.nan
     array: bool = False
@@ -148,14 +155,15 @@ Unbounded = Annotated[np.ndarray, _Null(math.inf, array=True)]
 
 
 class stored(property):
-    """A property that `plain` writes in addition to the fields; it is computed again, not read back."""
+    """A property that `plain` writes in addition to the fields; when read back, it is computed again."""
 
 
 def plain(value: object, null: bool = False) -> Any:
     """Return a record, or any nesting of records, arrays, mappings and lists, as plain JSON values.
 
     Args:
-        null: whether null stands for a number that is not finite; of an array it does.
+        value: the record or other value.
+        null: True writes a number that is not finite as null; in arrays this is always done.
     """
     if is_dataclass(value) and not isinstance(value, type):
         return {name: plain(getattr(value, name), nullable) for name, nullable in _keys(type(value)).items()}
@@ -175,7 +183,7 @@ def plain(value: object, null: bool = False) -> Any:
 
 @cache
 def _keys(kind: type) -> dict[str, bool]:
-    """Return, for each field and stored property of a record type, whether null in JSON means NaN."""
+    """Return, for each field and stored property of a record type, whether non-finite numbers are written as null."""
     hints = get_type_hints(kind, include_extras=True)
     keys = {field.name: _nullable(hints[field.name]) for field in fields(kind)}
     for base in kind.__mro__:
@@ -195,14 +203,16 @@ def _nullable(hint: object) -> bool:
 def read_record(kind: type[T], content: object, where: str = "") -> T:
     """Return plain JSON `content` as a value of the record type `kind`.
 
-    Keys that a record does not name are left out, so that a newer version may write more; a field with a default may be
-    missing.
+    Keys that are not fields of the record are ignored, so that files of newer versions can be read. A field with a
+    default may be missing.
 
     Args:
+        kind: the record type.
+        content: values as read from JSON.
         where: name of `content` for messages.
 
     Raises:
-        ValueError: for a missing or invalid value, with its location.
+        ValueError: a value is missing or invalid; the message gives its location.
     """
     from pydantic import ValidationError
 
@@ -225,7 +235,7 @@ def _adapter(kind: type[T]) -> TypeAdapter[T]:
 
 
 def evenly(count: int, max_rows: int) -> np.ndarray:
-    """Return rows (m,) of `count`, spread evenly from the first to the last: all, or `max_rows` of them."""
+    """Return row numbers (m,) out of `count` rows, spread evenly from first to last: all, or `max_rows` of them."""
     return np.unique(np.linspace(0, count - 1, min(count, max_rows)).astype(int))
 
 
@@ -235,20 +245,20 @@ def frozen(values: ArrayLike, dtype: type = float) -> np.ndarray:
 
 
 def read_only(values: np.ndarray) -> np.ndarray:
-    """Return `values`, made read-only; the caller must own the array."""
+    """Return the array `values` itself, made read-only; no other code may use the array for writing."""
     values.flags.writeable = False
     return values
 
 
 def as_subclass(record: Any, kind: type[T]) -> T:
-    """Return a record as an instance of a subclass of its type that adds methods, but no fields."""
+    """Return a record as an instance of the subclass `kind` of its class; the subclass adds methods but no fields."""
     if not issubclass(kind, type(record)):
         raise TypeError(f"{kind.__name__} is no subclass of {type(record).__name__}")
     return kind(**field_values(record))
 
 
 class Frozen:
-    """Base of dataclasses whose fields annotated ``np.ndarray`` become read-only copies (floats or booleans)."""
+    """Base class of dataclasses whose ``np.ndarray`` fields are stored as read-only copies (floats or booleans)."""
 
     def __post_init__(self) -> None:
         for field in fields(self):  # type: ignore[arg-type]
@@ -259,10 +269,11 @@ class Frozen:
 
 
 def shaped(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> np.ndarray:
-    """Return `values` as a finite float array of `shape` (None: any length).
+    """Return `values` as a finite float array of the given shape; None in `shape` allows any length.
 
     Raises:
-        CalibError: with the expected and the found shape, or the index of the first value that is not finite.
+        CalibError: another shape, or a value that is not finite; the message gives both shapes, or the index of the
+            value.
     """
     array = np.asarray(values, dtype=float)
     fits = array.ndim == len(shape)

@@ -1,8 +1,8 @@
-"""Kinds of results on disk: how a folder is recognised, what made it, and the message of a verb that does not take it.
+"""Kinds of results on disk: how a folder is recognised, and the message of a command that does not accept it.
 
-Every verb that takes a result (`calib view`, `certificate`, `export`, `diff` …) refuses others by `refusal`, so that
-the message says what the folder is, and which folder or command to use instead. What a result of each kind can do is
-in `calib.results`.
+Every command that takes a result (`calib view`, `certificate`, `export`, `diff` …) refuses folders of other kinds with
+the message of `refusal`. It states what the folder is, and which folder or command to use instead. The functions for
+each kind of result are in `calib.results`.
 """
 
 from collections.abc import Mapping
@@ -20,9 +20,10 @@ class ResultKind:
     Attributes:
         name: identifier of the kind.
         noun: noun for a folder of this kind, with its article.
-        marks: sets of files, each of which identifies a folder of this kind.
-        advice: map from a verb to advice on what to do instead, a clause with ``{folder}``.
-        companion: for a kind that is a file: suffix, after the stem, of the name of the file beside it.
+        marks: sets of file names; a folder with all files of one set is of this kind.
+        advice: for each command that does not accept this kind, advice on what to do instead; a clause with
+            ``{folder}``.
+        companion: for a kind that is a file: end of the name of the file beside it, which follows the stem of its name.
         array: for a kind that is an archive of arrays: name of an array that only this kind contains.
     """
 
@@ -43,7 +44,7 @@ class ResultKind:
 
 
 def _members(archive: Path) -> list[str]:
-    """Return the names of an archive's members; empty if the file is no archive."""
+    """Return the names of the files in an archive; empty if the file is not an archive."""
     try:
         with ZipFile(archive) as content:
             return content.namelist()
@@ -54,14 +55,14 @@ def _members(archive: Path) -> list[str]:
 _SHOWN = "calib view {folder} shows it, calib export {folder} --into DIR writes the robot for other programs"
 _NOT_A_SESSION = {"session": "not a session; " + _SHOWN}
 
-# In the order of recognition: a session also holds fits, an identification also a robot.
+# In the order in which they are tested: a session also contains fits, an identification also a robot.
 KINDS = (
     ResultKind(
         "session",
         "a session",
         ((SESSION,),),
         {
-            "certificate": "its details stand in {folder}/session.toml, under [certificate]; then: "
+            "certificate": "its details are in {folder}/session.toml, under [certificate]; then: "
             "calib redo {folder} certificate",
             "robot": "give the robot it exported, {folder}/9-export/robot.urdf, or its fit, {folder}/4-fit",
             "export": "its last step exports the robot; for other files give {folder}/4-fit or {folder}/8-dynamics",
@@ -69,7 +70,7 @@ KINDS = (
             "compensate": "it has no fit yet: calib next {folder}",
             "recall": "give its motion, {folder}/6-excitation",
             "program": "give a list of poses or a motion in it, {folder}/2-poses/poses.csv or {folder}/6-excitation",
-            "view": "it holds nothing to show yet: calib next {folder}",
+            "view": "it has nothing to show yet: calib next {folder}",
         },
     ),
     ResultKind("export", "an exported robot", ((OFFSETS, "README.txt"), (PARAMETERS, "README.txt"))),
@@ -78,7 +79,7 @@ KINDS = (
         "identification",
         "the result of an identification",
         (("dynamics.json",),),
-        _NOT_A_SESSION | {"compensate": "give the fit that it stands on"},
+        _NOT_A_SESSION | {"compensate": "give the fit that it is based on"},
     ),
     ResultKind("excitation", "a motion of calib excite", (("trajectory.toml",),)),
     ResultKind("plan", "a motion of calib plan", (("motion.csv",),)),
@@ -95,7 +96,7 @@ KINDS = (
 )
 BY_NAME = {kind.name: kind for kind in KINDS}
 
-# What each verb takes, in words. `robot` stands for every command that takes a robot.
+# Description of what each command accepts. `robot` is the entry for every command that takes a robot.
 TAKES = {
     "certificate": "the folder of a fit or of an identification",
     "compensate": "the folder of a fit, or of a session that has one",
@@ -114,7 +115,7 @@ TAKES = {
 
 
 def kind_of(path: str | Path) -> ResultKind | None:
-    """Return the kind of the result in a folder or a file; None for what is no result."""
+    """Return the kind of the result in a folder or a file; None if it is not a result."""
     path = Path(path)
     for kind in KINDS:
         if kind.holds(path):
@@ -123,15 +124,17 @@ def kind_of(path: str | Path) -> ResultKind | None:
 
 
 def refusal(path: str | Path, verb: str) -> str:
-    """Return the message of a verb that does not take a path: what the path is, what the verb takes, what to do.
+    """Return the message of a command that does not accept a path: what the path is, and what to give or do instead.
 
     Args:
-        path: what the user named.
-        verb: a key of `TAKES`.
+        path: path given by the user.
+        verb: the command, a key of `TAKES`.
     """
     kind = kind_of(path)
     if kind is None:
-        what = "holds no result" if Path(path).is_dir() else "is a file" if Path(path).is_file() else "does not exist"
+        what = (
+            "contains no result" if Path(path).is_dir() else "is a file" if Path(path).is_file() else "does not exist"
+        )
         return f"{path} {what}; give {TAKES[verb]}"
     advice = kind.advice.get(verb, f"give {TAKES[verb]}")
     return f"{path} is {kind.noun}; {advice.format(folder=path)}"

@@ -1,7 +1,7 @@
-"""Rigid transforms as (..., 4, 4) arrays; rotations by scipy if possible.
+"""Rigid transforms as (..., 4, 4) arrays; rotations are computed by scipy if possible.
 
-A pose maps coordinates of its own frame to its reference: p_ref = T @ [p; 1]. Quaternions are x, y, z, w;
-roll-pitch-yaw is URDF's: R = Rz(yaw) Ry(pitch) Rx(roll).
+A pose T maps coordinates in its own frame to coordinates in its reference frame: [p_ref; 1] = T @ [p; 1]. Quaternions
+have the order x, y, z, w. Roll-pitch-yaw has the convention of URDF: R = Rz(yaw) Ry(pitch) Rx(roll).
 """
 
 import numpy as np
@@ -10,7 +10,10 @@ from scipy.spatial.transform import Rotation
 
 
 def pose(rotation: ArrayLike | Rotation | None = None, position: ArrayLike | None = None) -> np.ndarray:
-    """Assemble poses (..., 4, 4) from rotations (..., 3, 3) and positions (..., 3) [m]; both are optional."""
+    """Return poses (..., 4, 4) from rotations (..., 3, 3) and positions (..., 3) [m].
+
+    None stands for the identity rotation, or for the origin.
+    """
     matrix = rotation.as_matrix() if isinstance(rotation, Rotation) else rotation
     matrix = np.eye(3) if matrix is None else np.asarray(matrix, dtype=float)
     point = np.zeros(3) if position is None else np.asarray(position, dtype=float)
@@ -23,20 +26,21 @@ def pose(rotation: ArrayLike | Rotation | None = None, position: ArrayLike | Non
 
 
 def invert(poses: np.ndarray) -> np.ndarray:
-    """Invert rigid poses (..., 4, 4)."""
+    """Return the inverses of rigid poses (..., 4, 4)."""
     transposed = np.swapaxes(poses[..., :3, :3], -1, -2)
     return pose(transposed, -np.einsum("...ij,...j->...i", transposed, poses[..., :3, 3]))
 
 
 def from_xyz_rpy(xyz: ArrayLike, rpy: ArrayLike) -> np.ndarray:
-    """Return URDF origins (..., 4, 4) from xyz [m] and roll-pitch-yaw [rad]."""
+    """Return poses (..., 4, 4) from URDF's xyz [m] and roll-pitch-yaw [rad]."""
     return pose(Rotation.from_euler("xyz", rpy).as_matrix(), xyz)
 
 
 def to_xyz_rpy(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return xyz [m] and roll-pitch-yaw [rad] of one pose (4, 4); the round trip is exact near pitch ±90°, too.
+    """Return xyz [m] and roll-pitch-yaw [rad] of one pose (4, 4).
 
-    Roll is taken from Rz(-yaw) R instead of from R, so that it compensates an arbitrary yaw where yaw is ill defined.
+    `from_xyz_rpy` reproduces the pose, also near pitch ±90°, where yaw is not determined: roll is taken from Rz(-yaw) R
+    instead of from R, so that it compensates any value of yaw.
     """
     rotation = poses[:3, :3]
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
@@ -61,7 +65,7 @@ def rotation_vector(matrices: np.ndarray) -> np.ndarray:
 
 
 def displace(placement: np.ndarray, step: ArrayLike) -> np.ndarray:
-    """Return ``placement · Trans(step[:3]) · Exp(step[3:])``: a placement (4, 4) moved by six elements [m, rad]."""
+    """Return ``placement · Trans(step[:3]) · Exp(step[3:])``: a placement (4, 4) displaced by six numbers [m, rad]."""
     step = np.asarray(step, dtype=float)
     return placement @ pose(Rotation.from_rotvec(step[3:]).as_matrix(), step[:3])
 

@@ -1,6 +1,6 @@
-"""Units: input units with their factor to SI, output units with their factor from SI.
+"""Units: units of input files with their factor to SI, and units of output with their factor from SI.
 
-SI stands in every file that we write, unless a header or a key names another.
+Numbers in all files written by the toolkit are in SI, unless a header or a key names another unit.
 """
 
 import math
@@ -11,7 +11,7 @@ DEG = math.pi / 180
 ANGLES = {"rad": 1.0, "deg": DEG, "mrad": 1e-3, "°": DEG, "degrees": DEG}
 LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "cm": 1e-2, "in": 0.0254}
 
-# as recordings name them, in small letters
+# names of units of time in recordings, in small letters, with their factor to seconds
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 POSITIONS = {"rad": 1.0, "m": 1.0, "deg": DEG, "°": DEG, "mrad": 1e-3, "mm": 1e-3}
 TURNED = ("rad", "deg", "°", "mrad", "rad/s", "deg/s", "°/s", "rpm")
@@ -53,13 +53,13 @@ TORQUE = "N m"
 
 
 def small(value: float, unit: str, digits: int = 3) -> str:
-    """Return the printed text of a small change or a standard deviation of a parameter [m or rad]."""
+    """Return the printed text of a parameter's small change or standard deviation [m or rad], in mm or mrad."""
     factor, printed = SMALL[unit]
     return f"{factor * value:.{digits}g} {printed}"
 
 
 class NamedJoint(Protocol):
-    """A joint of any robot, or of a recording: its name, and ``revolute`` or ``prismatic``."""
+    """A joint of any robot or recording, with its name and its kind, ``revolute`` or ``prismatic``."""
 
     @property
     def name(self) -> str: ...
@@ -69,7 +69,7 @@ class NamedJoint(Protocol):
 
 
 def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
-    """Return the SI units of position, velocity, acceleration and torque of joints of these kinds."""
+    """Return the SI units of position, velocity, acceleration and torque for joints of the given kinds."""
     distinct_kinds = set(kinds)
     if "prismatic" not in distinct_kinds:
         position, torque = "rad", TORQUE
@@ -81,7 +81,12 @@ def motion_units(kinds: Iterable[str]) -> tuple[str, str, str, str]:
 
 
 def headings(series: str, joints: Sequence[NamedJoint]) -> list[str]:
-    """Return the headers of joints' columns in a table of motion: ``q_joint1 [rad]``, v_, a_, current_, torques."""
+    """Return the headers of the joints' columns in a table of motion, such as ``q_joint1 [rad]``.
+
+    Args:
+        series: quantity of the columns: ``q``, ``q_link``, ``v``, ``a``, ``current``; all others are torques.
+        joints: the joints.
+    """
     result = []
     for joint in joints:
         position, velocity, acceleration, torque = motion_units([joint.kind])
@@ -92,16 +97,17 @@ def headings(series: str, joints: Sequence[NamedJoint]) -> list[str]:
 
 
 def without_gains(unit: str) -> str:
-    """Return a description of the torque unit `unit` ("A of joint 2") of a model identified from currents."""
+    """Return a description of the torque unit `unit` ("A of joint 2") of a model that was identified from currents."""
     reference = unit.removeprefix("A of ")
     scale = f"scaled to {reference}, " if reference != unit else ""
     return f"in amperes, {scale}because no drive gains are known"
 
 
 def per_ampere(parameter_unit: str, unit: str) -> str:
-    """Return a parameter's unit in a model whose torques are in `unit`: if amperes, each is divided by a gain [N m/A].
+    """Return a parameter's unit in a model whose torques have the unit `unit`.
 
-    ``N m s/rad`` becomes ``A s/rad``, ``kg m²`` becomes ``kg m² A/(N m)``.
+    If torques are in amperes, each parameter is divided by a gain [N m/A]: ``N m s/rad`` becomes ``A s/rad``, ``kg m²``
+    becomes ``kg m² A/(N m)``.
     """
     if unit == TORQUE:
         return parameter_unit
@@ -111,10 +117,10 @@ def per_ampere(parameter_unit: str, unit: str) -> str:
 
 
 def plain_number(text: str) -> float:
-    """Return the number of a text in ASCII digits; ``0_5`` and digits of other scripts are refused.
+    """Return the number in a text of ASCII digits.
 
     Raises:
-        ValueError: for anything else.
+        ValueError: the text is not a number, or has digits of other scripts or underscores (``0_5``).
     """
     if "_" in text or not text.isascii():
         raise ValueError(text)
@@ -122,7 +128,7 @@ def plain_number(text: str) -> float:
 
 
 def is_number(text: str) -> bool:
-    """Return whether `plain_number` takes the text."""
+    """Return whether `plain_number` accepts the text."""
     try:
         plain_number(text)
     except ValueError:

@@ -15,7 +15,7 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from calib.apps.cell_demo import demo
-from calib.apps.cell_demo.summary import PICTURE, position_errors, torque_error
+from calib.apps.cell_demo.step_lines import PICTURE, position_errors, torque_error
 from calib.procedure.export.delivery import prediction
 from calib.workers.threads import one_blas_thread
 

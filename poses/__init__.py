@@ -1,1 +1,1 @@
-"""Experiment design for geometry: observability indices and the selection of measurement poses. No robot classes."""
+"""Experiment design for geometry: observability indices and selection of measurement poses, without robot classes."""

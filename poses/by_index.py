@@ -1,4 +1,4 @@
-"""Exchange of candidates for any observability index, judged by the singular values of every trial set."""
+"""Exchange of candidates for any observability index, evaluated from the singular values of every set tried."""
 
 import time
 from collections.abc import Callable
@@ -39,21 +39,22 @@ def exchanged_by_index(
     sweeps: int = 20,
     screen: int = 32,
 ) -> LocalOptimum:
-    """Replace one member at a time by a candidate until no replacement tried improves the index.
+    """Return the set after replacing members one by one by candidates until no replacement tried improves the index.
 
-    O2-O5 and cond have no determinant lemma: a trial costs the eigenvalues of a p × p matrix. Trials are therefore
-    screened: those with the largest first-order gain tr(J_i G J_iᵀ), G = ∂ log O / ∂M, and those with the largest
-    tr(J_i M⁻² J_iᵀ) (the gain of A-optimality, which also serves where the smallest singular value is multiple). The
-    screening and its size are our choice; the result is a local optimum among screened exchanges only.
+    For O2-O5 and cond there is no determinant lemma: each set tried costs the eigenvalues of a p × p matrix. Only two
+    groups of candidates are therefore tried for each member: those with the largest first-order gain tr(J_i G J_iᵀ), G
+    = ∂ log O / ∂M with M the information matrix of the set, and those with the largest tr(J_i M⁻² J_iᵀ). The second is
+    the gain of A-optimality, which also works where several singular values equal the smallest one. These two groups
+    and their size are our choice; the result is a local optimum among the exchanges tried only.
 
     Args:
-        jacobians: (N, rows, p) whitened Jacobians of the candidates.
-        known_information: (p, p) information of the poses already measured.
+        jacobians: (N, rows, p) Jacobians J_i of the N candidates, each row divided by its standard deviation.
+        known_information: (p, p) information Σ J_iᵀJ_i of the poses already measured; zeros for no such poses.
         members: indices of the candidates to start from.
-        index: "O1" ... "O5", "cond".
-        report: called with every improved set and its merit; None for no report.
+        index: observability index O to improve, "O1" ... "O5" or "cond" (`calib.poses.indices`).
+        report: called with the indices of every improved set and its merit; None for no report.
         sweeps: largest number of passes over all members.
-        screen: number of trials per member and screening rule.
+        screen: number of candidates tried per member from each of the two groups.
     """
     chosen = list(members)
     matrix = known_information + _gram(jacobians[chosen])
@@ -64,6 +65,7 @@ def exchanged_by_index(
         for position in range(len(chosen)):
             thinned = matrix - _gram(jacobians[chosen[position]][None])
             trials = _screened(jacobians, matrix, chosen, index, screen)
+            # every candidate is a member
             if not len(trials):
                 continue
             trial_count += len(trials)
@@ -130,9 +132,14 @@ def kicked_by_index(
 
 
 def merits(matrices: np.ndarray, index: Index) -> np.ndarray:
-    """Return the merits log O (−log cond) (K,) of information matrices (K, p, p); −inf where a matrix is singular.
+    """Return the merits log O (−log cond) (K,) of K information matrices (K, p, p); −inf where a matrix is singular.
 
-    Columns may have very different units, so accuracy ends where the ratio of singular values nears 1e-7.
+    Columns may have very different units, so the results are accurate only while the ratio of the smallest to the
+    largest singular value is well above 1e-7.
+
+    Args:
+        matrices: (K, p, p) information matrices WᵀW of K sets of poses.
+        index: observability index O, "O1" ... "O5" or "cond"; O1 without its factor 1/√m.
     """
     values = np.linalg.eigvalsh(matrices)[:, ::-1]
     regular = values[:, -1] > 1e-14 * values[:, 0]

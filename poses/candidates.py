@@ -1,4 +1,4 @@
-"""Candidates: low-discrepancy poses within limits that satisfy all constraints and the predicate."""
+"""Candidate poses: a low-discrepancy sequence within joint limits, filtered by constraints and predicate."""
 
 from collections.abc import Callable
 
@@ -18,7 +18,7 @@ def draw_candidates(
     max_draws: int | None = None,
     block: int = 2048,
 ) -> np.ndarray:
-    """Draw feasible poses from a scrambled Sobol sequence (Sobol 1967; Owen 1998), block by block.
+    """Return feasible poses of a scrambled Sobol sequence (Sobol 1967; Owen 1998), drawn block by block.
 
     Args:
         lower, upper: (n,) joint limits [rad or m].
@@ -33,7 +33,7 @@ def draw_candidates(
 
     Raises:
         BadInput: limits that are not two (n,) arrays with lower < upper, or a count below 1.
-        NothingFeasible: fewer than N of `max_draws` poses are feasible; the message gives their share.
+        NothingFeasible: fewer than N of `max_draws` poses are feasible; the message gives the share of feasible poses.
     """
     # slow to load
     from scipy.stats import qmc

@@ -1,7 +1,7 @@
-"""The D-optimal relaxation: an upper bound for any choice of poses.
+"""The D-optimal relaxation: an upper bound on det(WᵀW) for any choice of poses.
 
-Choosing m of N poses is relaxed to weights x in [0, 1] with Σ x = m (a pose at most once; without the cap, x ≤ m: poses
-may be repeated),
+Choosing m of N poses is relaxed to weights x in [0, 1] with Σ x = m, each pose at most once. Without this cap x ≤ m,
+and poses may be repeated. The problem is
 
     maximise  log det M(x),   M(x) = M_known + Σ x_i J_iᵀJ_i .
 
@@ -9,14 +9,15 @@ may be repeated),
 
     det M(x)^(1/p)  ≤  det M^(1/p) · T/p,   T = tr(M⁻¹ M_known) + Σ (m largest d_i),   d_i = tr(J_i M⁻¹ J_iᵀ)
 
-(without the cap: m · max d_i), the linearisation at the best multiple of M. At the optimum T = p: the general
-equivalence theorem (Kiefer & Wolfowitz 1960; Pukelsheim 1993, ch. 7; the capped form Wynn 1982). The bound holds for
-any weights whatsoever; good weights make it tight.
+(without the cap: m · max d_i), by linearisation at the best multiple of M. At the optimum T = p: the general
+equivalence theorem (Kiefer & Wolfowitz 1960; Pukelsheim 1993, ch. 7; the capped form Wynn 1982). The bound is valid for
+any weights; good weights make it tight.
 
-**Method.** A few multiplicative steps x ← x d (Titterington 1976) show where the weight goes; then a primal-dual
-interior-point method (Boyd & Vandenberghe 2004, ch. 11) on the candidates with the largest d_i, and pricing: whatever
-candidate violates the certificate joins, until it is tight. Working on a few hundred candidates plays the part of the
-Harman & Pronzato (2007) deletion rule, which needs repeats to be allowed. The set and its growth are our choice.
+**Method.** A few multiplicative steps x ← x d (Titterington 1976) find the candidates with large weights. A primal-dual
+interior-point method (Boyd & Vandenberghe 2004, ch. 11) then solves the problem for the candidates with the largest
+d_i. Candidates that violate the certificate are added and the problem is solved again, until the bound is tight.
+Restricting the problem to a few hundred candidates replaces the deletion rule of Harman & Pronzato (2007), which is
+valid only where poses may be repeated. The choice of these candidates is ours.
 """
 
 from dataclasses import dataclass
@@ -24,22 +25,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .information import Candidates, log_det, prepared
+from .scaled_jacobians import Candidates, log_det, prepared
 
 
 @dataclass(frozen=True)
 class Bound:
-    """Upper bound on det(WᵀW)^(1/p) over all choices of m poses, with the weights that certify it.
+    """Upper bound on det(WᵀW)^(1/p) over all choices of m poses, with the weights that prove it.
 
     Attributes:
         weights: (N,) relaxed choice, Σ = m.
         logdet: log det M(weights), in the caller's parameters.
-        upper: certified upper bound on det(M)^(1/p) of any m poses (with the poses already measured).
-        log_upper: its logarithm, times p: an upper bound on log det M.
-        gap: upper / det M(weights)^(1/p) − 1; what the bound may at most be loose against the relaxed optimum.
+        upper: proved upper bound on det(M)^(1/p) of any m poses together with the poses already measured.
+        log_upper: p · log(upper), an upper bound on log det M.
+        gap: upper / det M(weights)^(1/p) − 1, the most by which the bound may exceed the relaxed optimum, relative.
         iterations: interior-point steps.
         capped: True where no pose may be taken twice.
-        scores: (N,) d_i at the weights the bound was certified with; large ones are the promising candidates.
+        scores: (N,) d_i at the weights that prove the bound; candidates with large scores are promising.
     """
 
     weights: np.ndarray
@@ -54,7 +55,7 @@ class Bound:
 
 @dataclass(frozen=True)
 class _Certified:
-    """Feasible weights x with the bound certified at M(x), in transformed coordinates."""
+    """Feasible weights x and the bound proved at M(x), in the scaled coordinates of `Candidates`."""
 
     x: np.ndarray
     scores: np.ndarray
@@ -67,21 +68,30 @@ def bound(
 ) -> Bound:
     """Return an upper bound on det(WᵀW)^(1/p) over all choices of m candidates.
 
+    W (rows of all poses, p) is the stack of the Jacobians of the chosen poses and of those already measured.
+
     Args:
-        jacobians: (N, rows, p) whitened Jacobians of the candidates.
+        jacobians: (N, rows, p) Jacobians of the candidates, each row divided by its standard deviation.
         m: number of poses.
-        existing: (k, rows, p) Jacobians of poses already measured; they count in full. None without such poses.
+        existing: (k, rows, p) Jacobians of poses already measured, whose information is added with weight 1; None for
+            no such poses.
         capped: False allows a pose to be repeated, which makes the bound looser.
-        tolerance: relative gap at which the search for a tighter bound ends.
+        tolerance: relative gap (`Bound.gap`) at which the search for a tighter bound ends.
 
     Raises:
-        BadInput, TooFewCandidates, NotIdentifiable: as `calib.poses.information.prepared`.
+        BadInput, TooFewCandidates, NotIdentifiable: under the conditions of `calib.poses.scaled_jacobians.prepared`.
     """
     return relaxed(prepared(jacobians, m, existing), m, capped=capped, tolerance=tolerance)
 
 
 def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: float = 1e-3, rounds: int = 12) -> Bound:
-    """Return the bound of the relaxation solved over prepared candidates; see `bound`."""
+    """Return the upper bound for prepared candidates; arguments as for `bound`.
+
+    Args:
+        candidates: the scaled candidates.
+        m, capped, tolerance: as for `bound`.
+        rounds: largest number of times that candidates are added and the problem is solved again.
+    """
     z = candidates.z
     known_information = candidates.known
     count, _, p = z.shape
@@ -113,13 +123,27 @@ def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: f
 
 
 def certificate(candidates: Candidates, x: np.ndarray, m: int, capped: bool = True) -> float:
-    """Return the upper bound on log det M that weights x (N,) certify, whichever they are (+inf if M is singular)."""
+    """Return the upper bound on log det M proved by any feasible weights x (N,); +inf if M(x) is singular.
+
+    Args:
+        candidates: the scaled candidates; M(x) is the information of the weighted candidates and the poses already
+            measured.
+        x: (N,) weights ≥ 0 with Σ x = m (and ≤ 1 if `capped`).
+        m: number of poses to choose.
+        capped: whether each candidate may be chosen once only; False gives the looser bound for repeated poses.
+    """
     certified = _certify(candidates.z, candidates.known, x, m, capped)
     return certified.log_upper + candidates.shift
 
 
 def information_of(z: np.ndarray, known_information: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return M = M_known + Σ x_i z_iᵀz_i (p, p) from z (N, rows, p) and weights x (N,)."""
+    """Return M = M_known + Σ x_i z_iᵀz_i (p, p) from Jacobians z (N, rows, p) and weights x (N,).
+
+    Args:
+        z: (N, rows, p) Jacobians z_i of the candidates, in scaled coordinates.
+        known_information: M_known (p, p), information of the poses already measured.
+        x: (N,) weights of the candidates.
+    """
     chosen = np.flatnonzero(x)
     rows = z[chosen].reshape(-1, z.shape[2])
     row_weights = np.repeat(x[chosen], z.shape[1])
@@ -127,7 +151,7 @@ def information_of(z: np.ndarray, known_information: np.ndarray, x: np.ndarray) 
 
 
 def scores_of(z: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Return the scores d_i = tr(z_i M⁻¹ z_iᵀ) (N,) of candidates."""
+    """Return the scores d_i = tr(z_i M⁻¹ z_iᵀ) (N,) of candidates z (N, rows, p) for the information M (p, p)."""
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     spread = z.reshape(-1, z.shape[2]) @ root.T
     spread = spread.reshape(len(z), -1)
@@ -152,7 +176,11 @@ def _certify(z: np.ndarray, known_information: np.ndarray, x: np.ndarray, m: int
 
 
 def _tighter(first: _Certified, second: _Certified) -> _Certified:
-    """Return the weights of larger log det of the two, with the tighter bound of the two."""
+    """Return the weights with the larger log det of the two, combined with the smaller of the two bounds.
+
+    Args:
+        first, second: weights with their proved bounds, for the same candidates and number of poses.
+    """
     upper = min(first.log_upper, second.log_upper)
     if second.logdet >= first.logdet:
         better = second
@@ -164,7 +192,15 @@ def _tighter(first: _Certified, second: _Certified) -> _Certified:
 def _warm(
     z: np.ndarray, known_information: np.ndarray, m: int, cap: float, steps: int = 6
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return initial weights (N,) by a few multiplicative steps, and the candidates' scores (N,) at these weights."""
+    """Return initial weights (N,) by a few multiplicative steps, and the candidates' scores (N,) at these weights.
+
+    Args:
+        z: (N, rows, p) scaled Jacobians of the candidates.
+        known_information: (p, p) information of the poses already measured.
+        m: sum of the weights.
+        cap: largest weight of a candidate.
+        steps: number of multiplicative steps.
+    """
     x = np.full(len(z), m / len(z))
     matrix = information_of(z, known_information, x)
     scores = scores_of(z, matrix)
@@ -182,13 +218,25 @@ def _warm(
 
 
 def _largest(values: np.ndarray, count: int) -> np.ndarray:
-    """Return the sorted indices of the `count` largest values."""
+    """Return the indices of the `count` largest values, in rising order."""
     order = np.argpartition(values, len(values) - count)
     return np.sort(order[-count:])
 
 
 def _priced(scores: np.ndarray, x: np.ndarray, active: np.ndarray, price: float, max_count: int) -> np.ndarray:
-    """Return the next active set: active candidates with weight or scores near the price, and the worst violators."""
+    """Return the indices of the candidates for the next interior-point problem.
+
+    Kept are active candidates with a weight, or with a score near `price` or above; added are at most `max_count` other
+    candidates, those whose scores exceed `price` most.
+
+    Args:
+        scores: (N,) scores d_i of all candidates.
+        x: (N,) present weights.
+        active: indices of the candidates of the last problem.
+        price: multiplier λ of the constraint Σ x = m in that problem; the score of a candidate with a weight between
+            the bounds.
+        max_count: largest number of candidates to add.
+    """
     has_weight = x[active] > 1e-4
     near_price = scores[active] > 0.9 * price
     keep = active[has_weight | near_price]
@@ -213,11 +261,21 @@ def _interior(
     tolerance: float,
     max_steps: int = 30,
 ) -> tuple[np.ndarray, float, int]:
-    """Return optimal weights (K,) over few candidates, the price λ of the constraint Σ x = m, and the steps taken.
+    """Return optimal weights (K,) for K candidates, the multiplier λ of the constraint Σ x = m, and the step count.
 
-    With duals u of x ≥ 0 and v of x ≤ cap, Newton's step of the perturbed optimality conditions is
+    λ is called the price. With duals u of x ≥ 0 and v of x ≤ cap, Newton's step of the perturbed optimality conditions
+    is
 
         (Q + u/x + v/(cap−x)) dx + λ = d + τ/x − τ/(cap−x),  Σ dx = m − Σ x,   Q_ij = ‖z_i M⁻¹ z_jᵀ‖² .
+
+    Args:
+        z: (K, rows, p) scaled Jacobians of the candidates.
+        known_information: (p, p) information of the poses that are not varied.
+        x: (K,) first weights.
+        m: sum of the weights.
+        cap: largest weight of a candidate.
+        tolerance: relative gap of det(M)^(1/p) to its optimum at which the iteration ends.
+        max_steps: largest number of Newton steps.
     """
     count, _, p = z.shape
     mean = m / count
@@ -262,7 +320,12 @@ def _interior(
 
 
 def _newton_terms(z: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gradient d (K,) and matrix Q (K, K) of the Newton step for a few candidates."""
+    """Return the gradient d (K,) and the matrix Q (K, K) of the Newton step for K candidates.
+
+    Args:
+        z: (K, rows, p) scaled Jacobians of the candidates.
+        matrix: (p, p) information M at the present weights.
+    """
     count, rows, p = z.shape
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     rows_spread = z.reshape(-1, p) @ root.T
@@ -277,7 +340,7 @@ def _newton_terms(z: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _longest(value: np.ndarray, step: np.ndarray) -> float:
-    """Return the largest t with value + t step ≥ 0; infinite where no step is negative."""
+    """Return the largest t with value + t · step ≥ 0 in every component; infinite where no step is negative."""
     falling = step < 0
     if not falling.any():
         return np.inf

@@ -1,26 +1,30 @@
-"""A set of chosen candidates, whose determinant is updated with each addition or removal.
+"""A set of chosen candidate poses, with the determinant of its information matrix M updated at each change.
 
-With C = M⁻¹ and one pose z (rows, p), the matrix determinant lemma and Woodbury's identity give
+With C = M⁻¹ and the Jacobian z (rows, p) of one pose, the matrix determinant lemma and Woodbury's identity give
 
     det(M ± zᵀz) = det M · det(S),   S = I ± z C zᵀ,   (M ± zᵀz)⁻¹ = C ∓ C zᵀ S⁻¹ z C ,
 
-so all candidates are judged by rows × rows blocks, and the scores d_i = tr(z_i C z_iᵀ) follow by one thin product.
+so that all candidates are compared by small blocks (rows, rows). The scores d_i = tr(z_i C z_iᵀ) of all candidates are
+updated by one product with a matrix of few rows.
 """
 
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from .information import log_det
+from .scaled_jacobians import log_det
 
-# information added to every design, relative to the unit mean information of one candidate, so that sets without full
-# rank can be compared (our choice); values reported to the user never contain it
+# multiple of the identity matrix (the mean information of one candidate) added to every design, so that sets without
+# full rank can be compared (our choice); values reported to the user do not contain it
 RIDGE = 1e-6
 
 
 @dataclass(frozen=True)
 class Pool:
-    """Candidates z (N, rows, p) to choose from, and known information (p, p), transformed."""
+    """Candidates to choose from, in the scaled coordinates of `calib.poses.scaled_jacobians.Candidates`.
+
+    The fields are the Jacobians z (N, rows, p) of N candidates and the information (p, p) of the poses measured before.
+    """
 
     z: np.ndarray
     known: np.ndarray
@@ -28,7 +32,7 @@ class Pool:
 
 @dataclass(frozen=True)
 class Design:
-    """Chosen candidates with their information and log det.
+    """A set of chosen candidates, with its information matrix and log det.
 
     Attributes:
         members: indices of the chosen candidates, in the order of choosing.
@@ -46,7 +50,12 @@ class Design:
 
 
 def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
-    """Return the design of given members, computed anew (this removes rounding errors of many updates)."""
+    """Return the design of the given members, computed from scratch to remove the rounding errors of many updates.
+
+    Args:
+        pool: the candidates and the information of the poses measured before.
+        members: indices of the chosen candidates in the pool.
+    """
     p = pool.z.shape[2]
     count = len(pool.z)
     rows = pool.z[list(members)].reshape(-1, p)
@@ -63,26 +72,39 @@ def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
 
 
 def with_added(pool: Pool, design: Design, i: int) -> Design:
-    """Return the design with candidate i added."""
+    """Return the design after adding the candidate with index i, which must not be a member.
+
+    Args:
+        pool: the candidates from which the design is chosen.
+        design: the design, which is not changed.
+        i: index of the candidate in the pool.
+    """
     return _changed(pool, design, i, 1.0)
 
 
 def with_removed(pool: Pool, design: Design, i: int) -> Design:
-    """Return the design with member i removed."""
+    """Return the design after removing the candidate with index i, which must be a member.
+
+    Args:
+        pool: the candidates from which the design is chosen.
+        design: the design, which is not changed.
+        i: index of the candidate in the pool.
+    """
     return _changed(pool, design, i, -1.0)
 
 
 def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int = 48) -> tuple[int, float]:
-    """Return the candidate outside the design that raises log det most, and its gain.
+    """Return the candidate outside the design that raises log det most, and that gain of log det.
 
-    Exact, though few blocks are formed: by the arithmetic-geometric mean det(I + B) ≤ (1 + tr(B)/r)^r for r rows, so
-    candidates whose score cannot beat the best gain so far (or `above`) are skipped.
+    The search is exact, though only few candidates are evaluated. With B (r, r) = z C zᵀ of a candidate, by the
+    arithmetic-geometric mean det(I + B) ≤ (1 + tr(B)/r)^r for r rows; a candidate whose score by this bound cannot
+    exceed the best gain so far (or `above`) is skipped.
 
     Args:
-        pool: candidates.
-        design: the design to add to.
-        above: gains of log det up to this are not looked for.
-        first: number of candidates tried before any is skipped.
+        pool: the N candidates; an index refers to them.
+        design: the present design.
+        above: gains of log det up to this value are ignored.
+        first: number of candidates evaluated before any is skipped.
 
     Returns:
         (index, gain); (−1, above) where no candidate gains more than `above`.
@@ -108,14 +130,28 @@ def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int
 
 
 def best_removal(pool: Pool, design: Design) -> tuple[int, float]:
-    """Return the member whose removal reduces log det least, and the (negative) gain of log det."""
+    """Return the index of the member whose removal reduces log det least, and the (negative) change of log det.
+
+    Args:
+        pool: the candidates; the index refers to them.
+        design: the design, which is not changed.
+    """
     members = np.array(design.members)
     gains = gains_of(pool, design, members, -1.0)
     return int(members[gains.argmax()]), float(gains.max())
 
 
 def gains_of(pool: Pool, design: Design, candidates: np.ndarray, sign: float) -> np.ndarray:
-    """Return the gains log det(I ± z_i C z_iᵀ) (K,) of adding (sign 1) or removing (sign −1) each of K candidates."""
+    """Return the changes of log det (K,) by adding (`sign` 1) or removing (`sign` −1) each of K candidates alone.
+
+    The change is log det(I ± z_i C z_iᵀ), with the candidate's Jacobian z_i (rows, p) and C = M⁻¹ of the design.
+
+    Args:
+        pool: the candidates.
+        design: the design to change.
+        candidates: (K,) indices into the pool.
+        sign: 1 or −1.
+    """
     z = pool.z[candidates]
     transposed = z.transpose(0, 2, 1)
     blocks = (z @ design.inverse) @ transposed

@@ -1,20 +1,23 @@
-"""The errors of pose selection: each states the finding, its likely cause, and advice."""
+"""Errors of pose selection. Each message states what was found, its likely cause, and what to try."""
 
 import numpy as np
 
 
 class BadInput(ValueError):
-    """An invalid array or option (shape, NaN, unknown name)."""
+    """Raised for an invalid array or option (shape, NaN, unknown name)."""
 
 
 def require(holds: object, message: str, kind: type[Exception] = BadInput) -> None:
-    """Raise `kind(message)` unless `holds`; for messages that can be formatted in both cases."""
+    """Raise `kind(message)` where the condition `holds` is false.
+
+    The message is formatted before the check, so its values must exist in both cases.
+    """
     if not holds:
         raise kind(message)
 
 
 class TooFewCandidates(ValueError):
-    """There are fewer candidates than poses to choose.
+    """Raised where there are fewer candidates than poses to choose.
 
     Attributes:
         found: number of candidates.
@@ -27,7 +30,7 @@ class TooFewCandidates(ValueError):
 
 
 class NothingFeasible(ValueError):
-    """No pose, or fewer poses than asked for, keep limits and predicate.
+    """Raised where fewer poses than requested satisfy joint limits, constraints and predicate.
 
     Attributes:
         found: number of feasible poses.
@@ -40,10 +43,11 @@ class NothingFeasible(ValueError):
 
 
 class NotIdentifiable(ValueError):
-    """A set of poses that cannot determine all parameters.
+    """Raised where a set of poses cannot determine all parameters.
 
     Attributes:
-        singular_values: singular values of the column-scaled observation matrix, falling; None where it was not formed.
+        singular_values: (p,) singular values of the column-scaled observation matrix, largest first; None where the
+            matrix was not computed.
     """
 
     def __init__(self, message: str, singular_values: np.ndarray | None = None):

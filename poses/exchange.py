@@ -1,4 +1,4 @@
-"""Exchange over candidates for the determinant (O1): greedy start, pair exchange, DETMAX excursions."""
+"""Search among candidates for the largest determinant (index O1): greedy start, pair exchange, DETMAX excursions."""
 
 import time
 from collections.abc import Callable
@@ -7,15 +7,22 @@ import numpy as np
 
 from .design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
 
-# called with each design of the requested size that is better than all before
+# function called with each design of the requested size that is better than all before
 Report = Callable[[Design], None]
 
-# smallest gain of log det that counts (our choice)
+# smallest gain of log det that is treated as an improvement (our choice)
 TOLERANCE = 1e-9
 
 
 def greedy(pool: Pool, m: int) -> Design:
-    """Return the design of the m candidates added one after another, each the one that raises det M most."""
+    """Return the design of m candidates added one after another, each time the candidate that raises det M most.
+
+    M (p, p) is the information of the chosen candidates and of the poses measured before.
+
+    Args:
+        pool: the candidates and the information of the poses measured before.
+        m: number of candidates to choose.
+    """
     design = design_of(pool, ())
     for _ in range(m):
         candidate, _ = best_addition(pool, design)
@@ -24,10 +31,11 @@ def greedy(pool: Pool, m: int) -> Design:
 
 
 def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: int = 50) -> Design:
-    """Return the design after replacing members one by one by the best candidate until no replacement raises det M.
+    """Return the design after replacing members one by one by the best candidate, until no replacement raises det M.
 
-    The modified Fedorov exchange (Fedorov 1972; one member after another: Cook & Nachtsheim 1980). The result is a
-    local optimum: no single exchange improves it.
+    M is the information matrix of the design. This is the modified Fedorov exchange (Fedorov 1972; one member after
+    another: Cook & Nachtsheim 1980). The result is a local optimum: no exchange of one member for one candidate
+    improves it.
 
     Args:
         pool: candidates.
@@ -54,17 +62,18 @@ def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: 
 def detmax(pool: Pool, design: Design, report: Report | None = None, *, longest: int = 6, failures: int = 40) -> Design:
     """Return a design with larger det M, searched by temporarily adding and removing poses (DETMAX).
 
-    DETMAX (Mitchell 1974, section 3): an excursion leaves the design of m poses upwards (add the best candidate) or
-    downwards (remove the member that costs least) and comes back; designs seen on an excursion that failed form the
-    failure list, and meeting one of them lengthens the excursion, up to m ± `longest`. The method ends when an
-    excursion runs over that length in both directions, or after `failures` excursions in a row without gain (ours).
+    M is the information matrix of the design. DETMAX (Mitchell 1974, section 3) makes excursions from the design of m
+    poses: candidates are added (the best first) or members removed (the one that costs least first), and then the size
+    is brought back to m. The designs passed on an excursion that gained nothing form the failure list. An excursion
+    that meets a listed design is lengthened, up to m ± `longest` poses. The method ends when excursions in both
+    directions exceed that length, or after `failures` excursions in a row without gain (our addition).
 
     Args:
         pool: candidates.
         design: start, of m poses.
-        report: called with every improved design.
-        longest: k, the farthest the excursion goes from m.
-        failures: excursions in a row without gain.
+        report: called with every improved design; None for no report.
+        longest: largest number of poses by which an excursion may differ from m.
+        failures: number of excursions in a row without gain after which the search ends.
     """
     failed: set[frozenset[int]] = set()
     fruitless = 0
@@ -98,21 +107,21 @@ def kicked(
     weights=None,
     seconds: float = np.inf,
 ) -> Design:
-    """Return the best design after random kicks: swap `size` members for random candidates, exchange, keep the better
-    set.
+    """Return the best design after random restarts near the present one.
 
-    Iterated local search (Lourenço, Martin & Stützle 2003). New members are drawn by their relaxed weights where known;
-    size and law are our choice.
+    Each round replaces `size` random members by random candidates, runs the exchange, and keeps the result if det M is
+    larger: iterated local search (Lourenço, Martin & Stützle 2003). New members are drawn with probabilities that rise
+    with their relaxed weights, where these are given. The number replaced and the probabilities are our choice.
 
     Args:
         pool: candidates.
         design: the design to start from.
-        rounds: number of kicks.
+        rounds: number of restarts.
         seed: seed of the draws.
         report: called with every improved design; None for no report.
-        size: members replaced by one kick.
-        weights: (N,) relaxed weights, None for equal ones.
-        seconds: processor time after which no further kick begins.
+        size: number of members replaced in one restart.
+        weights: (N,) relaxed weights; None for equal probabilities.
+        seconds: processor time [s] after which no further restart begins.
     """
     deadline = time.process_time() + seconds
     generator = np.random.default_rng(seed)
@@ -143,7 +152,17 @@ def kicked(
 def _excursion(
     pool: Pool, start: Design, upwards: bool, longest: int, failed: set[frozenset[int]]
 ) -> tuple[Design | None, set[frozenset[int]]]:
-    """Return the design at the end of one excursion (None if it exceeds m ± `longest`), and the designs passed."""
+    """Return the design at the end of one DETMAX excursion, and the sets of members passed on the way.
+
+    The design is None if the excursion exceeds m ± `longest` poses.
+
+    Args:
+        pool: the candidates.
+        start: design of m poses from which the excursion starts.
+        upwards: True adds poses first, False removes poses first.
+        longest: largest number of poses by which the excursion may differ from m.
+        failed: failure list: sets of members passed on earlier excursions without gain.
+    """
     m = len(start.members)
     passed = set[frozenset[int]]()
     design = start

@@ -3,8 +3,8 @@
 ``s1 >= ... >= sp`` are the singular values of the whitened observation matrix W of m poses, U and V its singular
 vectors.
 
-========  =========================  =========  ===========================================================
-index     formula                    direction  source
+========  =========================  =========  =========================================================== index
+formula                    direction  source
 ========  =========================  =========  ===========================================================
 ``O1``    (s1 s2 ... sp)^(1/p)/√m    maximise   Borm & Menq 1989/1991 (D-optimality: det(WᵀW)^(1/2p)/√m)
 ``O2``    sp / s1                    maximise   Driels & Pathre 1990
@@ -14,8 +14,9 @@ index     formula                    direction  source
 ``cond``  s1 / sp                    minimise   = 1/O2; the number the LWR4+ study minimises
 ========  =========================  =========  ===========================================================
 
-O1 is the default everywhere in this package: multiplying a column of W (changing the unit of a parameter) multiplies
-O1 of *every* set by the same factor, so its ranking of sets does not depend on units. That of O2-O5 and cond does.
+O1 is the default everywhere in this package: multiplying a column of W (changing the unit of a parameter) multiplies O1
+of *every* set by the same factor, so the ranking of sets by O1 does not depend on units. The ranking by O2-O5 and cond
+does.
 """
 
 from typing import Literal, get_args
@@ -30,12 +31,13 @@ _POWERS = {"O2": (1.0, 1.0), "O3": (1.0, 0.0), "O4": (2.0, 1.0), "cond": (1.0, 1
 
 
 def observability(W: ArrayLike, index: Index = "O1", m: int | None = None) -> float:
-    """Return an observability index of a set of poses; formulas: see the module's docstring.
+    """Return an observability index of a set of poses, by the formulas of the module's docstring.
 
     Args:
-        W: (m, rows, p) whitened Jacobians of the poses, or (m rows, p) the same stacked; unitless rows.
+        W: (m, rows, p) whitened Jacobians of the poses, or the same Jacobians stacked to (m rows, p). Rows have no
+            unit.
         index: one of "O1" ... "O5", "cond".
-        m: number of poses; needed for O1 of a stacked W only.
+        m: number of poses; only needed for O1 of a stacked W. None takes the length of W.
 
     Returns:
         The index; 0 (infinity for cond) where W has not full column rank.
@@ -50,9 +52,9 @@ def observability(W: ArrayLike, index: Index = "O1", m: int | None = None) -> fl
 def gradient(W: ArrayLike, index: Index = "O1", m: int | None = None) -> tuple[float, np.ndarray]:
     """Return an index and its gradient with respect to W.
 
-    ∂O/∂W = U diag(∂O/∂s) Vᵀ, because ∂s_i/∂W = u_i v_iᵀ. For O1 and O5, symmetric and smooth in s, it holds for any s;
-    for O2, O3, O4 and cond it exists only where the extreme singular values concerned are simple (elsewhere this is
-    one subgradient out of many).
+    ∂O/∂W = U diag(∂O/∂s) Vᵀ, because ∂s_i/∂W = u_i v_iᵀ. For O1 and O5, which are symmetric and smooth in s, this
+    gradient is valid for any s. For O2, O3, O4 and cond it exists only where the smallest and largest singular values
+    are distinct from the others; elsewhere the result is one of many subgradients.
 
     Args:
         W: (m, rows, p) or (m rows, p), of full column rank.
@@ -69,16 +71,16 @@ def gradient(W: ArrayLike, index: Index = "O1", m: int | None = None) -> tuple[f
 
 
 def merit(W: np.ndarray, index: Index, sharpness: float = np.inf) -> tuple[float, np.ndarray]:
-    """Return the merit that searches maximise, log O (−log cond; O1 with m = 1), and its gradient by W.
+    """Return the merit that the searches maximise, log O (−log cond; O1 with m = 1), and its gradient by W.
 
-    O2, O3, O4 and cond have kinks where singular values meet, which is where their optima lie. A finite sharpness a
-    replaces log s1 by (1/a) log Σ s_i^a and log sp by −(1/a) log Σ s_i^−a: smooth, and at most log(p)/a too pessimistic
-    in each. The gradient is exact, too.
+    O2, O3, O4 and cond have kinks where singular values coincide, and their optima lie at such kinks. A finite
+    sharpness a replaces log s1 by (1/a) log Σ s_i^a and log sp by −(1/a) log Σ s_i^−a. Both are smooth and at most
+    log(p)/a too pessimistic. The gradient of the smoothed merit is exact.
 
     Args:
         W: (rows in all, p) stacked observation matrix.
-        index: what is maximised.
-        sharpness: a; infinite for the index itself.
+        index: the observability index to maximise.
+        sharpness: a; infinite for no smoothing.
 
     Returns:
         The merit (−inf without full column rank) and its gradient (rows in all, p).
@@ -102,7 +104,7 @@ def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
     """Return the observability index from singular values (last axis, largest first).
 
     Args:
-        s: (..., p) singular values.
+        s: (..., p) singular values of the whitened observation matrix W of all poses.
         index: one of "O1" ... "O5", "cond".
         m: number of poses (used by O1).
 
@@ -128,14 +130,17 @@ def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
 
 
 def has_kinks(index: Index) -> bool:
-    """Return whether an index depends on single singular values, so that `merit` is smooth with a finite sharpness
-    only.
-    """
+    """Return whether an index depends on single singular values, so that its `merit` needs smoothing."""
     return index in _POWERS
 
 
 def log_slope(s: np.ndarray, index: Index) -> np.ndarray:
-    """Return ∂ log O / ∂s (p,) at the singular values s (p,), largest first."""
+    """Return ∂ log O / ∂s (p,) at the singular values s (p,), largest first.
+
+    Args:
+        s: (p,) singular values of the whitened observation matrix.
+        index: observability index O, "O1" ... "O5" or "cond".
+    """
     slope = np.zeros_like(s)
     if index == "O1":
         return 1.0 / (len(s) * s)
@@ -149,8 +154,9 @@ def log_slope(s: np.ndarray, index: Index) -> np.ndarray:
 
 
 def _soft_maximum(values: np.ndarray, sharpness: float) -> tuple[float, np.ndarray]:
-    """Return the smooth maximum (1/a) log Σ exp(a x) of values x, a = `sharpness`, and its derivatives by x; they sum
-    to 1.
+    """Return the smooth maximum (1/a) log Σ exp(a x) of `values` x with a = `sharpness`, and its derivatives by x.
+
+    The derivatives sum to 1.
     """
     top = values.max()
     weights = np.exp(sharpness * (values - top))
@@ -159,7 +165,16 @@ def _soft_maximum(values: np.ndarray, sharpness: float) -> tuple[float, np.ndarr
 
 
 def _stacked(W: ArrayLike, index: Index, m: int | None) -> tuple[np.ndarray, int]:
-    """Return W as (m rows, p), checked, and the number of poses m."""
+    """Return W, checked and stacked to (m rows, p), and the number of poses m.
+
+    Args:
+        W: (m, rows, p) or (m rows, p) Jacobians of the poses.
+        index: one of "O1" ... "O5", "cond".
+        m: number of poses; None takes the length of a W with three axes.
+
+    Raises:
+        BadInput: an unknown index, a wrong shape, values that are not finite, or no `m` where O1 needs it.
+    """
     if index not in get_args(Index):
         names = ", ".join(get_args(Index))
         raise BadInput(f"index '{index}' is not known; take one of {names}")

@@ -1,4 +1,4 @@
-"""Selection of poses by any method, and its result."""
+"""Selection of poses by any of the search methods, and the selection's result."""
 
 import time
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from .design import Design, Pool, design_of
 from .errors import BadInput, NotIdentifiable
 from .exchange import detmax, exchanged, greedy, kicked
 from .indices import Index, merit, observability
-from .information import Candidates, checked, log_det, prepared
+from .scaled_jacobians import Candidates, checked, log_det, prepared
 from .space import SearchSpace, is_feasible
 from .whole_space import Ceiling, bound_over_space
 
@@ -71,20 +71,20 @@ class Selection:
     """Chosen poses with their index, efficiency and bounds.
 
     Attributes:
-        q: (m, n) joint values [rad or m]; None where candidates came without joint values.
-        indices: (m,) into the candidates, rising; None for methods that leave the candidates.
+        q: (m, n) joint values [rad or m]; None where the candidates were given without joint values.
+        indices: (m,) indices of the chosen candidates, rising; None for methods whose poses are not candidates.
         index: name of the index the search improved.
-        value: that index of the chosen poses together with the poses measured before (m counts both).
+        value: value of that index for the chosen poses together with the poses measured before (m counts both).
         history: values of the index as the search improved it; the last is `value`.
-        efficiency: det(WᵀW)^(1/p) over the ceiling, at most 1.
-        bound: the convex relaxation over the candidates with its certificate; poses from elsewhere may exceed it.
-        ceiling: the bound that the efficiency is taken against: over all feasible poses where `climbs` were asked for,
-            else over the candidates and the chosen poses.
+        efficiency: det(WᵀW)^(1/p) divided by `ceiling.upper`, at most 1.
+        bound: upper bound by convex relaxation over the candidates; poses that are not candidates may exceed it.
+        ceiling: the upper bound used for the efficiency: over all feasible poses where the settings' `climbs` is above
+            0, else over the candidates and the chosen poses.
         random_baseline: best value of the index among 1000 random sets of the candidates.
-        seconds: wall-clock time, bound and baseline included.
+        seconds: wall-clock time [s], bound and baseline included.
         evaluations: designs accepted (detmax) or evaluations of the index (the others).
-        seed, method: what reproduces it.
-        interrupted: True after Ctrl-C: the best found until then.
+        seed, method: seed and method of the search, which reproduce the selection.
+        interrupted: True where Ctrl-C ended the search; the selection is then the best set reached.
     """
 
     q: np.ndarray | None
@@ -104,10 +104,10 @@ class Selection:
 
     @property
     def joints(self) -> np.ndarray:
-        """The joint values (m, n) [rad or m] of the chosen poses.
+        """Return the joint values (m, n) [rad or m] of the chosen poses.
 
         Raises:
-            BadInput: where candidates came without joint values.
+            BadInput: the candidates were given without joint values.
         """
         if self.q is None:
             raise BadInput("the candidates have no joint values: use `indices` of the chosen ones")
@@ -116,14 +116,14 @@ class Selection:
 
 @dataclass(frozen=True)
 class _Chosen:
-    """Result of a method.
+    """Poses chosen by one search method.
 
     Attributes:
-        members: indices into the candidates; None for methods that leave the candidates.
+        members: indices into the candidates; None for methods whose poses are not candidates.
         q: (m, n) joint values [rad or m]; None where `members` is given.
         merits: history of the merit log O, rising.
         evaluations: designs accepted, or evaluations of the index.
-        interrupted: True after Ctrl-C.
+        interrupted: True where Ctrl-C ended the search.
     """
 
     members: tuple[int, ...] | None
@@ -135,7 +135,7 @@ class _Chosen:
 
 @dataclass(frozen=True)
 class _Request:
-    """What every method is called with: the candidates, their bound, and the arguments of `select_poses`."""
+    """Input of every search method: the candidates, their upper bound, and the arguments of `select_poses`."""
 
     jacobians: np.ndarray
     q: np.ndarray | None
@@ -164,27 +164,36 @@ def select_poses(
 ) -> Selection:
     """Return m poses that make the parameters as observable as possible.
 
-    * ``detmax`` chooses among the candidates: rounded relaxation and greedy start, pair exchange, DETMAX excursions,
-      kicks (`calib.poses.exchange`); other indices than O1 go on from there by `calib.poses.by_index`.
-    * ``polish`` moves all joint values of that set at once (`calib.poses.continuous.local`).
-    * ``local`` does so from one random set of the candidates, ``multistart`` from `starts` of them
-      (`calib.poses.continuous.multistart`): the study's deterministic search and its remedy.
-    * ``mlsl`` looks for the best start everywhere, by NLopt's MLSL (`calib.poses.continuous.global_local`).
+    * ``detmax`` chooses among the candidates: start from the rounded relaxation and from a greedy set, pair exchange,
+      DETMAX excursions, random restarts (`calib.poses.exchange`). For indices other than O1 the resulting set is then
+      improved by `calib.poses.by_index`.
+    * ``polish`` starts from the set of ``detmax`` and improves all joint values at once
+      (`calib.poses.continuous.local`).
+    * ``local`` runs the same local search from one random set of candidates, as Kolyubin, Shiriaev & Jubien (2019) did
+      for the KUKA LWR4+. ``multistart`` runs it from `starts` random sets (`calib.poses.continuous.multistart`), to
+      avoid poor local optima.
+    * ``mlsl`` searches all joint values globally by NLopt's MLSL, then runs the local search
+      (`calib.poses.continuous.global_local`).
     * ``tabu`` is IMHATR, the two-stage meta-heuristic (`calib.poses.continuous.tabu`).
 
     Args:
-        jacobians: (N, rows, p) whitened observation Jacobians of the candidates in base columns; None takes them at q,
-            or at feasible Sobol poses of the space where q is None too.
-        m: number of poses to choose; none is taken twice by detmax.
+        jacobians: (N, rows, p) observation Jacobians of the candidates by the p base parameters, whitened: each row
+            divided by its standard deviation. None computes them by `space` at q, or at feasible Sobol poses where q is
+            None too.
+        m: number of poses to choose; detmax takes no candidate twice.
         settings: index, method and effort.
-        q: (N, n) joint values of the candidates [rad or m].
-        space: needed by all methods but detmax.
-        existing: (k, rows, p) whitened Jacobians of poses already measured; their information counts.
-        map: where multistart spreads its starts.
-        progress: called with (done, total, message).
+        q: (N, n) joint values of the candidates [rad or m]; None if unknown, or to draw them.
+        space: limits, constraints and Jacobian; needed by all methods but detmax. None without it.
+        existing: (k, rows, p) whitened Jacobians of poses already measured, whose information is added; None for no
+            such poses.
+        map: the builtin, or a parallel map on which multistart runs its starts.
+        progress: called with (done, total, message); None for no report.
 
     Raises:
-        BadInput, TooFewCandidates, NothingFeasible, NotIdentifiable
+        BadInput: an unknown method or index, invalid arrays, or no `space` where the method needs one.
+        TooFewCandidates: fewer candidates than m.
+        NothingFeasible: too few feasible poses can be drawn.
+        NotIdentifiable: m poses, or all candidates together, cannot determine all parameters.
     """
     began = time.perf_counter()
     method, index, seed = settings.method, settings.index, settings.seed
@@ -220,13 +229,13 @@ def select_poses(
 def random_baseline(
     jacobians: np.ndarray, m: int, index: Index = "O1", existing: np.ndarray | None = None, *, seed: int = 0, sets=1000
 ) -> float:
-    """Return the best index among random sets of m candidates: the baseline without optimisation.
+    """Return the best index among random sets of m candidates, as a baseline without optimisation.
 
     Args:
         jacobians: (N, rows, p) whitened Jacobians of the candidates.
         m: poses per set.
         index: "O1" ... "O5", "cond".
-        existing: (k, rows, p) Jacobians that count in every set; None without such.
+        existing: (k, rows, p) Jacobians of poses already measured, added to every set; None for no such poses.
         seed: seed of the draw.
         sets: number of sets drawn.
     """
@@ -273,7 +282,7 @@ def _candidates(
 
 
 def _exchange(task: _Request) -> _Chosen:
-    """Choose poses among the candidates by exchanges (detmax); after Ctrl-C return the best set until then."""
+    """Return the poses of `task` chosen by exchange of candidates (detmax); after Ctrl-C the best set reached."""
     candidates = task.candidates
     m = task.m
     p = task.jacobians.shape[2]
@@ -338,10 +347,12 @@ def _exchange(task: _Request) -> _Chosen:
 
 
 def _by_index(task: _Request, members: tuple[int, ...], seconds: float) -> _Chosen:
-    """Improve the D-optimal set `members` by exchanges for the requested index, where that is not O1.
+    """Return the D-optimal set `members` improved by exchanges for the requested index, where the index is not O1.
 
     Args:
-        seconds: processor time after which it is not restarted any more.
+        task: candidates and arguments of `select_poses`.
+        members: indices of the set's candidates.
+        seconds: processor time [s] after which the exchange is not restarted any more.
     """
     p = task.jacobians.shape[2]
     past = np.zeros((0, p))
@@ -371,7 +382,11 @@ def _by_index(task: _Request, members: tuple[int, ...], seconds: float) -> _Chos
 
 
 def _polished(task: _Request) -> _Chosen:
-    """Choose poses among the candidates, then improve all joint values continuously."""
+    """Return poses chosen among the candidates, then improved in all joint values continuously.
+
+    Args:
+        task: candidates, search space and arguments of `select_poses`.
+    """
     began = time.process_time()
     chosen = _exchange(task)
     if chosen.interrupted:
@@ -387,7 +402,12 @@ def _polished(task: _Request) -> _Chosen:
 
 
 def _multistart(task: _Request, starts: int) -> _Chosen:
-    """Run the local search from random sets of candidates."""
+    """Return the best result of the local search from `starts` random sets of candidates.
+
+    Args:
+        task: candidates, search space and arguments of `select_poses`.
+        starts: number of random sets.
+    """
     space, joints = _movable(task)
 
     def report(number: int, _: Improved) -> None:
@@ -407,7 +427,11 @@ def _multistart(task: _Request, starts: int) -> _Chosen:
 
 
 def _mlsl(task: _Request) -> _Chosen:
-    """Search for a set everywhere within the limits, beginning at a random set of candidates."""
+    """Return a set of poses searched by MLSL within the joint limits, beginning at a random set of candidates.
+
+    Args:
+        task: candidates, search space and arguments of `select_poses`.
+    """
     space, joints = _movable(task)
     task.progress(0, 1, "global search")
     [start] = random_starts(joints, task.m, 1, task.seed)
@@ -502,7 +526,14 @@ def _selection(task: _Request, chosen: _Chosen, baseline: float, began: float) -
 
 
 def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
-    """Return bound over the candidates and the chosen poses q, or over all feasible poses if `climbs` is above 0."""
+    """Return the upper bound over the candidates and the chosen poses q; over all feasible poses if `climbs` > 0.
+
+    Args:
+        task: candidates with their bound, and arguments of `select_poses`; without a search space its bound is
+            returned.
+        q: (m, n) chosen poses [rad or m]; None: the bound over the candidates is returned.
+        climbs: number of local searches for poses that exceed the bound (`bound_over_space`).
+    """
     space, joints = task.space, task.q
     if space is None or joints is None or q is None or (not climbs and np.isin(q, joints).all()):
         return Ceiling(task.bound.upper, task.bound.gap, 0, 0.0, np.zeros((0, 0)), 0)
@@ -515,7 +546,13 @@ def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
 
 
 def _value(jacobians: np.ndarray, existing: np.ndarray | None, index: Index) -> float:
-    """Return the index of the Jacobians of the chosen poses and of the poses measured before, together."""
+    """Return the index of the chosen poses and the poses measured before, together, from their Jacobians.
+
+    Args:
+        jacobians: (m, rows, p) whitened Jacobians of the chosen poses.
+        existing: (k, rows, p) those of the poses measured before; None without such poses.
+        index: name of the observability index.
+    """
     p = jacobians.shape[2]
     if existing is None:
         return observability(jacobians.reshape(-1, p), index, len(jacobians))

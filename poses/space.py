@@ -1,4 +1,4 @@
-"""Search space of continuous searches: limits, constraints, predicate, and Jacobian."""
+"""Search space of the continuous searches: joint limits, constraints, predicate, and observation Jacobian."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,8 +17,8 @@ class PoseConstraint:
 
     Attributes:
         name: the constraint's name in messages.
-        function: (m, n) -> (m, k), feasible where ≤ 0; a pose's values depend on that pose only.
-        gradient: (m, n) -> (m, k, n); None takes central differences of `function` in one batch.
+        function: (m, n) -> (m, k), satisfied where ≤ 0; each pose's values depend on that pose only.
+        gradient: (m, n) -> (m, k, n); None computes central differences of `function` in one batch.
     """
 
     name: str
@@ -31,14 +31,13 @@ class SearchSpace:
     """The continuous search space of poses.
 
     Attributes:
-        jacobian: (m, n) -> (m, rows, p) whitened observation Jacobians in base columns.
+        jacobian: (m, n) -> (m, rows, p) whitened observation Jacobians by the base parameters.
         lower, upper: (n,) joint limits [rad or m].
-        jacobian_product: (q: (m, n), G: (m, rows, p)) -> (m, n), Σ_rp G[i,r,p] ∂J[i,r,p]/∂q[i,k]; None takes central
+        jacobian_product: (q: (m, n), G: (m, rows, p)) -> (m, n), Σ_rp G[i,r,p] ∂J[i,r,p]/∂q[i,k]; None computes central
             differences of `jacobian` in one batch of 2 m n poses.
-        constraints: inequalities that candidates and results of searches satisfy.
+        constraints: inequalities that candidates and search results must satisfy.
         feasible: (m, n) -> (m,) bool, a predicate for conditions without gradient (collision, visibility by ray
-            casting);
-            None accepts all.
+            casting); None accepts all.
 
     Raises:
         BadInput: limits that are not two finite (n,) arrays with lower < upper.
@@ -64,7 +63,13 @@ class SearchSpace:
 
 
 def is_feasible(space: SearchSpace, q: np.ndarray, tolerance: float = 1e-8) -> np.ndarray:
-    """Return whether each pose q (m, n) satisfies limits, constraints and predicate, (m,) bool."""
+    """Return whether each pose q (m, n) satisfies joint limits, constraints and predicate, (m,) bool.
+
+    Args:
+        space: joint limits, constraints and predicate.
+        q: (m, n) joint values [rad or m].
+        tolerance: excess of a joint limit [rad or m] or a constraint's value that still counts as satisfied.
+    """
     above_lower = q >= space.lower - tolerance
     below_upper = q <= space.upper + tolerance
     good = np.all(above_lower & below_upper, axis=1)
@@ -80,7 +85,12 @@ def is_feasible(space: SearchSpace, q: np.ndarray, tolerance: float = 1e-8) -> n
 
 
 def product(space: SearchSpace, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-    """Return Σ_rp G[i,r,p] ∂J[i,r,p]/∂q[i,k] (m, n): exact if the space provides it, else by central differences."""
+    """Return Σ_rp G[i,r,p] ∂J[i,r,p]/∂q[i,k] (m, n), by `space.jacobian_product`, else by central differences.
+
+    Args:
+        q: (m, n) joint values [rad or m].
+        G: (m, rows, p) weights of the entries of the Jacobians J (m, rows, p) at q.
+    """
     if space.jacobian_product is not None:
         return np.asarray(space.jacobian_product(q, G), dtype=float)
     slopes = central_difference(space.jacobian, q)
@@ -88,21 +98,24 @@ def product(space: SearchSpace, q: np.ndarray, G: np.ndarray) -> np.ndarray:
 
 
 def constraint_values(space: SearchSpace, q: np.ndarray) -> np.ndarray:
-    """Return values of all constraints (m, k) at poses q (m, n); a constraint is satisfied where its value is ≤ 0."""
+    """Return the values (m, k) of all constraints of `space` at poses q (m, n); a constraint is satisfied where ≤ 0."""
     empty = np.zeros((len(q), 0))
     values = [np.asarray(constraint.function(q)) for constraint in space.constraints]
     return np.concatenate([empty, *values], axis=1)
 
 
 def constraint_gradients(space: SearchSpace, q: np.ndarray) -> np.ndarray:
-    """Return the derivatives of `constraint_values` with respect to q, (m, k, n)."""
+    """Return the derivatives of `constraint_values` of `space` with respect to q, (m, k, n), at poses q (m, n)."""
     empty = np.zeros((len(q), 0, q.shape[1]))
     gradients = [constraint_gradient(constraint, q) for constraint in space.constraints]
     return np.concatenate([empty, *gradients], axis=1)
 
 
 def constraint_gradient(constraint: PoseConstraint, q: np.ndarray) -> np.ndarray:
-    """Return the gradient ∂c/∂q (m, k, n) of a constraint's values c at poses q (m, n)."""
+    """Return the gradient ∂c/∂q (m, k, n) of the values c of `constraint` at poses q (m, n).
+
+    Without `PoseConstraint.gradient` it is computed by central differences.
+    """
     if constraint.gradient is not None:
         return np.asarray(constraint.gradient(q), dtype=float)
     slopes = central_difference(constraint.function, q)
@@ -110,7 +123,10 @@ def constraint_gradient(constraint: PoseConstraint, q: np.ndarray) -> np.ndarray
 
 
 def central_difference(function: Callable[[np.ndarray], np.ndarray], q: np.ndarray) -> np.ndarray:
-    """Return ∂f_i/∂q_ik (m, n, ...) of a function (m, n) -> (m, ...) with independent poses, in one batch."""
+    """Return ∂f_i/∂q_ik (m, n, ...) of a function f: (m, n) -> (m, ...), evaluated in one batch.
+
+    Each row of f depends on the same row of q only.
+    """
     m, n = q.shape
     steps = STEP * np.eye(n)
     forwards = q[:, None] + steps

@@ -1,18 +1,19 @@
-"""An upper bound over all poses within limits and constraints, not only over the candidates.
+"""Upper bound on det(WᵀW) over all poses within limits and constraints, not only over the candidates.
 
-The relaxation of `calib.poses.convex`, with poses allowed to repeat, over all feasible poses: a design is a measure ξ
-of mass m. By the general equivalence theorem (Kiefer & Wolfowitz 1960), for any M = M_known + ∫ JᵀJ dξ ≻ 0 and any m
-poses
+The relaxation of `calib.poses.convex`, with poses allowed to repeat, is extended to all feasible poses: a design is a
+measure ξ of mass m. By the general equivalence theorem (Kiefer & Wolfowitz 1960), for any M = M_known + ∫ JᵀJ dξ ≻ 0
+and any m poses
 
     det M(q_1 ... q_m)^(1/p)  ≤  det M^(1/p) · (tr(M⁻¹ M_known) + m max_q d(q)) / p,    d(q) = tr(J(q) M⁻¹ J(q)ᵀ),
 
-the maximum over all feasible q. Candidates are the first support. Then, in rounds (Wynn 1970 added one pose, here all
-local maxima that are reached), single poses climb d from the best poses known and from random ones under the
-constraints, with exact gradients; the ends of the climbs join the support, and the relaxation is solved again.
+where the maximum is over all feasible q. The candidates are the first support of ξ (the poses with positive weight).
+Then local searches maximise d(q) over single poses under the constraints, with exact gradients. They start from the
+support poses of largest d and from random poses. Their end poses are added to the support and the relaxation is solved
+again, for several rounds. (Wynn 1970 added one pose per round; here all local maxima found are added.)
 
-**What is certain.** The formula holds for every pose at which d was evaluated: the candidates, the chosen poses, all
-ends of climbs. That no other pose has a larger d rests on the climbs having reached the global maximum of d, which
-random starts make likely and do not prove; `Ceiling.climbs` is the number of climbs that found no larger d.
+**What is certain.** The bound covers every pose at which d was evaluated: the candidates, the chosen poses, and the end
+poses of all local searches. Random starts make it likely, but do not prove, that the local searches reached the global
+maximum of d. `Ceiling.climbs` is the number of local searches that found no larger d.
 """
 
 from collections.abc import Callable
@@ -23,12 +24,12 @@ import numpy as np
 from .candidates import draw_candidates
 from .continuous.local import climb, restored
 from .convex import information_of, relaxed, scores_of
-from .information import log_det, prepared
+from .scaled_jacobians import log_det, prepared
 from .space import SearchSpace, is_feasible, product
 
-# poses optimised together: few for a fast SLSQP, many for an efficient Jacobian (our choice)
+# number of poses optimised together: few for a fast SLSQP, many for an efficient Jacobian (our choice)
 BLOCK = 8
-# poses that differ by less in all joints are one start [rad or m] (our choice)
+# poses that differ by less in all joints are treated as one start [rad or m] (our choice)
 MIN_DIFFERENCE = 0.1
 
 
@@ -39,12 +40,12 @@ class Ceiling:
     Attributes:
         upper: the bound.
         gap: upper / det M^(1/p) − 1, the most by which the bound may exceed the relaxed optimum, relative.
-        climbs: local searches of the last round for a pose that exceeds the bound, all without success; 0: the bound
-            covers the candidates and the chosen poses only.
-        excess: by how much the best pose of these searches exceeds the largest d of the support, relative; 0 where it
-            does not.
-        support: (K, n) poses that carry the relaxed design [rad or m].
-        evaluations: evaluations of d in all climbs, counted per pose.
+        climbs: number of local searches of the last round, none of which found a pose that exceeds the bound; 0: the
+            bound covers the candidates and the chosen poses only.
+        excess: relative amount by which the largest d found by these searches exceeds the largest d of the support; 0
+            where it does not exceed it.
+        support: (K, n) poses with positive weight in the relaxed design [rad or m].
+        evaluations: evaluations of d in all local searches, counted per pose.
     """
 
     upper: float
@@ -67,18 +68,19 @@ def bound_over_space(
     seed: int = 0,
     report: Callable[[int, float], None] | None = None,
 ) -> Ceiling:
-    """Return an upper bound on det(WᵀW)^(1/p) of any m feasible poses; see the module's docstring.
+    """Return an upper bound on det(WᵀW)^(1/p) of any m feasible poses, as defined in the module's docstring.
 
     Args:
         space: limits, constraints, Jacobian.
-        q: (N, n) feasible poses to begin with: the candidates, and the chosen poses, which the bound then covers.
+        q: (N, n) feasible poses to begin with: the candidates and the chosen poses. The bound covers all of them.
         m: number of poses.
         existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
-        climbs: local searches of the last round, half from the highest d, half from random poses; 0: none.
+        climbs: number of local searches of the last round, half of them from the poses of largest d, half from random
+            poses; 0: none.
         rounds: largest number of rounds.
         tolerance: relative excess of d at which the rounds end.
         seed: seed of the random poses.
-        report: called with each round's number and the gap; None for no report.
+        report: called with each round's index (from 0) and the relative gap of the bound; None for no report.
     """
     generator = np.random.default_rng([seed, 5])
     jacobians = np.asarray(space.jacobian(q), dtype=float)
@@ -137,7 +139,13 @@ def bound_over_space(
 
 
 def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return feasible local maxima (K, n) of d(q) = ‖J(q) root‖² from start poses, and the number of evaluations."""
+    """Return feasible local maxima (K, n) of d(q) = ‖J(q) root‖² from start poses, and the number of evaluations.
+
+    Args:
+        space: limits, constraints, predicate, Jacobian J.
+        starts: (K, n) poses [rad or m], each improved on its own.
+        root: (p, p) root of M⁻¹ = root rootᵀ, the inverse of the present information.
+    """
 
     def objective(q: np.ndarray) -> tuple[float, np.ndarray]:
         spread = np.asarray(space.jacobian(q), dtype=float) @ root
@@ -164,7 +172,15 @@ def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[
 def _starts(
     space: SearchSpace, q: np.ndarray, scores: np.ndarray, count: int, generator: np.random.Generator
 ) -> np.ndarray:
-    """Return `count` start poses: half with the highest scores d, pairwise distinct, and half at random."""
+    """Return `count` start poses: half with the largest scores d, pairwise distinct, and half drawn at random.
+
+    Args:
+        space: limits, constraints and predicate of the random poses.
+        q: (N, n) poses to choose from [rad or m].
+        scores: (N,) d of these poses.
+        count: number of start poses.
+        generator: source of the random poses.
+    """
     order = np.argsort(-scores, kind="stable")[: 20 * count]
     ranked_count = count - count // 2
     ranked = _apart(q[order])[:ranked_count]
@@ -176,7 +192,7 @@ def _starts(
 
 
 def _apart(q: np.ndarray) -> np.ndarray:
-    """Return poses out of q (N, n), in order, that differ pairwise by more than `MIN_DIFFERENCE` in some joint."""
+    """Return those poses of q (N, n), in order, that differ pairwise by more than `MIN_DIFFERENCE` in some joint."""
     distinct = np.zeros((0, q.shape[1]))
     for pose in q:
         if not len(distinct) or (np.abs(distinct - pose).max(1) > MIN_DIFFERENCE).all():

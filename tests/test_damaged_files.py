@@ -21,7 +21,7 @@ from calib.data.images.detection import detect
 from calib.data.images.images import decode as read_image_of
 from calib.data.images.images import read_image
 from calib.data.images.lens import Lens, read_lens, write_lens
-from calib.data.images.pixels import Found, read_corners, write_corners
+from calib.data.images.pixels import Detections, read_corners, write_corners
 from calib.data.poses.fit_options import read_options
 from calib.data.poses.pose_files import read_measurements
 from calib.data.poses.pose_lists import read_poses, read_targets
@@ -110,7 +110,7 @@ def picture(tmp: Path) -> bytes:
 
 def corner_table(tmp: Path) -> bytes:
     found = detect(read_image_of(picture(tmp)), BOARD)
-    return write_corners(tmp / "made_corners.csv", Found({"a.png": found}, (200, 200))).read_bytes()
+    return write_corners(tmp / "made_corners.csv", Detections({"a.png": found}, (200, 200))).read_bytes()
 
 
 def look(path: Path) -> None:

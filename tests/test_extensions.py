@@ -63,7 +63,7 @@ def test_a_misspelt_name_is_told(add):
 
 def test_an_extension_that_raises_is_told(add):
     add("extra", "OFFERS = {'commands': 'commands:app'}\nimport nothing_of_the_kind")
-    words = r"the extension calib\.apps\.extra does not load: ModuleNotFoundError: .*'nothing_of_the_kind'; mend it"
+    words = r"the extension calib\.apps\.extra does not load: ModuleNotFoundError: .*'nothing_of_the_kind'; correct it"
     with pytest.raises(UsageError, match=words):
         Point("commands", "").all()
 

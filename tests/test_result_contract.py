@@ -11,7 +11,7 @@ import pytest
 import calib
 from calib import cli
 from calib.api.rendering import Kept
-from calib.apps.fleet.report import FleetReport
+from calib.apps.fleet.fleet_report import FleetReport
 from calib.apps.monitoring.comparison.robot_change import RobotChange
 from calib.apps.monitoring.drift_page import DriftFound, drift
 from calib.apps.monitoring.log import LogLine, RobotLog
@@ -24,8 +24,8 @@ from calib.parallel.mechanism.geometric_fit import changed, loop_parameters
 from calib.parallel.robots import find
 from calib.procedure.findings import LEVELS
 from calib.result_kinds import BY_NAME, KINDS, TAKES, kind_of
-from calib.results.registry import CLASSES, open_result
 from calib.results.result import ExportSettings
+from calib.results.result_classes import CLASSES, open_result
 from calib.robot import description
 from calib.robot.library import load
 
@@ -249,7 +249,7 @@ def test_a_verb_works_or_says_what_it_takes(kind, verb, results, tmp_path, capsy
     if folder.is_file():
         assert "give" in said
         return
-    nouns = [recognised.noun if recognised else "holds no result", "parallel robot"]
+    nouns = [recognised.noun if recognised else "contains no result", "parallel robot"]
     assert any(noun in said for noun in nouns[: 1 + kind.startswith("parallel")])
 
 

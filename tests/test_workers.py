@@ -305,7 +305,7 @@ def test_self_starting_script_is_told(tmp_path: Path) -> None:
     """A script that starts itself again is told."""
     running = script(tmp_path, guard="True")
     _, err = running.communicate(timeout=SECONDS)
-    assert "CalibError: worker processes die at start" in err and "lacks if __name__" in err
+    assert "CalibError: worker processes die at start" in err and "lack if __name__" in err
 
 
 def test_nearly_done_survives_one_interrupt() -> None:

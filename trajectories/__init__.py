@@ -1,1 +1,1 @@
-"""Experiment design for dynamics: exciting motions within limits, from arrays and callables (no robot classes)."""
+"""Experiment design for dynamics: exciting motions within limits, from arrays and callables, without robot classes."""

@@ -1,9 +1,8 @@
 """A smooth approach from any pose to the start of a motion, within velocity, acceleration and jerk limits.
 
-Ruckig (Berscheid & Kröger 2021, an open relative of the Reflexxes library that the 2019 study used) computes the
-fastest
-jerk-limited motion; all joints move in proportion, so the approach is a straight line in joint space and stays between
-its ends. Ruckig is imported at the first call.
+Ruckig (Berscheid & Kröger 2021, an open relative of the Reflexxes library that Kolyubin, Shiriaev, Jubien 2019 used)
+computes the fastest jerk-limited motion. All joints move in proportion, so the approach is a straight line in joint
+space between its two ends. Ruckig is imported at the first call.
 """
 
 import math
@@ -20,15 +19,17 @@ KINDS: tuple[str, ...] = ("velocity", "acceleration", "jerk")
 def straight_approach(
     start: np.ndarray, goal: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, jerk: np.ndarray, rate: float
 ) -> Setpoints:
-    """Return the setpoints of the fastest approach from rest to rest, its duration rounded up to whole samples.
+    """Return the setpoints of the fastest straight approach from rest at `start` to rest at `goal`.
+
+    The duration is rounded up to whole samples.
 
     Args:
         start, goal: (n,) joint values [rad or m].
-        velocity, acceleration, jerk: (n,) largest moduli [rad or m, per s, s², s³], finite and above zero.
+        velocity, acceleration, jerk: (n,) largest absolute values [rad or m, per s, s², s³], finite and above zero.
         rate: sampling rate of the controller [Hz].
 
     Raises:
-        BadInput: poses, limits or a rate that are not valid, with the joint; or no approach was found.
+        BadInput: invalid poses, limits or rate (the message names the joint), or Ruckig found no approach.
     """
     start = np.asarray(start, dtype=float)
     goal = np.asarray(goal, dtype=float)

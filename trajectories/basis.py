@@ -1,9 +1,9 @@
-"""Motions that are linear in free variables: common part of the Fourier and B-spline families.
+"""Motions that are linear in free variables: common base of the Fourier and B-spline families.
 
     d^r q_j / dt^r (t_i) = offset_j[r, i] + Σ_c table_j[r, i, c] · x_{j,c},      r = 0 … 3
 
-Rest at start and end is an equation on a family's coefficients; it is eliminated by c_j = particular_j + null_j x_j, so
-every x gives a motion that starts and ends at rest.
+Rest at start and end is a linear equation on the coefficients of a family. The equation is eliminated by c_j =
+particular_j + null_j x_j, so that every x gives a motion that starts and ends at rest.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ ORDERS = ("position", "velocity", "acceleration", "jerk")
 
 @dataclass(frozen=True, eq=False)
 class SampledMotion:
-    """Samples of a motion with position, velocity, acceleration and jerk.
+    """Position, velocity, acceleration and jerk of a motion at N sample times.
 
     Attributes:
         times: (N,) [s].
@@ -40,7 +40,10 @@ class SampledMotion:
         return len(self.times)
 
     def evaluated(self, regressor: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-        """Return regressor(q, v, a), evaluated once: objectives and torque limits share it."""
+        """Return regressor(q, v, a) (N, n, b) of the samples, which maps b dynamic parameters to torques.
+
+        The result is stored at the first call, so that objectives and torque limits share it.
+        """
         if regressor not in self._evaluated:
             self._evaluated[regressor] = regressor(self.q, self.v, self.a)
         return self._evaluated[regressor]
@@ -50,19 +53,22 @@ class SampledMotion:
         return self.q, self.v, self.a, self.jerk
 
     def part(self, rows: np.ndarray) -> SampledMotion:
-        """Return the samples at the given row numbers."""
+        """Return the samples at the indices `rows` (from 0), or where the mask `rows` (N,) is True."""
         return SampledMotion(self.times[rows], self.q[rows], self.v[rows], self.a[rows], self.jerk[rows])
 
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """A motion family evaluated at fixed times.
+    """A motion family evaluated at fixed times: the motion as a linear function of free variables x.
+
+    The variables are the coefficients (Fourier coefficients, control points) that the equations of rest leave free.
 
     Attributes:
         times: (N,) [s].
-        offsets: (4, N, n) position, velocity, acceleration and jerk at zero variables.
-        tables: (n, 4, N, c) their derivatives by the variables of each joint, zero where a joint has fewer than c.
-        used: (n, c) True where a joint has that variable; x stacks the variables joint after joint.
+        offsets: (4, N, n) position, velocity, acceleration and jerk of the motion whose variables are all zero.
+        tables: (n, 4, N, c) derivatives of these four by the variables of each joint, zero where a joint has fewer than
+            c variables; c is the largest number of variables of a joint.
+        used: (n, c) True where a joint has that variable; x lists the variables joint after joint.
     """
 
     times: np.ndarray
@@ -72,7 +78,7 @@ class Basis:
 
     @property
     def p(self) -> int:
-        """Number of variables."""
+        """Number of variables of all joints."""
         return int(self.used.sum())
 
     @property
@@ -80,7 +86,7 @@ class Basis:
         return len(self.used)
 
     def motion(self, x: np.ndarray) -> SampledMotion:
-        """Return the motion of variables x (p,)."""
+        """Return the motion for variables x (p,)."""
         spread = np.zeros(self.used.shape)
         spread[self.used] = x
         n, _, count, c = self.tables.shape
@@ -91,7 +97,7 @@ class Basis:
         return SampledMotion(self.times, *orders)
 
     def nearest(self, q: np.ndarray) -> np.ndarray:
-        """Return the variables (p,) whose motion comes nearest to positions q (N, n): least squares over the times."""
+        """Return the variables (p,) whose motion fits positions q (N, n) best, by least squares over the times."""
         variables = np.zeros(self.used.shape)
         for j, exists in enumerate(self.used):
             position_table = self.tables[j, 0][:, exists]
@@ -100,7 +106,12 @@ class Basis:
         return variables[self.used]
 
     def adjoint(self, slopes: np.ndarray) -> np.ndarray:
-        """Return gradients (m, p) in x of m functions, from their gradients (m, 4, N, n) in q, v, a, jerk."""
+        """Return the gradients (m, p) of m functions by the free variables.
+
+        Args:
+            slopes: (m, 4, N, n) gradients of the m functions by position, velocity, acceleration and jerk at the N
+                times.
+        """
         m, _, count, n = slopes.shape
         by_joint = slopes.transpose(3, 0, 1, 2)
         flat = by_joint.reshape(n, m, 4 * count)
@@ -110,7 +121,10 @@ class Basis:
 
 
 class Family(Protocol):
-    """Interface of a family of periodic motions for the optimiser; see `Fourier` and `BSpline`."""
+    """Interface of a family of periodic motions for the optimiser.
+
+    `calib.trajectories.fourier.Fourier` and `calib.trajectories.bspline.BSpline` implement it.
+    """
 
     @property
     def period(self) -> float: ...
@@ -126,14 +140,22 @@ class Family(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """Coefficients (C,) of a joint that satisfy its equations: particular (C,) + null (C, c) x, with free x (c,)."""
+    """All solutions of a joint's linear equations on its C coefficients: particular + null · x for any x (c,).
+
+    Attributes:
+        particular: (C,) one solution.
+        null: (C, c) basis of the null space of the equations.
+    """
 
     particular: np.ndarray
     null: np.ndarray
 
 
 def freedom(rows: np.ndarray, values: np.ndarray) -> Freedom:
-    """Return the solutions of the equations rows (e, C) · coefficients = values (e,).
+    """Return all solutions of e linear equations on a joint's C coefficients.
+
+    Args:
+        rows, values: the equations rows (e, C) · coefficients = values (e,).
 
     Raises:
         BadInput: the equations have no solution.
@@ -150,13 +172,13 @@ def freedom(rows: np.ndarray, values: np.ndarray) -> Freedom:
 def holding(
     counts: Sequence[int], none: int, start: np.ndarray | None, held: Mapping[int, float] | None
 ) -> tuple[tuple[int, ...], list[float | None]]:
-    """Return coefficient counts and start values of the joints, including joints held at a fixed value.
+    """Return coefficient counts and start values of the joints, where some joints are locked at a fixed value.
 
     Args:
-        counts: coefficient count of each joint.
-        none: the count that locks a joint.
+        counts: number of coefficients (Fourier coefficients or control points) of each joint.
+        none: the coefficient count that locks a joint.
         start: (n,) joint values at the start [rad or m]; None leaves them free.
-        held: joint index to the value [rad or m] at which it is held; None holds no joint.
+        held: index (from 0) of each locked joint, with its value [rad or m]; None locks no joint.
 
     Returns:
         The counts, and the start value of each joint, None where it is free.
@@ -170,7 +192,9 @@ def holding(
         first = [float(start[j]) for j in range(len(counts))]
     for j, value in (held or {}).items():
         if not 0 <= j < len(values) or not np.isfinite(value):
-            raise BadInput(f"joint {j + 1} of {len(values)} cannot be held at {value:g}")
+            raise BadInput(
+                f"joint {j + 1} of {len(values)} cannot be held at {value:g}; choose a joint and a finite value"
+            )
         if start is not None and start[j] != value:
             raise BadInput(f"joint {j + 1} is held at {value:g}, but the motion starts from {start[j]:g}")
         values[j] = none
@@ -179,8 +203,13 @@ def holding(
 
 
 def assemble(times: np.ndarray, tables: Sequence[np.ndarray], freedoms: Sequence[Freedom]) -> Basis:
-    """Return the basis at times (N,) from the joints' coefficient tables (4, N, C_j) and the solutions of their
-    equations.
+    """Return the basis at times (N,) [s].
+
+    Args:
+        times: (N,) [s].
+        tables: for each joint, the derivatives (4, N, C_j) of position, velocity, acceleration and jerk by its C_j
+            coefficients.
+        freedoms: for each joint, the coefficients that satisfy its equations of rest and start value.
     """
     n = len(tables)
     widths = [free.null.shape[1] for free in freedoms]
@@ -197,14 +226,24 @@ def assemble(times: np.ndarray, tables: Sequence[np.ndarray], freedoms: Sequence
 
 
 def counts_of_joints(counts: int | Sequence[int], joints: int | None) -> tuple[int, ...]:
-    """Return the count of each joint, from one number for all joints or one number per joint."""
+    """Return the coefficient count of each joint, from one number for all joints or one number per joint.
+
+    Args:
+        counts: one number, or one number per joint.
+        joints: number of joints, needed where `counts` is one number.
+    """
     if isinstance(counts, Sequence | np.ndarray):
         return tuple(int(count) for count in counts)
     return (int(counts),) * (joints or 0)
 
 
 def joined(freedoms: Sequence[Freedom], x: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the coefficients (C_j,) of every joint for variables x (p,)."""
+    """Return the coefficients (C_j,) of every joint for free variables x (p,), which are ordered joint after joint.
+
+    Args:
+        freedoms: for each joint, its coefficients as a linear function of its part of x.
+        x: (p,) free variables of all joints.
+    """
     widths = [free.null.shape[1] for free in freedoms]
     ends = np.cumsum(widths)[:-1]
     parts = np.split(x, ends)
@@ -212,7 +251,12 @@ def joined(freedoms: Sequence[Freedom], x: np.ndarray) -> tuple[np.ndarray, ...]
 
 
 def projected(freedoms: Sequence[Freedom], coefficients: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the variables (p,) whose coefficients are nearest to the given ones (C_j,) of every joint."""
+    """Return the variables (p,) whose coefficients are nearest to the given coefficients (C_j,) of every joint.
+
+    Args:
+        freedoms: for each joint, its coefficients as a linear function of its variables.
+        coefficients: for each joint, the coefficients (C_j,) to approximate by least squares.
+    """
     variables = []
     for free, values in zip(freedoms, coefficients):
         displacement = np.asarray(values) - free.particular
@@ -221,7 +265,7 @@ def projected(freedoms: Sequence[Freedom], coefficients: Sequence[np.ndarray]) -
 
 
 def sample_times(period: float, count: int, shift: float = 0.0) -> np.ndarray:
-    """Return `count` equidistant times [s] over one period, the end excluded, moved by `shift` steps."""
+    """Return `count` equidistant times [s] over one period, without its end, shifted by `shift` sampling steps."""
     return (np.arange(count) + shift) * (period / count)
 
 
@@ -229,7 +273,7 @@ def aligned_period(period: float, rate: float) -> int:
     """Return the number of samples at a controller's rate [Hz] in one period [s].
 
     Raises:
-        BadInput: the number is not whole, so that averaging over periods would mix instants.
+        BadInput: the number is not whole, so that averaging over periods would mix different instants of the motion.
     """
     count = period * rate
     if not np.isfinite(count) or count < 1 or abs(count - round(count)) > 1e-6:

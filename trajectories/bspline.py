@@ -1,6 +1,8 @@
-"""Periodic B-splines, with the interface of `calib.trajectories.fourier`.
+"""Periodic B-splines, with the same interface as the Fourier series of `calib.trajectories.fourier`.
 
-q_j(t) = Σ_{i=1}^{C} c_ji B_i(t),    uniform knots over one period, B_i periodic of a stated degree (5: smooth jerk)
+    q_j(t) = Σ_{i=1}^{C} c_ji B_i(t)
+
+The knots are uniform over one period, and the basis functions B_i are periodic and of a given degree (5: smooth jerk).
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,13 +17,13 @@ from .errors import BadInput, require
 
 @dataclass(frozen=True, eq=False)
 class BSpline:
-    """Family of periodic splines as joint motions.
+    """Family of joint motions as periodic splines.
 
     Attributes:
         period: T0 [s].
-        counts: (n,) control points C of each joint; 1 holds the joint at a constant.
+        counts: (n,) number C of control points of each joint; 1 locks the joint at a constant value.
         degree: degree of the polynomial pieces.
-        freedoms: for each joint, the control points that satisfy its equations.
+        freedoms: for each joint, the control points that satisfy the equations of rest and start value.
     """
 
     period: float
@@ -34,20 +36,30 @@ class BSpline:
         return len(self.counts)
 
     def basis(self, times: np.ndarray) -> Basis:
-        """Return the family's basis at times (N,) [s]."""
+        """Return the linear map from the family's free variables to the motion at times (N,) [s]."""
         tables = [_table(times, self.period, count, self.degree) for count in self.counts]
         return assemble(times, tables, self.freedoms)
 
     def coefficients(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the control points (C,) of every joint [rad or m]."""
+        """Return the control points (C,) of every joint [rad or m] for the family's free variables x (p,)."""
         return joined(self.freedoms, x)
 
     def variables(self, coefficients: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the variables (p,) whose control points are nearest to the given ones."""
+        """Return the free variables (p,) that approximate given control points best, by least squares.
+
+        Args:
+            coefficients: control points (C,) of every joint [rad or m].
+        """
         return projected(self.freedoms, coefficients)
 
     def evaluate(self, x: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-        """Return d^r q / dt^r (N, n) from the control points by de Boor's recursion, without the tables."""
+        """Return d^r q / dt^r (N, n), by de Boor's recursion from the control points instead of by tables.
+
+        Args:
+            x: (p,) free variables of the family.
+            times: (N,) [s].
+            order: r, 0 for position.
+        """
         result = np.zeros((len(times), self.n))
         for j, (count, points) in enumerate(zip(self.counts, self.coefficients(x))):
             if count == 1:
@@ -63,10 +75,15 @@ class BSpline:
         return result
 
     def largest(self, x: np.ndarray, order: int) -> np.ndarray:
-        """Return a bound (n,) on abs(d^r q / dt^r): the largest control point of the r-th derivative.
+        """Return a bound (n,) on abs(d^r q / dt^r): the largest control point of the r-th derivative, r = `order`.
 
-        The derivative of a uniform spline has control points Δc / h one degree lower (de Boor), and a spline lies in
-        the hull of its control points.
+        The derivative of a uniform spline is a spline one degree lower with control points Δc / h (differences of
+        neighbouring control points by the knot spacing; de Boor 1978), and a
+        spline lies in the convex hull of its control points.
+
+        Args:
+            x: (p,) free variables of the family.
+            order: r, 0 or more.
         """
         bounds = []
         for count, points in zip(self.counts, self.coefficients(x)):
@@ -77,7 +94,15 @@ class BSpline:
         return np.array(bounds)
 
     def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-        """Return variables (p,) of a random motion about `centre` (n,), control points spread by `amplitude` (n,)."""
+        """Return the free variables (p,) of a random motion about the pose `centre` (n,).
+
+        The control points are drawn from a normal distribution with standard deviations `amplitude` (n,) [rad or m].
+
+        Args:
+            rng: generator of the random numbers.
+            centre: (n,) [rad or m].
+            amplitude: (n,) [rad or m].
+        """
         points = []
         for count, middle, size in zip(self.counts, centre, amplitude):
             points.append(middle + size * rng.normal(size=count))
@@ -95,10 +120,10 @@ def bspline_family(
     held: Mapping[int, float] | None = None,
     rate: float | None = None,
 ) -> BSpline:
-    """Return the family of periodic splines with `points` control points (one number, or (n,); 1 locks a joint).
+    """Return the family of periodic splines with the given numbers of control points.
 
     Args:
-        points: control points of all joints, or of each joint; more than the degree, or 1.
+        points: number of control points, one number for all joints or (n,); more than the degree, or 1 to lock a joint.
         period, joints, rest, start, held, rate: as for `calib.trajectories.fourier.fourier_family`.
         degree: 5 or more, so that the jerk has no kinks.
 
@@ -107,7 +132,9 @@ def bspline_family(
     """
     counts = counts_of_joints(points, joints)
     if not counts or any(c != 1 and c <= degree for c in counts) or max(counts) == 1:
-        raise BadInput(f"control points {points} for {joints} joints: expected more than the degree {degree} (or 1)")
+        raise BadInput(
+            f"control points {points} for {joints} joints: expected more than the degree {degree}, or 1 to lock a joint"
+        )
     require(degree >= 5, f"degree {degree}: expected 5 or more (below, the jerk is not bounded between samples)")
     require(np.isfinite(period) and period > 0, f"period {period} s: expected a positive number")
     if rate is not None:
@@ -131,7 +158,14 @@ def bspline_family(
 
 
 def _table(times: np.ndarray, period: float, count: int, degree: int) -> np.ndarray:
-    """Return the derivatives (4, N, count) of q, v, a, jerk with respect to the control points."""
+    """Return the derivatives (4, N, count) of a joint's q, v, a, jerk at times (N,) by its control points.
+
+    Args:
+        times: (N,) [s].
+        period: [s].
+        count: number of control points.
+        degree: degree of the spline.
+    """
     result = np.zeros((4, len(times), count))
     if count == 1:
         result[0] = 1.0

@@ -1,13 +1,13 @@
-"""Constraints on a motion: values that must be at most zero at every sample, with exact gradients.
+"""Constraints on a motion: functions that must be at most zero at every sample, with exact gradients.
 
 Joint, velocity, acceleration and jerk limits are linear in the variables; torques come from a regressor and parameters,
 with a margin for their uncertainty; positions of the tool and of named points, and distances between bodies, come from
-callables with derivative products. An optimiser sees each group of columns (a joint's limit, both signs) as one smooth
-function,
+callables with derivative products. A constraint has values g_ik at sample i in column k. For the optimiser, each group
+of columns (such as both signs of one joint's limit) is replaced by one smooth function,
 
     c_r = (1/ρ) log Σ_{i, k in r} exp(ρ g_ik / scale_k)  ≥  max g / scale      (Kreisselmeier & Steinhauser 1979)
 
-so a feasible c means feasible samples; `calib.trajectories.design.verify` checks the motion between the samples.
+so that all samples are feasible where c ≤ 0. `calib.trajectories.design.verify` checks the motion between the samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,14 +28,14 @@ LINEAR_UNITS = ("m", "m/s", "m/s²", "m/s³")
 
 
 class MotionConstraint(Protocol):
-    """Constraint with values (N, k), feasible if ≤ 0, each depending on one sample.
+    """Constraint with values (N, k) at N samples, satisfied where ≤ 0; each value depends on one sample only.
 
     Attributes:
         name: the constraint's name in messages.
         unit: unit of its values.
         labels: (k,) names of the columns.
-        scale: (k,) [unit] by which values are divided to compare different constraints.
-        groups: (k,) group number of each column; the columns of a group are one function to the optimiser.
+        scale: (k,) [unit] numbers by which values are divided to compare different constraints.
+        groups: (k,) group number of each column; the optimiser gets one smooth function per group.
     """
 
     @property
@@ -50,16 +50,16 @@ class MotionConstraint(Protocol):
     def groups(self) -> np.ndarray: ...
     def values(self, motion: SampledMotion) -> np.ndarray: ...
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
-        """Return the gradients (4, N, n) of Σ weights (N, k) · values in q, v, a, jerk."""
+        """Return the gradients (4, N, n) of Σ weights (N, k) · values by q, v, a, jerk of the motion."""
         ...
 
 
 class TwoSided:
-    """Columns of a limit from both sides: the upper sides of the limited rows, then their lower sides.
+    """Two-sided limit, whose columns are the upper sides of the limited joints and then their lower sides.
 
     Attributes:
-        joints: indices of the limited rows.
-        rows: names of all rows; empty for joint 1, 2 ...
+        joints: indices (from 0) of the limited joints.
+        rows: names of all joints; empty for "joint 1", "joint 2" ...
     """
 
     joints: np.ndarray
@@ -85,11 +85,11 @@ class BoxLimit(TwoSided):
     Attributes:
         order: r, 0 to 3.
         lower, upper: (n,) limits [rad or m, per s^r]; infinite where there is no limit.
-        unit: unit of the values in messages; empty for the unit of a rotary joint.
-        rows: names of the n rows; empty for joint 1, 2 ...
+        unit: unit of the values in messages; empty for the unit of a revolute joint.
+        rows: names of the n joints; empty for "joint 1", "joint 2" ...
 
     Raises:
-        BadInput: limits of the wrong shape or order, or limits of a derivative that exclude zero.
+        BadInput: limits of the wrong shape, a lower limit above the upper, or limits of a derivative that exclude zero.
     """
 
     order: int
@@ -144,21 +144,23 @@ class BoxLimit(TwoSided):
 
 @dataclass(frozen=True, eq=False)
 class TorqueLimit(TwoSided):
-    """Torque limit |Y χ| + k √(y Σ yᵀ) ≤ (1 - margin) τ_max: the model's uncertainty is a margin.
+    """Torque limit |Y χ| + k √(y Σ yᵀ) ≤ (1 - margin) τ_max, with y a row of Y and k σ of the torque as a margin.
 
     Attributes:
-        regressor: (q, v, a) -> Y (N, n, b).
-        product: derivative product of the regressor, (q, v, a, G (N, n, b)) -> slopes of Σ G · Y in q, v, a.
-        parameters: (b,) χ.
+        regressor: (q, v, a) -> observation matrix Y (N, n, b); torques are Y χ.
+        product: derivative product of the regressor, (q, v, a, G (N, n, b)) -> gradients of Σ G · Y by q, v, a, each
+            (N, n).
+        parameters: (b,) dynamic parameters χ.
         limits: (n,) τ_max [N m or N]; infinite where there is none.
-        covariance: (b, b) Σ of χ; None: χ is exact.
+        covariance: (b, b) covariance Σ of χ; None takes χ as exact.
         deviations: k, the number of standard deviations.
         margin: further margin, as a share of the limits.
-        torque_product: (q, v, a, χ, G (N, n)) -> slopes of Σ G · Y χ, where that is cheaper than `product`; or None.
-        rows: names of the n rows; empty for joint 1, 2 ...
+        torque_product: (q, v, a, χ, G (N, n)) -> slopes of Σ G · Y χ in q, v, a, if cheaper to compute than by
+            `product`; None uses `product`.
+        rows: names of the n joints; empty for "joint 1", "joint 2" ...
 
     Raises:
-        BadInput: parameters that are not finite, limits not above zero, or a margin outside 0 to below 1.
+        BadInput: parameters that are not finite, limits not above zero, or a margin below 0, or of 1 or more.
     """
 
     regressor: Regressor
@@ -225,15 +227,16 @@ def box_limits(
     jerk: np.ndarray | None = None,
     linear: Sequence[bool] | None = None,
 ) -> tuple[BoxLimit, ...]:
-    """Return the limits of position (lower, upper) and of the moduli of velocity, acceleration and jerk, each (n,).
+    """Return the limits of position and of the absolute values of velocity, acceleration and jerk, each (n,).
 
     Args:
-        lower, upper: position limits [rad or m]; infinite where there is none.
-        velocity, acceleration, jerk: largest moduli [per s, s², s³]; None for no limit of that order.
-        linear: whether each joint is prismatic; None: all joints are rotary.
+        lower, upper: position limits [rad or m]; infinite for no limit.
+        velocity, acceleration, jerk: largest absolute values [rad or m, per s, s², s³]; None for no limit of that
+            order.
+        linear: whether each joint is prismatic; None: all joints are revolute.
 
     Raises:
-        BadInput: a limit that is not a number, not above zero, or a lower limit above the upper.
+        BadInput: a limit that is not a number or not above zero, or a lower limit above the upper.
     """
     units = UNITS
     if linear and all(linear):
@@ -255,14 +258,14 @@ def box_limits(
 
 
 class Smoothed(NamedTuple):
-    """Smoothed values of a constraint along a motion.
+    """Smoothed values c of a constraint along a motion, one per group of columns.
 
     Attributes:
         constraint: the constraint.
-        values: (r,) c of its groups.
-        excess: max g / scale + tightening.
-        shares: (N, k) share of each sample and column in the slope of its group's value.
-        in_group: (r, k) True where a column belongs to a group.
+        values: (r,) c of the r groups.
+        excess: max g / scale + tightening, the largest unsmoothed value.
+        shares: (N, k) derivative of the group's value c by the scaled value of each sample and column.
+        in_group: (r, k) True where a column is part of a group.
     """
 
     constraint: MotionConstraint
@@ -272,7 +275,7 @@ class Smoothed(NamedTuple):
     in_group: np.ndarray
 
     def slopes(self, motion: SampledMotion) -> np.ndarray:
-        """Return the gradients (r, 4, N, n) of the values in q, v, a, jerk of the motion."""
+        """Return the gradients (r, 4, N, n) of the r smoothed values by q, v, a, jerk of the motion."""
         # nine digits without the small shares
         counts = self.in_group[:, None] & (self.shares > 1e-9)
         group, row = np.nonzero(counts.any(axis=2))
@@ -287,13 +290,13 @@ class Smoothed(NamedTuple):
 def smoothed(
     constraint: MotionConstraint, motion: SampledMotion, sharpness: float, tightening: float = 0.0
 ) -> Smoothed:
-    """Return the smoothed values of a constraint along a motion; gradients are computed on demand.
+    """Return the smoothed values of a constraint along a motion; their gradients are computed by `Smoothed.slopes`.
 
     Args:
         constraint: the constraint.
         motion: the motion at its samples.
-        sharpness: ρ.
-        tightening: added to every value, as a share of its scale.
+        sharpness: ρ of the smoothed maximum (1/ρ) log Σ exp(ρ g / scale); the larger, the closer to the maximum.
+        tightening: number added to every scaled value g / scale, to keep the motion inside the limit.
     """
     scaled = constraint.values(motion) / constraint.scale + tightening
     groups = constraint.groups

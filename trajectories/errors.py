@@ -1,12 +1,15 @@
-"""The errors of trajectory design: each states the finding, its likely cause, and advice."""
+"""Errors of trajectory design. Each message states what was found, its likely cause, and what to try."""
 
 
 class BadInput(ValueError):
-    """An invalid array or option (shape, NaN, crossed limits, unknown name)."""
+    """Raised for an invalid array or option (shape, NaN, crossed limits, unknown name)."""
 
 
 def require(holds: object, message: str, kind: type[Exception] = BadInput) -> None:
-    """Raise `kind(message)` unless `holds`; for messages that can be formatted in both cases."""
+    """Raise `kind(message)` where the condition `holds` is false.
+
+    The message is formatted before the check, so its values must exist in both cases.
+    """
     if not holds:
         raise kind(message)
 
@@ -16,11 +19,11 @@ class NotExciting(ValueError):
 
 
 class NothingFeasible(ValueError):
-    """Raised where the search finds no motion within all constraints.
+    """Raised where the search finds no motion that satisfies all constraints.
 
     Attributes:
-        constraint: name of the constraint that the nearest motion breaks most.
-        excess: by how much it is broken, in `unit`.
+        constraint: name of the constraint that the least infeasible motion violates most.
+        excess: size of the violation, in `unit`.
         unit: unit of `excess`.
     """
 

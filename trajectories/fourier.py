@@ -2,7 +2,7 @@
 
     q_j(t) = q_j0 + Σ_{k=1}^{n_f,j} a_jk sin(k ω0 t) + b_jk cos(k ω0 t),      ω0 = 2π / T0
 
-Rest at the start, and by periodicity at the end: Σ k a_jk = 0 and Σ k² b_jk = 0.
+The motion is at rest at the start, and by periodicity at the end, where Σ k a_jk = 0 and Σ k² b_jk = 0.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,12 +16,13 @@ from .errors import BadInput, require
 
 @dataclass(frozen=True, eq=False)
 class Fourier:
-    """A family of Fourier series.
+    """Family of joint motions as finite Fourier series.
 
     Attributes:
         period: T0 [s].
-        harmonics: (n,) n_f of each joint; 0 holds the joint at a constant.
-        freedoms: for each joint, the coefficients that satisfy its equations, ordered q0, a_1 … a_nf, b_1 … b_nf.
+        harmonics: (n,) number n_f of harmonics of each joint; 0 locks the joint at a constant value.
+        freedoms: for each joint, the coefficients that satisfy the equations of rest and start value, ordered q0, a_1 …
+            a_nf, b_1 … b_nf.
     """
 
     period: float
@@ -33,24 +34,39 @@ class Fourier:
         return len(self.harmonics)
 
     def basis(self, times: np.ndarray) -> Basis:
-        """Return the family's basis at times (N,) [s]."""
+        """Return the linear map from the family's free variables to the motion at times (N,) [s]."""
         tables = [_table(times, self.period, count) for count in self.harmonics]
         return assemble(times, tables, self.freedoms)
 
     def coefficients(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the coefficients q0, a, b (1 + 2 n_f,) of every joint."""
+        """Return the coefficients q0, a, b (1 + 2 n_f,) of every joint [rad or m] for free variables x (p,)."""
         return joined(self.freedoms, x)
 
     def variables(self, coefficients: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the variables (p,) whose coefficients are nearest to the given ones."""
+        """Return the free variables (p,) that approximate given Fourier coefficients best, by least squares.
+
+        Args:
+            coefficients: q0, a, b (1 + 2 n_f,) of every joint [rad or m].
+        """
         return projected(self.freedoms, coefficients)
 
     def evaluate(self, x: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-        """Return d^r q / dt^r (N, n) from eq. 23 term by term, without the tables."""
+        """Return the derivative d^r q / dt^r (N, n), by the series term by term instead of the tables of `basis`.
+
+        Args:
+            x: (p,) free variables of the family.
+            times: (N,) [s].
+            order: r, 0 for position.
+        """
         return evaluate(self.coefficients(x), self.period, times, order)
 
     def largest(self, x: np.ndarray, order: int) -> np.ndarray:
-        """Return a bound (n,) on abs(d^r q / dt^r) over all times, r ≥ 1: Σ_k (k ω0)^r √(a_k² + b_k²)."""
+        """Return a bound (n,) on abs(d^r q / dt^r) over all times: Σ_k (k ω0)^r √(a_k² + b_k²).
+
+        Args:
+            x: (p,) free variables of the family, which give the Fourier coefficients a_k, b_k.
+            order: r, 1 or more.
+        """
         bounds = []
         for count, c in zip(self.harmonics, self.coefficients(x)):
             rates = 2 * np.pi / self.period * np.arange(1, count + 1)
@@ -60,7 +76,15 @@ class Fourier:
         return np.array(bounds)
 
     def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-        """Return variables of a random motion about a centre (n,); amplitudes (n,) spread over the harmonics as 1/k."""
+        """Return the free variables (p,) of a random motion about the pose `centre` (n,).
+
+        The amplitudes (n,) [rad or m] are distributed over the harmonics k in proportion to 1/k.
+
+        Args:
+            rng: generator of the random numbers.
+            centre: (n,) [rad or m].
+            amplitude: (n,) [rad or m].
+        """
         coefficients = []
         for count, middle, size in zip(self.harmonics, centre, amplitude):
             fall = 1.0 / np.arange(1, count + 1)
@@ -85,18 +109,19 @@ def fourier_family(
     """Return the family of Fourier series with a given period.
 
     Args:
-        harmonics: n_f, one number for all joints or (n,); 0 locks a joint.
+        harmonics: number n_f of harmonics, one number for all joints or (n,); 0 locks a joint.
         period: T0 [s].
-        joints: n, where `harmonics` is one number.
-        rest: velocity and acceleration are zero at t = 0 and T0, whatever the variables.
-        start: (n,) pose to start from [rad or m]; None: free.
-        held: indices (from 0) of joints that do not move, with their values [rad or m].
-        resonance: smallest resonance frequency ω_r [rad/s]; n_f ω0 has to be below it (the paper, section 4.3).
-        rate: sampling rate of the controller [Hz]; a period has to be a whole number of samples.
+        joints: number n of joints, needed where `harmonics` is one number.
+        rest: True: velocity and acceleration are zero at t = 0 and T0 for every motion of the family.
+        start: (n,) pose at the start [rad or m]; None leaves it free.
+        held: indices (from 0) of locked joints, with their values [rad or m]; None locks no joint.
+        resonance: smallest resonance frequency ω_r [rad/s]; n_f ω0 must be below it (Kolyubin et al. 2019, section
+            4.3). None: not checked.
+        rate: sampling rate of the controller [Hz]; a period must be a whole number of samples. None: not checked.
 
     Raises:
-        BadInput: a period that is not positive, frequencies beyond the resonance, or a period of no whole number of
-            samples.
+        BadInput: a period that is not positive, frequencies above the resonance, or a period that is not a whole number
+            of samples.
     """
     counts = counts_of_joints(harmonics, joints)
     if not counts or min(counts) < 0 or max(counts) < 1:
@@ -116,7 +141,13 @@ def fourier_family(
 
 
 def _table(times: np.ndarray, period: float, count: int) -> np.ndarray:
-    """Return the derivatives (4, N, 1 + 2 count) of q, v, a, jerk with respect to q0, a, b."""
+    """Return the derivatives (4, N, 1 + 2 count) of a joint's q, v, a, jerk by its coefficients q0, a, b.
+
+    Args:
+        times: (N,) [s].
+        period: T0 [s].
+        count: number of harmonics.
+    """
     rates = 2 * np.pi / period * np.arange(1, count + 1)
     angle = np.outer(times, rates)
     sine = np.sin(angle)
@@ -131,7 +162,14 @@ def _table(times: np.ndarray, period: float, count: int) -> np.ndarray:
 
 
 def evaluate(coefficients: Sequence[np.ndarray], period: float, times: np.ndarray, order: int = 0) -> np.ndarray:
-    """Return d^r q / dt^r (N, n) directly from eq. 23, independent of tables and null spaces."""
+    """Return the derivative d^r q / dt^r (N, n) of order r by the Fourier series, term by term.
+
+    Args:
+        coefficients: for each joint, q0, a_1 … a_nf, b_1 … b_nf [rad or m].
+        period: T0 [s].
+        times: (N,) [s].
+        order: r, 0 for position.
+    """
     max_order = max(len(c) // 2 for c in coefficients)
     rates = 2 * np.pi / period * np.arange(1, max_order + 1)
     # each derivative turns sine and cosine by π/2

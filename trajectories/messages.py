@@ -14,16 +14,19 @@ DIGITS = 9  # after the point: 1e-9 rad, and whole nanoseconds
 def joint_trajectory(
     track: Setpoints, joint_names: Sequence[str], every: int = 1, frame: str = ""
 ) -> dict[str, object]:
-    """Return a motion as the message's plain dictionaries; joints in rad or m, effort in N m or N if torques are known.
+    """Return a motion as a ROS message in plain dictionaries.
+
+    Positions are in rad or m; effort is in N m or N, and is left out where torques are unknown.
 
     Args:
         track: the motion.
         joint_names: (n,) names of the joints.
-        every: keep every so many samples (and the last one), for controllers that interpolate.
-        frame: header.frame_id.
+        every: number of samples from one point of the message to the next, for controllers that interpolate; the last
+            sample is always included.
+        frame: frame_id of the message's header.
 
     Raises:
-        BadInput: names that are not one per joint, or `every` below 1.
+        BadInput: `joint_names` are not one per joint, or `every` is below 1.
     """
     if len(joint_names) != track.n or len(set(joint_names)) != track.n:
         raise BadInput(f"the motion has {track.n} joints, the given names are {', '.join(joint_names) or 'none'}")
@@ -48,7 +51,7 @@ def to_json(message: dict[str, object]) -> str:
 
 
 def to_yaml(message: dict[str, object]) -> str:
-    """Return the message as YAML; numbers always with a decimal point, since YAML 1.1 reads 1e-05 as text."""
+    """Return the message as YAML. Numbers always have a decimal point, since YAML 1.1 reads 1e-05 as text."""
     stamp = message["header"]["stamp"]
     quoted = [json.dumps(name) for name in message["joint_names"]]
     names = ", ".join(quoted)

@@ -1,4 +1,4 @@
-"""Motions as setpoints for a controller: samples at its rate, joined, repeated, slowed down."""
+"""Motions as setpoints for a controller: sampled at its rate, concatenated, repeated, slowed down."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 
 from .errors import BadInput, require
 
-# of a joint [rad or m] at a seam between two tracks
+# largest jump of a joint between two tracks [rad or m]
 MAX_JUMP = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Setpoints:
-    """Samples at a constant rate, both ends included.
+    """Samples of a motion at a constant rate, both ends included.
 
     Attributes:
         rate: sampling rate [Hz].
@@ -46,18 +46,20 @@ class Setpoints:
         return (len(self) - 1) / self.rate
 
     def repeated(self, times: int) -> Setpoints:
-        """Return a closed motion repeated `times` times; its first and last sample coincide, so a period is N - 1
-        samples.
+        """Return a closed motion repeated `times` times.
+
+        The first and last of the N samples of a closed motion coincide, so a period is N - 1 samples.
         """
         require(times >= 1, f"times = {times}: expected 1 or more")
         return joined([self] * times)
 
 
 def joined(tracks: Sequence[Setpoints]) -> Setpoints:
-    """Return tracks joined one after the other; each begins at the last sample of the previous one.
+    """Return motions concatenated; each begins at the last sample of the previous one.
 
     Raises:
-        BadInput: tracks of different rates, or a jump of position or speed at a seam, with its joint and size.
+        BadInput: tracks of different rates, or a jump of position or speed between two tracks; the message gives joint
+            and size.
     """
     rate = tracks[0].rate
     for k, (track, following) in enumerate(pairwise(tracks)):
@@ -83,7 +85,14 @@ def joined(tracks: Sequence[Setpoints]) -> Setpoints:
 
 
 def _check_seam(k: int, quantity: str, end: np.ndarray, start: np.ndarray, max_jump: float) -> None:
-    """Refuse a jump between the end of motion k and the start of the next one."""
+    """Raise BadInput where the end of a motion and the start of the next differ by more than `max_jump`.
+
+    Args:
+        k: index (from 0) of the first of the two motions.
+        quantity: name of the compared quantity in the message ("position" or "speed").
+        end, start: (n,) values at the end of motion k and at the start of the next.
+        max_jump: largest permitted difference, in the unit of the values.
+    """
     jump = np.abs(start - end)
     if jump.max() > max_jump:
         j = int(jump.argmax())
@@ -94,9 +103,9 @@ def _check_seam(k: int, quantity: str, end: np.ndarray, start: np.ndarray, max_j
 
 
 def slowed(track: Setpoints, factor: float) -> Setpoints:
-    """Return the track `factor` times slower, for a rehearsal: v / factor, a / factor²; torques unknown.
+    """Return the motion `factor` times slower, for a rehearsal at low speed: v / factor, a / factor², without torques.
 
-    Positions between the samples come from cubic Hermite pieces, which meet q and v at every sample.
+    Positions between the samples are interpolated by cubic Hermite polynomials, which match q and v at every sample.
 
     Args:
         track: the motion.

@@ -1,22 +1,22 @@
-"""Order of stops for the shortest total time: an open tour, and durations of joint moves."""
+"""Order of poses for the shortest total time: an open tour, and durations of joint moves."""
 
 import numpy as np
 
 from .errors import BadInput
 
-# starts of a tour that may begin anywhere, about (our choice)
+# approximate number of starts tried for a tour that may begin at any pose (our choice)
 STARTS = 12
 
 
 def move_times(start: np.ndarray, end: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
-    """Return the durations (...) [s] of straight joint moves from rest to rest: trapezoids, all joints in proportion.
+    """Return the durations (...) [s] of straight joint moves from rest to rest with trapezoidal speed profiles.
 
-    A joint that moves by d takes d/v + v/a where it reaches its speed (d ≥ v²/a), else 2 √(d/a); the slowest joint
-    determines the duration.
+    All joints move in proportion. A joint that moves by d takes d/v + v/a where it reaches its speed (d ≥ v²/a), else 2
+    √(d/a); the slowest joint determines the duration.
 
     Args:
         start, end: (..., n) joint values [rad or m].
-        velocity, acceleration: (n,) largest moduli [per s, s²], above zero.
+        velocity, acceleration: (n,) largest absolute values [rad or m per s, s²], above zero.
     """
     distance = np.abs(end - start)
     full = distance >= velocity**2 / acceleration
@@ -27,14 +27,14 @@ def move_times(start: np.ndarray, end: np.ndarray, velocity: np.ndarray, acceler
 
 
 def tour(times: np.ndarray, first: int | None = None) -> np.ndarray:
-    """Return an order (m,) of m stops with nearly the shortest total time; the last stop is free.
+    """Return an order (m,) of m poses with nearly the shortest total time; the tour may end at any pose.
 
-    Nearest neighbours from several starts, each improved by reversing parts (2-opt, Croes 1958) and by moving up to
-    three stops elsewhere (Or 1976) until neither helps; the best order is returned.
+    Tours by nearest neighbours from several starts are each improved by reversing parts (2-opt, Croes 1958) and by
+    moving up to three successive poses elsewhere (Or 1976), until neither helps. The best tour is returned.
 
     Args:
-        times: (m, m) symmetric, durations from each stop to each other [s].
-        first: index of the stop to begin at; None: any.
+        times: (m, m) symmetric, durations of the moves between all poses [s].
+        first: index of the pose at which to begin; None: any.
 
     Raises:
         BadInput: `times` is not a symmetric matrix of finite numbers.
@@ -73,7 +73,12 @@ def tour(times: np.ndarray, first: int | None = None) -> np.ndarray:
 
 
 def _nearest_first(cost: np.ndarray, start: int) -> list[int]:
-    """Return the tour that goes from each place to the nearest one not yet visited."""
+    """Return the tour that goes from each pose to the nearest pose not yet visited.
+
+    Args:
+        cost: (m, m) durations of the moves between the poses [s].
+        start: index (from 0) of the first pose.
+    """
     order = [start]
     unvisited = set(range(len(cost))) - {start}
     while unvisited:
@@ -85,7 +90,12 @@ def _nearest_first(cost: np.ndarray, start: int) -> list[int]:
 
 
 def _improved(order: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    """Return a closed tour that no reversal or relocation shortens, by repeating the move that saves most."""
+    """Return a closed tour that no reversal or relocation shortens, by repeating the change that saves most.
+
+    Args:
+        order: (m,) indices of the poses in the order of the tour.
+        cost: (m, m) durations of the moves between the poses [s].
+    """
     while True:
         shorter = _reversed(order, cost)
         if shorter is None:
@@ -96,7 +106,14 @@ def _improved(order: np.ndarray, cost: np.ndarray) -> np.ndarray:
 
 
 def _reversed(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
-    """Return the tour after the reversal that saves most (edges a-b and c-d become a-c and b-d); None if none saves."""
+    """Return the tour after the reversal that saves most; None if none saves time.
+
+    A reversal replaces the edges a-b and c-d by a-c and b-d.
+
+    Args:
+        order: (m,) indices of the poses in the order of the closed tour.
+        cost: (m, m) durations of the moves between the poses [s].
+    """
     after = np.roll(order, -1)
     edge = cost[order, after]
     between_starts = cost[order[:, None], order]
@@ -109,8 +126,13 @@ def _reversed(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
 
 
 def _relocated(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
-    """Return the tour after moving up to three successive stops, reversed or not, for the largest saving; None if none
-    saves.
+    """Return the tour after moving up to three successive poses, reversed or not, elsewhere; None if none saves time.
+
+    The move with the largest saving is made.
+
+    Args:
+        order: (m,) indices of the poses in the order of the closed tour.
+        cost: (m, m) durations of the moves between the poses [s].
     """
     count = len(order)
     best = (1e-9, 0, 0, 0, False)

@@ -1,7 +1,8 @@
-"""Search for a collision-free way between two places in joint space: straight, else with via-points.
+"""Search for a collision-free path between two poses in joint space: a straight move, or one with via-points.
 
-RRT-Connect (Kuffner & LaValle 2000): two trees, from either end, grow towards random places and towards each other;
-then detours are cut short wherever a straight move is clear. What is clear is asked of the caller, in batches.
+The search is RRT-Connect (Kuffner & LaValle 2000): two trees, one from either end, grow towards random poses and
+towards each other. Then detours are replaced by straight moves wherever these are free of collision. The caller's
+function checks poses for collision, in batches.
 """
 
 from collections.abc import Callable
@@ -11,24 +12,25 @@ import numpy as np
 
 Clear = Callable[[np.ndarray], np.ndarray]
 
-# largest step of a tree in one joint, as a share of its unit (see `Room`; our choice)
+# largest step of a tree in one joint, as a share of the joint's unit in `Room` (our choice)
 MAX_STEP = 0.5
-# share of random places near the middle between the ends (our choice)
+# share of random poses that are drawn near the middle between the ends (our choice)
 MIDDLE_SHARE = 0.1
-# attempts to remove a detour, and length that a straight move must have at most, relative to the detour
+# number of attempts to remove a detour, and largest length of a straight move relative to the detour it replaces
 SHORTENINGS = 60
 MAX_SHORTENED = 0.98
 
 
 @dataclass(frozen=True, eq=False)
 class Room:
-    """Search space of collision-free ways.
+    """Search space of collision-free paths.
 
     Attributes:
-        lower, upper: (n,) [rad or m].
-        clear: places (N, n) -> (N,) whether they are clear.
-        spacing: (n,) weights: of a straight move as many places are looked at as Σ |Δq_j| / spacing_j says.
-        unit: (n,) what counts as one step of each joint [rad or m].
+        lower, upper: (n,) joint limits [rad or m].
+        clear: function of poses (N, n) that returns (N,) True where a pose is free of collision.
+        spacing: (n,) distance between checked poses in each joint [rad or m]; a straight move by Δq is divided into Σ
+            |Δq_j| / spacing_j parts.
+        unit: (n,) length of each joint that counts as 1 in distances [rad or m].
     """
 
     lower: np.ndarray
@@ -39,7 +41,11 @@ class Room:
 
 
 def straight_is_clear(room: Room, start: np.ndarray, end: np.ndarray) -> bool:
-    """Return whether the straight move between two places (n,) is clear; eight places on it are checked first."""
+    """Return whether the straight move in joint space between two poses `start` and `end` (n,) is free of collision.
+
+    About eight poses spread over the move are checked first, to end early on a collision. `room` gives the check for
+    collision and the spacing of checked poses.
+    """
     steps = np.abs(end - start) / room.spacing
     count = max(int(np.ceil(steps.sum())), 1)
     share = np.arange(1, count) / count
@@ -54,13 +60,15 @@ def straight_is_clear(room: Room, start: np.ndarray, end: np.ndarray) -> bool:
 
 
 def way(room: Room, start: np.ndarray, goal: np.ndarray, seed: int = 0, most: int = 4000) -> np.ndarray | None:
-    """Return a clear way (k, n) from start to goal, both included: two places if the straight move is clear.
+    """Return a collision-free path (k, n) from start to goal, both included; None if none was found.
+
+    If the straight move is free of collision, the path has only these two poses.
 
     Args:
-        room: limits and what is clear.
-        start, goal: (n,) [rad or m], clear.
-        seed: of the random places.
-        most: random places tried; None is returned where they do not suffice.
+        room: joint limits and the check for collision.
+        start, goal: (n,) poses free of collision [rad or m].
+        seed: seed of the random poses.
+        most: largest number of random poses.
     """
     if straight_is_clear(room, start, goal):
         return np.array([start, goal])
@@ -92,7 +100,13 @@ def way(room: Room, start: np.ndarray, goal: np.ndarray, seed: int = 0, most: in
 
 
 def _grown(room: Room, tree: tuple[list[np.ndarray], list[int]], aim: np.ndarray) -> int | None:
-    """Extend a tree by one step towards a place; return the new node's number, None if the step is not clear."""
+    """Extend a tree by one step towards the pose `aim`; return the new node's index, None if the step collides.
+
+    Args:
+        room: joint limits and the check for collision.
+        tree: poses of the nodes, and the index of each node's parent.
+        aim: (n,) pose [rad or m].
+    """
     nodes, parents = tree
     steps = (aim - np.array(nodes)) / room.unit
     nearest = int(np.linalg.norm(steps, axis=1).argmin())
@@ -108,7 +122,13 @@ def _grown(room: Room, tree: tuple[list[np.ndarray], list[int]], aim: np.ndarray
 
 
 def _branch(nodes: list[np.ndarray], parents: list[int], leaf: int) -> list[np.ndarray]:
-    """Return the nodes from a leaf to the root."""
+    """Return the poses of a tree from a leaf to the root.
+
+    Args:
+        nodes: (n,) pose of each node.
+        parents: index of each node's parent.
+        leaf: index of the leaf.
+    """
     branch = []
     while leaf >= 0:
         branch.append(nodes[leaf])
@@ -117,7 +137,13 @@ def _branch(nodes: list[np.ndarray], parents: list[int], leaf: int) -> list[np.n
 
 
 def _shortened(room: Room, places: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Return a way with detours removed by straight moves between its places and points on its lines."""
+    """Return a path with detours replaced by straight moves between its poses, or between points on its lines.
+
+    Args:
+        room: joint limits and the check for collision.
+        places: (k, n) poses of the path.
+        generator: generator of the random numbers.
+    """
     for _ in range(SHORTENINGS):
         if len(places) < 3:
             break

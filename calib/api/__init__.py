@@ -1,1 +1,1 @@
-"""Implementation of the Python API: functions for the stages, and results that print themselves."""
+"""Implementation of the Python API: functions for the stages of a calibration, and classes of results."""

@@ -35,8 +35,9 @@ Recorded = str | Path | Recording
 
 
 class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcome):
-    """Identified dynamics with covariance and verdict. ``print`` shows errors on unseen motion, friction and
-    verdict.
+    """Identified dynamics with covariance and verdict.
+
+    ``print`` shows the errors on held-out motion, the friction and the verdict.
     """
 
     kind = BY_NAME["identification"]
@@ -47,7 +48,10 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
 
     @property
     def residuals(self) -> DataFrame:
-        """Return whether an option is repeated for each item; a list of numbers is one comma-separated text instead."""
+        """Torque residuals, measured minus predicted, of every sample, fitted or held out, as a pandas DataFrame.
+
+        The columns are the file, the time [s], and one residual for each torque row.
+        """
         titles = self.found.settings.torque_rows.titles(self.inputs.chain.joint_names)
         header = ["file", "t [s]"]
         header += [f"{title} [{unit}]" for title, unit in zip(titles, self.inputs.row_units)]
@@ -59,12 +63,12 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
 
     @property
     def robot(self) -> CalibratedChain:
-        """The robot that the dynamics were identified on."""
+        """The robot whose dynamics were identified."""
         return self.inputs.robot
 
     @property
     def estimate(self) -> Estimate:
-        """The base parameters with their covariance, including the geometry's contribution if known."""
+        """The base parameters with their covariance, which includes that of the geometry if known."""
         estimate = self.found.fitted.estimate
         if self.carried is None:
             return estimate
@@ -72,8 +76,10 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
 
     @one_blas_thread()
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the predicted torques (N, rows) [N m or N] of a motion q [rad or m], v [per s], a [per s²], each (N,
-        n).
+        """Return the predicted torques (N, rows) [N m or N] of a motion.
+
+        Args:
+            q, v, a: (N, n) joint positions [rad or m], velocities [per s] and accelerations [per s²].
         """
         dynamics = self.found.dynamics
         q = np.asarray(q, dtype=float)
@@ -83,13 +89,15 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
 
     @one_blas_thread()
     def torque_sigma(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the standard deviations (N, rows) [N m or N] of predicted torques: ± 1.96 σ covers 95 %.
+        """Return the standard deviations σ (N, rows) [N m or N] of predicted torques; ± 1.96 σ contains 95 %.
 
-        They include the part of recorded torques that no model explains within the filter's band. Arguments as of
-        `torques`.
+        They include the part of recorded torques, within the band of the filter, that the model does not explain.
+
+        Args:
+            q, v, a: (N, n) joint positions [rad or m], velocities [per s] and accelerations [per s²].
 
         Raises:
-            UsageError: if the model's recordings were too short to estimate its errors.
+            UsageError: the recordings were too short to estimate the model's errors.
         """
         if self.errors is None:
             raise UsageError("torque errors cannot be estimated, since the recording is too short: record longer")
@@ -100,7 +108,12 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the result folder, as `calib identify --out` does."""
+        """Write the result folder, with the same files as `calib identify --out`, and return its path.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
+        """
         from calib.procedure.report import outputs
 
         return folder.write_folder(self, Path(out), partial(outputs.write_model, plots=plots))
@@ -112,11 +125,14 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
         return dynamics_figures.figures(self)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the metrics as in ``metrics.json``."""
+        """Return the metrics of the result, the content of ``metrics.json``."""
         return plain(metrics.metrics(self))
 
     def to_dataframe(self) -> DataFrame:
-        """Return the base parameters as a pandas DataFrame: name, unit, value, sigma (NaN: constraint active)."""
+        """Return the base parameters as a pandas DataFrame with the columns name, unit, value and sigma.
+
+        sigma is NaN for parameters at a bound of the physical constraints.
+        """
         estimate = self.estimate
         on_bounds = np.isin(self.found.names, metrics.on_bounds(self.found))
         sigma = np.where(on_bounds, np.nan, estimate.sigma)
@@ -124,7 +140,7 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
         return data_frame(rows, ["name", "unit", "value", "sigma"])
 
     def section(self) -> Section:
-        """Return a report section with the errors on unseen motion, the friction, and the verdict."""
+        """Return a report section with the errors on held-out motion, the friction, and the verdict."""
         from calib.procedure.report import dynamics_section
 
         return dynamics_section.outcome_section(self)
@@ -136,14 +152,17 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
 
 
 class MethodTable(tuple[Method, ...]):
-    """Identification methods as records: ``name``, ``description``, ``source``, ``assumes``; one per line in print."""
+    """Identification methods, one record each: ``name``, ``description``, ``source``, ``assumes``.
+
+    ``print`` shows one method per line.
+    """
 
     def __repr__(self) -> str:
         return "\n".join(map(str, self))
 
 
 def methods() -> MethodTable:
-    """Return all identification methods: ``name``, ``description``, ``source``, ``assumes``."""
+    """Return all identification methods, one record each: ``name``, ``description``, ``source``, ``assumes``."""
     return MethodTable(METHODS.values())
 
 
@@ -164,28 +183,32 @@ def identify_dynamics(
     on_read: Callable[[inputs.IdentificationInputs], None] | None = None,
     progress: Progress | None = None,
 ) -> DynamicsModel:
-    """Identify a robot's dynamics on its geometry, and judge them on unseen motion.
+    """Return a robot's dynamics, identified on its geometry and judged on motion that was not fitted.
 
-    If the robot comes from a fit (``fit.robot``), the covariance of its geometry is added to that of the estimate:
-    Σ = Σ_torque + S Σ_geometry Sᵀ.
+    If the robot is the result of a fit (``fit.robot``), the covariance of its geometry is propagated to the estimate:
+    the covariance Σ of the base parameters is Σ_torque + S Σ_geometry Sᵀ, with Σ_torque due to the errors of the
+    torques and S the sensitivity of the estimate to the geometry.
 
     Args:
-        robot, base, tip: arguments as of `calib.load`, its result, or ``fit.robot``. For a parallel robot, the result
-            has the same members.
-        recordings: logs of q and torque (or current): files, ``log.npz@0:9.4`` cut, or results of `read_recording`.
-        settings: method, friction, drives, payloads, gains, filters, closed loop; None: defaults.
-        validate: recordings of other motion, to validate on.
-        method, friction: replace those of the settings, see `methods`; None: as in the settings.
-        options: the settings as a TOML file (``calib formats identify-options``).
-        excitation: folder of `design_excitation`, whose motion is the reference of recordings without one, for methods
-            with a [loop].
+        robot, base, tip: arguments of `calib.load`; or, for `robot`, the result of `calib.load` or ``fit.robot``. For a
+            parallel robot, the result has the same members.
+        recordings: logs of joint positions and torques (or currents): files (``log.npz@0:9.4`` takes seconds 0 to 9.4),
+            or results of `read_recording`.
+        settings: method, friction, drives, payloads, gains, filters, closed loop; None takes the defaults.
+        validate: recordings of other motion, which are used to validate the result only.
+        method, friction: identification method (one of `methods`) and friction model, which replace those of the
+            settings; None takes those of the settings.
+        options: the settings as a TOML file (``calib formats identify-options``), or the options read from one, given
+            instead of `settings`; None for no file.
+        excitation: folder written by `design_excitation`, for methods that simulate the closed loop ([loop] in the
+            options). Its motion is the reference motion for recordings that contain none. None for no folder.
         seed: seed of all random numbers.
-        on_read: called with the inputs before the identification begins.
-        progress: called with the name of each step; None: silent.
+        on_read: called with the inputs before the identification begins; None for no call.
+        progress: called with the name of each step; None for no report.
 
     Raises:
-        MeasurementError: for implausible logs, naming row and column.
-        Unidentifiable: if the motion identifies no parameter.
+        MeasurementError: a log is implausible; the message names row and column.
+        Unidentifiable: the motion identifies no parameter.
     """
     require(
         settings is None or options is None,

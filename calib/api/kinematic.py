@@ -1,4 +1,4 @@
-"""Kinematic calibration in Python: choose poses, fit, compensate."""
+"""Kinematic calibration in Python: choose poses, fit the geometry, predict and compensate errors."""
 
 from __future__ import annotations
 
@@ -40,28 +40,34 @@ Several = Measured | Sequence[Measured | Sequence[Measured]]
 
 
 class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
-    """Poses that determine a robot's geometry best. ``print`` shows index, bound and the index of random poses."""
+    """Poses that determine a robot's geometry best.
+
+    ``print`` shows the observability index, its upper bound, and the index of random poses.
+    """
 
     kind = BY_NAME["selection"]
     tab = "q chain selection outlook run notes plot save save_run to_dict to_dataframe"
 
     @property
     def q(self) -> np.ndarray:
-        """(m, n) joint values [rad or m]."""
+        """Joint values (m, n) of the poses [rad or m]."""
         return np.asarray(self.selection.q)
 
     @checked
     def save(self, path: str | Path, *, plots: bool = True, overwrite: bool = False) -> Path:
-        """Write the poses as CSV with the joints' names [deg or mm], and the predicted errors next to it; return its
-        path.
+        """Write the poses [deg or mm] as CSV, and the predicted errors beside it; return the path of the CSV.
 
-        The prediction is ``…_prediction.json``, which the argument `poses` of `fit_geometry` uses; the figures are
-        those of
-        `plot`. Files that are not from an earlier selection, or to which measurements were added, are refused unless
-        `overwrite`.
+        The columns are the joints' names. The predicted errors are written to ``…_prediction.json``, which the argument
+        `poses` of `fit_geometry` uses. The figures are those of `plot`. Existing files are replaced only if an earlier
+        selection wrote them and no measurements were added, or with `overwrite`.
+
+        Args:
+            path: the CSV to write.
+            plots: whether to write the figures.
+            overwrite: whether to replace any existing file.
 
         Raises:
-            UsageError: for such files.
+            UsageError: a file exists and must not be replaced.
         """
         from calib.procedure.report.style import save
 
@@ -75,15 +81,21 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
 
     @checked
     def save_run(self, path: str | Path, *, overwrite: bool = False) -> Path:
-        """Write the measuring run, poses in order, as CSV: t [s], pose (0 for a via-point), joints [deg or mm]."""
+        """Write the measuring run, with the poses in their order, as CSV, and return its path.
+
+        The columns are t [s], pose (0 for a via-point) and the joints [deg or mm].
+
+        Args:
+            path: the CSV to write.
+            overwrite: whether to replace any existing file; without it, only an unchanged file of an earlier call.
+        """
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
             return write_run(Path(path), self.run, self.chain)
 
     def charts(self) -> dict[str, Chart]:
-        """Return the charts of the figures by name: σ of the tool position over the workspace, and over the number of
-        poses.
+        """Return the charts by name: σ of the tool position over the workspace, and over the number of poses.
 
-        {} if a parameter is not identifiable.
+        Empty if a parameter is not identifiable.
         """
         from calib.procedure.report.geometry_figures import outlook_figure, predicted_map
 
@@ -99,11 +111,11 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
         return result
 
     def to_dict(self) -> dict[str, object]:
-        """Return the results of the selection: index, its value, that of random sets, efficiency, seconds, notes."""
+        """Return the results of the selection: index, its value, value of random poses, efficiency, seconds, notes."""
         return selection.record(self)
 
     def to_dataframe(self) -> DataFrame:
-        """Return the joint values as a pandas DataFrame, a row per pose."""
+        """Return the joint values as a pandas DataFrame, one row per pose."""
         header = [f"{joint.name} [{joint.unit}]" for joint in self.chain.joints]
         return data_frame(self.q.tolist(), header)
 
@@ -125,7 +137,10 @@ class PredictedPoses(NamedTuple):
 
 
 class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
-    """A fitted geometry with covariance and verdict. ``print`` shows the ladder, errors on unseen poses and verdict."""
+    """A fitted geometry with covariance and verdict.
+
+    ``print`` shows the compared models, the errors on held-out poses, and the verdict.
+    """
 
     kind = BY_NAME["fit"]
     tab = (
@@ -135,27 +150,26 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
 
     @property
     def residuals(self) -> DataFrame:
-        """Residuals of every row, fitted or unseen, with weight and expected error, as a pandas DataFrame."""
+        """Residuals of every row, fitted or held out, with weight and expected error, as a pandas DataFrame."""
         from calib.procedure.kinematic_stage.fit_tables import residuals
 
         return data_frame(*residuals(self))
 
     @property
     def estimate(self) -> Estimate:
-        """Return the results of the selection: index, value, value of random poses, efficiency, seconds, notes."""
+        """Names, units, values and covariance of the fitted parameters."""
         return self.selection.fit.estimate
 
     @one_blas_thread()
     def predict(self, q: object, tool: int = 0) -> PredictedPoses:
         """Return the tool poses of the calibrated robot at given joint values, in its base frame, with their σ.
 
-        σ of the position contains all expected errors (`position_sigma`) if the fit has an error model, else only those
-        of the
-        parameters; σ of the orientation contains those of the parameters.
+        If the fit has an error model, σ of the position contains all expected errors (`position_sigma`), else only
+        those due to the parameters. σ of the orientation contains only those due to the parameters.
 
         Args:
             q: (m, n) joint values [rad or m].
-            tool: index of the fit's tool.
+            tool: index of the fitted tool, from 0.
         """
         geometry = self.selection.fit
         poses = self._poses(q)
@@ -169,29 +183,37 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
     def position_sigma(self, q: object, tool: int = 0) -> np.ndarray:
         """Return the standard deviation (m,) [m] of the tool position error (norm over the axes) at given poses.
 
-        It contains the parameters' covariance and unmodelled effects, estimated on held-out rows, and grows with the
-        distance from the fitted poses. 95 % of the errors are below ``expected.discrepancy.radius`` times this value.
+        It contains the parameters' covariance and unmodelled effects. It is estimated on held-out rows, and grows with
+        the distance from the fitted poses. 95 % of the errors are below ``expected.discrepancy.radius`` times this
+        value.
 
         Args:
             q: (m, n) joint values [rad or m].
-            tool: index of the fit's tool.
+            tool: index of the fitted tool, from 0.
 
         Raises:
-            UsageError: if no positions were measured.
+            UsageError: fewer than 20 positions were measured.
         """
         if self.expected is None:
             raise UsageError("this fit has no expected errors: they need at least 20 measured positions")
         return self.expected.position_sigma(self._poses(q), tool=tool)
 
     def _poses(self, q: object) -> PoseMeasurements:
-        """Return poses at joint values (m, n), with gravity torques (m, n) [N m] if masses are known."""
+        """Return poses at joint values q (m, n), with gravity torques (m, n) [N m] if the links' masses are known."""
         chain = self.inputs.chain
         q = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, chain.n), "q")
         return PoseMeasurements(q, chain.joint_names, torque=gravity_of(self.inputs.weighed, q))
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the result folder, as `calib fit --out` does: robot.toml, URDF, estimate, residuals, certificate."""
+        """Write the result folder, with the same files as `calib fit --out`, and return its path.
+
+        The files are robot.toml, URDF, estimate, residuals and certificate.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
+        """
         from calib.procedure.report import outputs
 
         return folder.write_folder(self, Path(out), partial(outputs.write_fit, plots=plots))
@@ -205,17 +227,20 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         return {name: chart for name, (chart, _) in captioned.items()}
 
     def to_dict(self) -> dict[str, object]:
-        """Return the metrics as in ``metrics.json``."""
+        """Return the metrics of the result, the content of ``metrics.json``."""
         return plain(folder.metrics(self))
 
     def to_dataframe(self) -> DataFrame:
-        """Return the fitted parameters as a pandas DataFrame: name, unit, nominal, value, sigma, RSD [%]."""
+        """Return the fitted parameters as a pandas DataFrame: name, unit, nominal, value, sigma, RSD [%].
+
+        RSD is the relative standard deviation.
+        """
         from calib.procedure.kinematic_stage.fit_tables import HEADER, estimate_table
 
         return data_frame(estimate_table(self.selection.fit, self.selection.nominal.cell).rows(), HEADER)
 
     def section(self) -> Section:
-        """Return a report section with the errors on unseen poses, the compared models, and the verdict."""
+        """Return a report section with the errors on held-out poses, the compared models, and the verdict."""
         from calib.procedure.report import geometry_section
 
         return geometry_section.outcome_section(folder.metrics(self))
@@ -237,25 +262,25 @@ def select_poses(
     workers: str | int = 1,
     progress: Progress | None = None,
 ) -> PoseSelection:
-    """Choose reachable, visible poses that determine a robot's geometry best.
+    """Return reachable and visible poses that determine a robot's geometry best.
 
-    By default, poses keep clear of joint limits, of the arm itself and of the floor that it stands on; the result lists
-    what was not checked. ``SelectionSettings.without`` names constraints to ignore.
+    By default, poses are inside the joint limits and free of collisions of the arm with itself and with the floor at
+    its base; the result lists what was not checked. ``SelectionSettings.without`` names constraints to ignore.
 
     Args:
-        robot, base, tip: arguments as of `calib.load`, or its result.
+        robot, base, tip: arguments of `calib.load`; or, for `robot`, its result.
         count: number of poses.
         settings: measured quantity, targets, index, method, sigmas, seed.
         constraints: TOML file of the arm's workspace and the instrument's placement (``calib formats constraints``), or
-            its tables; None: defaults.
-        existing: poses measured before, which the selection complements: a CSV, measurements, or joint values (m, n)
-            [rad
-            or m]; None: none.
+            its tables; None takes the defaults.
+        existing: poses measured before, to which the selection adds the most informative ones: a CSV, measurements, or
+            joint values (m, n) [rad or m]; None for no such poses.
         workers: number of local processes, or the address of a Dask scheduler.
-        progress: called with texts on the progress; None: silent.
+        progress: called with texts on the progress; None for no report.
 
     Raises:
-        UsageError, RobotError: for invalid input.
+        UsageError: an invalid argument or file of constraints.
+        RobotError: the robot is not found, or its file is invalid.
     """
     from calib.workers import workers as opened
 
@@ -296,25 +321,25 @@ def fit_geometry(
     on_read: Callable[[inputs.Inputs], None] | None = None,
     progress: Progress | None = None,
 ) -> GeometryFit:
-    """Fit a robot's geometry to measured poses, and judge it on unseen poses.
+    """Return a robot's geometry, fitted to measured poses and judged on poses that were not fitted.
 
     Args:
-        robot, base, tip: the nominal robot: arguments as of `calib.load`, or its result. For a parallel robot, the
-            result has the same members; its measurements are files.
+        robot, base, tip: the nominal robot: arguments of `calib.load`; or, for `robot`, its result. For a parallel
+            robot, measurements must be files, and the result has the same members.
         measured: CSV files, results of `read_poses`, or several of either.
-        settings: model, loss, folds, stations, tools, rows to hold out, tolerance, seed; None: defaults.
-        validate: unseen poses, in the forms of `measured`.
-        options: units and columns that the files' headers do not state, priors, fixed parameters (``calib formats
-            options``).
-        poses: the planned poses: result of `select_poses`, its CSV, or its folder; its predicted σ are compared with
-            the fit's (finding ``sigma-ratio``).
-        on_read: called with the inputs before the fit begins.
-        progress: called with the name of each step; None: silent.
+        settings: model, loss, folds, stations, tools, rows to hold out, tolerance, seed; None takes the defaults.
+        validate: poses that are not fitted but used to judge the result, in the same forms as `measured`.
+        options: units and columns that the files' headers do not state, priors, fixed parameters: in memory, or as a
+            TOML file (``calib formats options``). None takes the defaults.
+        poses: the planned poses: result of `select_poses`, its CSV, or its folder. The predicted σ are compared with
+            those of the fit (finding ``sigma-ratio``). None for no comparison.
+        on_read: called with the inputs before the fit begins; None for no call.
+        progress: called with the name of each step; None for no report.
 
     Raises:
-        MeasurementError: for implausible files, naming row and column.
-        Unidentifiable: if no parameter is identifiable.
-        NotConverged: if the fit did not converge.
+        MeasurementError: a file is implausible; the message names row and column.
+        Unidentifiable: no parameter is identifiable.
+        NotConverged: the fit did not converge.
     """
     if not isinstance(options, FitOptions):
         options = read_options(optional(options))

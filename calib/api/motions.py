@@ -1,4 +1,4 @@
-"""Design of excitation motions, and planning of time-optimal motions, in Python."""
+"""Design of exciting motions, and planning of time-optimal motions, in Python."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from calib.api.rendering import ChartedResult, Progress, WithoutVerdict, optiona
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
-from calib.errors import TaskLost, as_ours
+from calib.errors import TaskLost, UsageError, as_ours, require
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
-from calib.procedure.excitation import design, folder, planning
+from calib.procedure.excitation import design, folder, planning, stored_front
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 from calib.procedure.robot_kinds import Mechanism, MechanismResult, stage_of
 from calib.records import as_subclass
@@ -35,38 +35,45 @@ def _columns(track: Setpoints) -> Sampled:
 
 
 class ExcitationDesign(ChartedResult, WithoutVerdict, design.Designed):
-    """A motion that excites a robot's dynamics, verified within limits. ``print`` shows condition numbers and
-    margins.
+    """A motion that excites a robot's dynamics, verified within limits.
+
+    ``print`` shows condition numbers and margins to the limits.
     """
 
     kind = BY_NAME["excitation"]
     tab = "period condition goals proof outlook predicted front notes sampled plot save to_dict"
 
     def sampled(self, rate: float | None = None) -> Sampled:
-        """Return t (N,) [s] and q, v, a (N, n) [rad or m, per s, per s²] of one period at `rate` [Hz], ends included.
+        """Return t (N,) [s] and q, v, a (N, n) [rad or m, per s, per s²] of one period, both ends included.
 
-        Without `rate`, the samples are those at the controller's rate that `save` writes. Samples at any rate are
-        computed from
-        the motion's series, not interpolated.
+        The samples are at `rate` [Hz]; without it they are those that `save` writes, at the controller's rate. Samples
+        at any rate are computed from the series of the motion, not interpolated.
         """
         return _columns(folder.one_period(self, rate))
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the result folder, as `calib excite --out` does: trajectory.csv, ROS 2 messages, metrics, figures."""
+        """Write the result folder, with the same files as `calib excite --out`, and return its path.
+
+        The files are trajectory.csv, ROS 2 messages, metrics and figures.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
+        """
         from calib.procedure.report import motion_figures
 
         write_figures = motion_figures.write_design if plots else None
         return folder.write_design(self, Path(out), write_figures)
 
     def charts(self) -> dict[str, Chart]:
-        """Return the charts of the figures by name: motion, tool path, search, front."""
+        """Return the charts of the figures by name: motion, tool path, search, Pareto front."""
         from calib.procedure.report import motion_figures
 
         return motion_figures.design_figures(self)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the metrics as in ``metrics.json``."""
+        """Return the metrics of the result, the content of ``metrics.json``."""
         return folder.design_metrics(self)
 
     def __repr__(self) -> str:
@@ -77,7 +84,10 @@ class ExcitationDesign(ChartedResult, WithoutVerdict, design.Designed):
 
 
 class MotionPlan(ChartedResult, WithoutVerdict, planning.Planned):
-    """The fastest motion through waypoints, within speeds and torques. ``print`` shows duration and margins."""
+    """The fastest motion through waypoints, within limits on speeds and torques.
+
+    ``print`` shows the duration and the margins to the limits.
+    """
 
     kind = BY_NAME["plan"]
     tab = "duration track margins deviation sigma notes sampled plot save to_dict"
@@ -93,7 +103,12 @@ class MotionPlan(ChartedResult, WithoutVerdict, planning.Planned):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the result folder, as `calib plan --out` does."""
+        """Write the result folder, with the same files as `calib plan --out`, and return its path.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
+        """
         from calib.procedure.report import motion_figures
 
         write_figures = motion_figures.write_plan if plots else None
@@ -106,7 +121,7 @@ class MotionPlan(ChartedResult, WithoutVerdict, planning.Planned):
         return motion_figures.plan_figures(self)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the metrics as in ``metrics.json``."""
+        """Return the metrics of the result, the content of ``metrics.json``."""
         return folder.plan_metrics(self)
 
     def __repr__(self) -> str:
@@ -131,39 +146,50 @@ def design_excitation(
     limits: Tables | None = None,
     options: IdentifySettings | str | Path | None = None,
     after: DynamicsModel | str | Path | None = None,
+    pick: tuple[str | Path, int] | None = None,
     base: str | None = None,
     tip: str | None = None,
     workers: str | int = 1,
     progress: Progress | None = None,
 ) -> ExcitationDesign:
-    """Design a motion that excites a robot's dynamics within its limits.
+    """Return a motion that excites a robot's dynamics within its limits.
 
     Args:
-        robot, base, tip: arguments as of `calib.load`, its result, or ``fit.robot``. For a parallel robot, the result
-            has the same members except ``plot``.
+        robot, base, tip: arguments of `calib.load`; or, for `robot`, the result of `calib.load` or ``fit.robot``. For a
+            parallel robot, the result has the same members except ``plot``.
         settings: period, harmonics, goals, effort of the search, playback, seed.
-        model: identified dynamics that predict the torques, in memory or as a folder; None: the robot's description.
-        limits: TOML file of speeds, torques, workspace, collision (``calib formats limits``), or its tables.
-        options: settings of the identification that will follow, as of `calib.identify_dynamics`: the motion is
-            designed for its torque rows, drive terms, couplings and payloads.
-        after: identified dynamics whose recordings the motion complements, instead of `model`: the motion that reduces
-            their σ most is designed, and the reduction is predicted.
+        model: identified dynamics that predict the torques, in memory or as a folder; None takes those of the robot's
+            description.
+        limits: TOML file of limits on speeds, torques, workspace and collisions (``calib formats limits``), or its
+            tables; None takes the limits of the robot's description.
+        options: settings of the later identification, as in `calib.identify_dynamics`. The motion is designed for the
+            torque rows, drive terms, couplings and payloads in them. None takes the defaults.
+        after: identified dynamics to be improved by a further motion, given instead of `model`. The motion that reduces
+            the σ of their parameters most is designed, and the reduction is predicted. None: the design does not refer
+            to an earlier identification.
+        pick: folder of a design with a Pareto front, made with the same settings, and the number of a motion on that
+            front. This motion is returned instead of a new search; None searches.
         workers: number of local processes, or the address of a Dask scheduler.
-        progress: called with texts on the progress; None: silent.
+        progress: called with texts on the progress; None for no report.
 
     Raises:
-        UsageError: for impossible limits and goals.
-        NothingFeasible: if no motion keeps the limits, naming the constraint.
+        UsageError: limits or goals are contradictory.
+        NothingFeasible: no motion satisfies the limits; the message names the constraint.
     """
     from calib.workers import workers as opened
 
     lost_workers: list[TaskLost] = []
     stage = stage_of(robot, "excite", base, tip)
+    picked = None
+    if pick is not None:
+        front_folder, number = pick
+        picked = stored_front.read(Path(front_folder)).with_designed(number)
     with as_ours(), ExitStack() as stack:
         model_folder = None if model is None else stack.enter_context(saved(model))
         previous_folder = None if after is None else stack.enter_context(saved(after))
         crew = stack.enter_context(opened(workers))
         if stage is not None:
+            require(pick is None, "pick: fronts of trade-offs are designed for serial arms only", UsageError)
             return stage.run(
                 settings,
                 model=model_folder,
@@ -183,6 +209,7 @@ def design_excitation(
             tip=tip,
             options=identify_settings,
             after=previous_folder,
+            picked=picked,
             map=crew.map_without(lost_workers),
             progress=progress,
         )
@@ -203,21 +230,23 @@ def plan_motion(
     tip: str | None = None,
     progress: Progress | None = None,
 ) -> MotionPlan:
-    """Plan the fastest motion through waypoints, within a robot's speeds and torques.
+    """Return the fastest motion through waypoints, within limits on a robot's speeds and torques.
 
     Args:
-        robot, base, tip: arguments as of `calib.load`, its result, or ``fit.robot``. For a parallel robot, the result
-            has the same members except ``plot``.
-        waypoints: CSV of joint values, or of poses of the tip (of the platform's coordinates); or arrays: joint values
-            (m, n) [rad or m], poses of the tip (m, 4, 4) [m].
+        robot, base, tip: arguments of `calib.load`; or, for `robot`, the result of `calib.load` or ``fit.robot``. For a
+            parallel robot, the result has the same members except ``plot``.
+        waypoints: CSV of joint values or of poses of the tip (for a parallel robot, of the platform's coordinates); or
+            arrays: joint values (m, n) [rad or m], or poses of the tip (m, 4, 4) [m].
         settings: payloads, straight lines, rate, shaping, approach.
-        model: identified dynamics, in memory or as a folder; None: the robot's description.
-        limits: TOML file (``calib formats limits``), or its tables.
-        drives: TOML file of Ia, Fv, Fc, off, or its tables, without a model.
-        progress: called with texts on the progress; None: silent.
+        model: identified dynamics, in memory or as a folder; None takes those of the robot's description.
+        limits: TOML file of limits (``calib formats limits``), or its tables; None takes the limits of the robot's
+            description.
+        drives: TOML file, or its tables, of drive inertia (Ia), viscous and Coulomb friction (Fv, Fc) and torque offset
+            (off); used where no `model` is given. None for no such terms.
+        progress: called with texts on the progress; None for no report.
 
     Raises:
-        UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
+        UsageError: waypoints cannot be reached, or limits cannot be satisfied.
     """
     stage = stage_of(robot, "plan", base, tip)
     with as_ours(), ExitStack() as stack:

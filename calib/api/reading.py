@@ -1,4 +1,4 @@
-"""Reading robots and measurements from files, as inputs of the API functions."""
+"""Reading of robots and measurements from files, as inputs of the API functions."""
 
 from pathlib import Path
 from typing import cast
@@ -18,21 +18,21 @@ from calib.robot.library import load_calibrated
 
 @checked
 def load(robot: str | Path, *, base: str | None = None, tip: str | None = None) -> CalibratedChain:
-    """Load a robot from a file, a folder or the library.
+    """Return a robot read from a file, a folder or the library.
 
     Args:
         robot: a ``.urdf``, an MDH table in TOML, a library name (``lwr4plus tx40 rv2sq ur5 ur10 ur10e panda iiwa14``),
-            or the folder of an earlier fit, with its nominal robot, covariance and joint corrections. For a parallel
-            robot (``dualv fivebar stewart``, or a TOML of legs) the result is a
-            `calib.procedure.robot_kinds.Mechanism`, which the other API functions accept, too.
-        base, tip: first and last link of the arm in a URDF; None: the root, and the flange
-            (`calib.robot.formats.arm_ends`); ``print`` names the chosen link and the reason.
+            or the folder of an earlier fit. From a fit, nominal robot, covariance and joint corrections are also read.
+            For a parallel robot (``dualv fivebar stewart``, or a TOML of legs) the result is a
+            `calib.procedure.robot_kinds.Mechanism`, which the other API functions also accept.
+        base, tip: first and last link of the arm in a URDF; None takes the root, and the flange as found by
+            `calib.robot.formats.arm_ends`. ``print`` names the chosen link and the reason.
 
     Returns:
-        The robot; if it does not come from a fit, its ``nominal``, ``covariance`` and ``corrections`` are None.
+        The robot. Its ``nominal``, ``covariance`` and ``corrections`` are None unless it was read from a fit.
 
     Raises:
-        RobotError: if nothing of this kind is found, or the file is wrong, with its line and advice.
+        RobotError: the robot is not found, or its file is invalid; the message gives the line and advice.
     """
     if stage_of(robot, "identify", base, tip) is not None:
         return cast(CalibratedChain, mechanism(robot))
@@ -43,18 +43,19 @@ def load(robot: str | Path, *, base: str | None = None, tip: str | None = None) 
 def read_poses(
     path: str | Path, robot: str | Path | CalibratedChain, *, options: FitOptions | str | Path | None = None
 ) -> tuple[PoseMeasurements, ...]:
-    """Read measured poses, positions, distances, sockets or planes of a robot from a CSV file.
+    """Return measured poses, positions, distances, sockets or planes of a robot, read from a CSV file.
 
     Args:
-        path: the file; its columns and units: ``calib formats measurements``.
-        robot: robot whose joints the columns name, as `load` takes or returns it.
+        path: the file; ``calib formats measurements`` describes its columns and units.
+        robot: robot whose joints the columns name: an argument or the result of `load`.
         options: units and columns that the header does not state, or a TOML file with them (``calib formats options``).
+            None where the header states all.
 
     Returns:
         One block per kind of measurement and station, joints [rad, m], lengths [m].
 
     Raises:
-        MeasurementError: naming file, row, column and the likely cause.
+        MeasurementError: the file is invalid; the message names file, row, column and the likely cause.
     """
     if not isinstance(options, FitOptions):
         options = read_options(optional(options))
@@ -67,16 +68,16 @@ def read_poses(
 def read_recording(
     path: str | Path, robot: str | Path | CalibratedChain | Mechanism, *, options: RecordingOptions | None = None
 ) -> Recording:
-    """Read a log of joint positions and torques (or currents) from npz, CSV, a ROS bag or MCAP.
+    """Return a log of joint positions and torques (or currents), read from npz, CSV, a ROS bag or MCAP.
 
     Args:
-        path: the file; ``log.npz@0:9.4`` cuts out seconds 0 to 9.4.
-        robot: robot whose joints are logged, as `load` takes or returns it.
-        options: units and columns that the file does not state, see
-            `calib.data.recordings.recording_options.RecordingOptions`; None: defaults.
+        path: the file; ``log.npz@0:9.4`` reads only seconds 0 to 9.4.
+        robot: robot whose joints are logged: an argument or the result of `load`.
+        options: units and columns that the file does not state
+            (`calib.data.recordings.recording_options.RecordingOptions`); None takes the defaults.
 
     Raises:
-        MeasurementError: naming file, row, column and the likely cause.
+        MeasurementError: the file is invalid; the message names file, row, column and the likely cause.
     """
     # The dynamics' modules: none of the geometry's.
     from calib.procedure.robot_kinds import joints_of

@@ -1,7 +1,7 @@
 """Base classes of results in memory: console text for ``print(result)``, and a page for notebooks.
 
-Also helpers for arguments of the API functions that have several forms: a single value or several, an optional file, a
-result or its folder.
+The module also has helpers for arguments of API functions that have several forms: one value or several, an optional
+file, a result or its folder.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 Progress = Callable[[str], None]
 DataFrame: TypeAlias = Any
 """A pandas DataFrame; pandas is there for those who ask for data frames."""
-# Letters of a line of text.
+# number of characters of a line of text
 WIDTH = 120
 
 
 def listed(value: object | Sequence[object]) -> list:
-    """Return a single value as a list of one, and nested sequences as a flat list."""
+    """Return a single value as a list with one item, and nested sequences as a flat list."""
     if isinstance(value, (str, Path)) or not isinstance(value, Sequence):
         return [value]
     result = []
@@ -54,13 +54,21 @@ class SavedResult(Protocol):
     """A result that can be written to a folder."""
 
     def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
-        """Write the result's folder, and return its path."""
+        """Write the result's folder, and return the folder's path.
+
+        Args:
+            out: folder to write.
+            plots: whether to write the figures.
+        """
         ...
 
 
 @contextmanager
 def saved(result: str | Path | SavedResult) -> Iterator[Path]:
-    """Yield the folder of a result: a given path unchanged, or a temporary folder (or file) of a result in memory."""
+    """Yield the folder of a result: a given path unchanged, or a temporary folder (or file) of a result in memory.
+
+    The temporary folder is removed at the end of the block.
+    """
     if isinstance(result, (str, Path)):
         yield Path(result)
         return
@@ -78,14 +86,14 @@ def saved(result: str | Path | SavedResult) -> Iterator[Path]:
 
 
 def _renamed(argument: object, path: str, name: str) -> object:
-    """Return an error's argument; in a text, the path is replaced by a name."""
+    """Return an error's argument; if it is a text, with the temporary `path` replaced by `name` of the result."""
     if isinstance(argument, str):
         return argument.replace(path, name)
     return argument
 
 
 def as_text(renderables: Iterable[object]) -> str:
-    """Return rich renderables as plain text."""
+    """Return the plain text that the library rich prints for `renderables`, objects such as tables and panels."""
     from rich.console import Console
 
     console = Console(file=io.StringIO(), width=WIDTH, highlight=False, color_system=None, force_jupyter=False)
@@ -95,7 +103,10 @@ def as_text(renderables: Iterable[object]) -> str:
 
 
 class Shown:
-    """A result that notebooks show like ``print``; completion by Tab lists the members in `tab`."""
+    """A result that notebooks show with the text of ``print``.
+
+    Completion by the Tab key lists the members named in `tab`.
+    """
 
     tab: ClassVar[str] = ""
 
@@ -107,25 +118,32 @@ class Shown:
 
 
 class Kept(Shown, ABC):
-    """A result in memory that can be written to a folder and fulfils `calib.Result` by reading this folder.
+    """A result in memory that can be written to a folder.
+
+    It implements the interface `calib.Result` by writing a temporary folder and reading it.
 
     Attributes:
-        kind: one of `calib.result_kinds.KINDS`.
+        kind: kind of the result, one of `calib.result_kinds.KINDS`.
     """
 
     kind: ClassVar[ResultKind]
 
     @abstractmethod
     def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
-        """Write the result's folder, and return its path."""
+        """Write the result's folder, and return the folder's path.
+
+        Args:
+            out: folder to write.
+            plots: whether to write the figures.
+        """
 
     def figures(self) -> Mapping[str, Picture]:
-        """Return the figures by name, as PNG."""
+        """Return the figures by name, as PNG images; empty for a result without figures."""
         return {}
 
     def tables(self) -> Mapping[str, Table]:
-        """Return the tables by name, as in the files that `save` writes."""
-        from calib.results.registry import open_result
+        """Return the tables by name, with the content of the files that `save` writes."""
+        from calib.results.result_classes import open_result
 
         with saved(self) as folder:
             return open_result(folder).tables()
@@ -134,16 +152,16 @@ class Kept(Shown, ABC):
         """Return the scene that the viewer draws: robot, poses, motions, torques.
 
         Args:
-            robot: name or file of the robot to draw; None: the result's robot.
+            robot: name or file of the robot to draw; None takes the robot of the result.
         """
-        from calib.results.registry import open_result
+        from calib.results.result_classes import open_result
 
         with saved(self) as folder:
             return open_result(folder, "view").scene(robot)
 
 
 class WithoutVerdict(Kept):
-    """A result, such as a motion, that has no verdict."""
+    """A result without a verdict, such as a designed motion."""
 
     @property
     def verdict(self) -> Verdict:
@@ -152,17 +170,17 @@ class WithoutVerdict(Kept):
 
 
 class ChartedResult(Kept):
-    """A result with figures."""
+    """A result with figures, made from charts."""
 
     def figures(self) -> Mapping[str, Picture]:
-        """Return the figures by name, as PNG."""
+        """Return the figures by name, as PNG images."""
         from calib.procedure.report.charts import picture
 
         return {name: picture(chart, "") for name, chart in self.charts().items()}
 
     @abstractmethod
     def charts(self) -> Mapping[str, Chart]:
-        """Return the charts of the figures by name."""
+        """Return the charts, from which the figures are drawn, by name."""
 
     @overload
     def plot(self) -> dict[str, Figure]: ...
@@ -170,7 +188,11 @@ class ChartedResult(Kept):
     def plot(self, name: str) -> Figure: ...
     @one_blas_thread()
     def plot(self, name: str | None = None) -> Any:
-        """Return the figure of this name; for None, all figures by name."""
+        """Return the figure of the given name; without a name, all figures by name.
+
+        Raises:
+            UsageError: there is no figure of this name.
+        """
         from calib.procedure.report import charts
 
         charts_by_name = self.charts()
@@ -181,11 +203,11 @@ class ChartedResult(Kept):
 
 
 class ReportedResult(Kept):
-    """A result with a verdict, shown as a section of a report: by ``print``, and as a page in a notebook."""
+    """A result with a verdict and a report section, shown by ``print`` on the console and as a page in a notebook."""
 
     @abstractmethod
     def section(self) -> Section:
-        """Return the report section: verdict, figures, tables, sentences."""
+        """Return the report section of the result: verdict, figures, tables, sentences."""
 
     @property
     def outcome(self) -> Self:
@@ -193,7 +215,7 @@ class ReportedResult(Kept):
         return self
 
     def renderables(self) -> Iterator[object]:
-        """Yield the rich renderables that ``print`` shows."""
+        """Yield the objects of the library rich that ``print`` shows."""
         from calib.procedure.report import page
 
         yield from page.section(self.section())
@@ -202,13 +224,13 @@ class ReportedResult(Kept):
         return as_text(self.renderables())
 
     def _repr_html_(self) -> str | None:
-        """Return the result as a page, as notebooks show it."""
+        """Return the HTML page of the result that notebooks show."""
         from calib.procedure.report.certificate.results import notebook
 
         return notebook(self)
 
     def _repr_mimebundle_(self, include: object = None, exclude: object = None) -> dict[str, str]:
-        """Return the page in a frame of its own, so that its style does not become the notebook's."""
+        """Return the page inside an HTML frame, so that its style does not affect the notebook."""
         bundle = super()._repr_mimebundle_()
         page = self._repr_html_()
         if page:
@@ -218,10 +240,14 @@ class ReportedResult(Kept):
 
 
 def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:
-    """Return rows as a pandas DataFrame with these columns.
+    """Return rows as a pandas DataFrame with the given columns.
+
+    Args:
+        rows: sequences or records, one per row.
+        columns: names of the columns.
 
     Raises:
-        UsageError: if pandas is not installed.
+        UsageError: pandas is not installed.
     """
     message = "data frames need pandas: pip install 'armature-calib[pandas]'; to_dict() and save() do without"
     with refused_as(UsageError, ImportError, message):

@@ -1,7 +1,8 @@
-"""Applications: commands beside the procedure, each a package that can be deleted.
+"""Applications: commands beyond the calibration procedure.
 
-An application imports from the toolkit only what `PUBLIC` names, and other applications only where the layers of
-`[tool.importlinter]` allow it.
+Each application is a package that can be deleted without changes elsewhere. It may import only the modules of
+`calib.toolkit` that `PUBLIC` lists, and other applications only where the import layers in ``pyproject.toml``
+(``[tool.importlinter]``) allow it.
 """
 
 # what applications may import: the names of `import calib`, these modules, and what stands in these packages

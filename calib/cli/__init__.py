@@ -1,6 +1,9 @@
-"""The command ``calib``: commands only, no mathematics. Exit codes: 0 done (the verdict is pass or marginal), 1 done
-but the verdict is fail, 2 input or usage, 3 not identifiable or not converged, 4 an internal error (what is
-needed to mend it stands in a file, see `calib.bug_reports`), 130 interrupted."""
+"""The command ``calib``: definition of the command line; the mathematics is in other packages.
+
+Exit codes: 0 done (the verdict is pass or marginal), 1 done but the verdict is fail, 2 wrong input or usage, 3 not
+identifiable or not converged, 4 an internal error (a file contains what is needed for its correction, see
+`calib.bug_reports`), 130 interrupted.
+"""
 
 import codecs
 import gc
@@ -69,7 +72,11 @@ def options(
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit with one of the codes above."""
+    """Run the command line, and exit with one of the exit codes that the module's docstring lists.
+
+    Args:
+        arguments: arguments of the command line; None: those of this process.
+    """
     owns_process = arguments is None
     gc.set_threshold(*GARBAGE)
     if owns_process:
@@ -93,14 +100,18 @@ def main(arguments: list[str] | None = None) -> None:
 
 @lru_cache(maxsize=1)
 def command_tree() -> Any:
-    """Return the Typer commands, built once per process from the functions' signatures."""
+    """Return the tree of Typer commands, built once per process from the signatures of the commands' functions."""
     for commands in (*COMMANDS.all(), geometry.app, dynamics.app, session.app):  # in the order of the help
         app.add_typer(commands)
     return get_command(app)
 
 
 def run(arguments: list[str] | None = None) -> int:
-    """Run the command line and return its exit code; errors become one message on stderr."""
+    """Run the command line and return the exit code; an error is printed as one message on stderr.
+
+    Args:
+        arguments: arguments of the command line; None: those of this process.
+    """
     if arguments is None:
         arguments = sys.argv[1:]
     arguments = list(arguments)
@@ -129,7 +140,12 @@ def run(arguments: list[str] | None = None) -> int:
 
 
 def _failed(error: Exception, arguments: list[str]) -> int:
-    """Print the error, write a bug report if it is internal, and return its exit code."""
+    """Print an error, write a bug report if it is an internal error, and return the exit code.
+
+    Args:
+        error: the exception that ended the command.
+        arguments: arguments of the command line, for the message and the bug report.
+    """
     from calib import bug_reports
     from calib.errors import complaint
 
@@ -141,9 +157,10 @@ def _failed(error: Exception, arguments: list[str]) -> int:
 
 
 def _spread(arguments: list[str]) -> list[str]:
-    """Return the arguments with ``--validate a b`` expanded to ``--validate a --validate b``.
+    """Return the arguments of the command line with ``--validate a b`` expanded to ``--validate a --validate b``.
 
-    They are expanded only after ROBOT and MEASURED, since texts after --validate could be these arguments otherwise.
+    The expansion is made only if --validate is after ROBOT and MEASURED, since the texts after --validate could
+    otherwise be these two arguments.
     """
     commands = [argument for argument in arguments[:2] if argument in ("fit", "identify", "compare")]
     if not commands:

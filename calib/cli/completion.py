@@ -1,4 +1,4 @@
-"""Shell completion: robots of the library, topics, codes. Loads no heavy module, since completion must be fast."""
+"""Completion in the shell: robots of the library, topics, codes. It imports no large module, since it must be fast."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,7 +10,13 @@ from calib.config_types import OneOf
 
 
 def robots(incomplete: str) -> Iterator[str]:
-    """Yield the library's robots whose names begin with the text typed so far, then such files and folders."""
+    """Yield completions of a robot's name.
+
+    These are the robots of the library whose names begin with the typed text, followed by such files and folders.
+
+    Args:
+        incomplete: the text typed so far.
+    """
     from calib.procedure.robot_kinds import ROBOTS
 
     folders = [Path(__file__).parents[1] / "robot" / "library"]
@@ -27,14 +33,14 @@ def robots(incomplete: str) -> Iterator[str]:
 
 
 def topics() -> list[tuple[str, str]]:
-    """Return the topics of `calib formats` with their descriptions."""
+    """Return the topics of `calib formats`, each with a description."""
     from calib.procedure.formats import TOPICS
 
     return [(name, description) for name, (description, _) in TOPICS.items()]
 
 
 def codes() -> list[str]:
-    """Return the codes of findings, and the one-word terms, that `calib explain` knows."""
+    """Return the codes of findings and the one-word terms that `calib explain` accepts."""
     from calib.procedure.findings import catalogue, glossary
 
     terms = [term for term in glossary() if " " not in term]
@@ -42,7 +48,7 @@ def codes() -> list[str]:
 
 
 def completion(allowed: OneOf) -> Callable[[], list[str]]:
-    """Return the completion of an option that takes one of a few texts."""
+    """Return a function that lists the allowed texts of an option, for the completion of this option in the shell."""
     return lambda: list(allowed.names)
 
 

@@ -1,4 +1,4 @@
-"""Commands for dynamics: excite, recall, identify, and plan (motions)."""
+"""Commands for dynamics: excite, recall and identify; and plan, for motions."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,6 +24,7 @@ def excite(
     limits: Path | None = None,
     options: Path | None = None,
     after: Path | None = None,
+    pick: Annotated[int | None, typer.Option(min=1)] = None,
     workers: str = "1",
     base: str | None = None,
     tip: str | None = None,
@@ -39,6 +40,7 @@ def excite(
         limits: TOML: speeds, torques, workspace, collision, friction; or MoveIt's files: calib formats moveit
         options: TOML: options of the identification that will follow (rows, drives, couplings, payloads)
         after: folder of an identification, which the motion adds to: for its model, information and torque errors
+        pick: number of a motion in --out/front.csv to take instead of a search; with the options of that design
     """
     from calib.api.motions import design_excitation
     from calib.workers import finishing
@@ -52,6 +54,7 @@ def excite(
             limits=limits,
             options=options,
             after=after,
+            pick=None if pick is None else (out, pick),
             base=base,
             tip=tip,
             workers=workers,

@@ -1,4 +1,4 @@
-"""Commands for geometry: select, fit; and export."""
+"""Commands for geometry: select and fit; and export."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -183,7 +183,7 @@ def export(
     from calib.files import results
     from calib.procedure.export import delivery, geometry
     from calib.procedure.robot_kinds import stage_of
-    from calib.results.registry import open_result
+    from calib.results.result_classes import open_result
 
     stage_of(folder, "export" if into else "export to single files")
     if into or ros2:

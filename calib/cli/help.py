@@ -1,4 +1,4 @@
-"""Help of the commands: commands in groups, arguments in capitals, plain words for types."""
+"""Help texts of the commands: commands in groups, arguments in capitals, and words instead of Python types."""
 
 import sys
 import unicodedata
@@ -19,11 +19,13 @@ _WORDS = {int: "N", float: "NUMBER", Path: "PATH"}
 
 
 def type_word(kind: object, choices: tuple[str, ...] | str = ()) -> str | None:
-    """Return the text after an option's name for its value: the choices if they are short; None for a flag.
+    """Return the word for an option's value in the help text; None for a flag, which has no value.
+
+    It lists the allowed texts if they are short, otherwise it names the type.
 
     Args:
         kind: type of the option's value.
-        choices: the allowed texts; or the module attribute that lists them, for a module that is loaded late.
+        choices: the allowed texts; or, for a module that is imported late, the module attribute that lists them.
     """
     if get_origin(kind) is list:
         kind = get_args(kind)[0]
@@ -37,7 +39,10 @@ def type_word(kind: object, choices: tuple[str, ...] | str = ()) -> str | None:
 
 
 class _Spelt(_ClickCommand):
-    """Help text converted to characters that the console can print; Typer would always write UTF-8."""
+    """Base class of commands whose help text uses only characters that the console can print.
+
+    Typer alone would always write UTF-8.
+    """
 
     def get_help(self, ctx: Any) -> str:
         console = sys.stdout.encoding or "utf-8"
@@ -45,7 +50,7 @@ class _Spelt(_ClickCommand):
 
 
 class Command(_Spelt, TyperCommand):
-    """A command whose help names arguments as its text does (ROBOT, MEASURED...), without Python's types."""
+    """A command whose help shows arguments in capitals (ROBOT, MEASURED...) and without Python types."""
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         return [piece.replace("{", "").replace("}", "") for piece in super().collect_usage_pieces(ctx)]
@@ -64,7 +69,7 @@ class Command(_Spelt, TyperCommand):
 
 
 class CommandGroup(_Spelt, TyperGroup):
-    """The list of commands by `GROUPS`; each command states its group in its decorator (`calib.cli.shared.command`)."""
+    """The list of commands, arranged by `GROUPS`; the decorator of each command states the group."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         groups: dict[str, list[tuple[str, str]]] = {title: [] for title in GROUPS}
@@ -77,8 +82,15 @@ class CommandGroup(_Spelt, TyperGroup):
 
 
 def spelt(error: Any) -> tuple[str, int]:
-    """Return ASCII replacements (sigma, ^2, ...) for characters that an encoding lacks, else their number; see
-    `codecs`.
+    """Return ASCII replacements (sigma, ^2, ...) for characters that an encoding lacks; an error handler of `codecs`.
+
+    Characters without a replacement are represented by their number.
+
+    Args:
+        error: the UnicodeEncodeError with the text and the position of the characters.
+
+    Returns:
+        The replacements, and the position at which the encoding continues.
     """
     letters = error.object[error.start : error.end]
     return "".join(map(_in_ascii, letters)), error.end

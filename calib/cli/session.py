@@ -1,4 +1,4 @@
-"""Commands of the guided session: new, next, status, redo; formats and explain."""
+"""Commands of the guided session: new, next, status, redo; and formats and explain."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -59,14 +59,18 @@ def new(
 
 
 def _completed(answers: Answers) -> Answers:
-    """Return the answers completed by questions at a terminal."""
+    """Return the answers completed by questions at a terminal.
+
+    Raises:
+        UsageError: if answers are missing and there is no terminal.
+    """
     import sys
 
     from calib.procedure.session.questions import QUESTIONS, with_answer
 
     if not sys.stdin.isatty():
         missing = "--robot" if answers.robot is None else "--instrument"
-        raise UsageError(f"{missing} is missing; at a terminal, `calib new` asks for it")
+        raise UsageError(f"{missing} is missing: give it, or run `calib new` at a terminal, which asks for it")
     for question in QUESTIONS:
         while question.open(answers):
             answer = typer.prompt(question.words, default=question.default, show_default=bool(question.default))
@@ -118,12 +122,15 @@ def explain(code: Annotated[str | None, typer.Argument(autocompletion=codes)] = 
 
 
 @command(app, "Start", "next")
-def next_step(folder: Folder, plots: bool = True) -> None:
+def next_step(folder: Folder, pick: Annotated[int | None, typer.Option(min=1)] = None, plots: bool = True) -> None:
     """Continue a session, then print what to do at the robot.
 
     Example: calib next cell
+
+    Args:
+        pick: number of a motion in 6-excitation/training/front.csv, which becomes the training motion
     """
-    _go_on(folder, "next", plots=plots)
+    _go_on(folder, "next", plots=plots, pick=pick or 0)
 
 
 @command(app, "Start")
@@ -145,19 +152,21 @@ def status(folder: Folder) -> None:
     Example: calib status cell
     """
     from calib.procedure.session import commands
-    from calib.results.registry import open_result
+    from calib.results.result_classes import open_result
 
     say(*open_result(folder, "session").status(), result=True)
     say(*commands.noted(folder))
 
 
-def _go_on(folder: Path, command: str, step: str = "", plots: bool = True) -> None:
+def _go_on(folder: Path, command: str, step: str = "", plots: bool = True, pick: int = 0) -> None:
     from calib.procedure.session import commands
 
     arguments: list[object] = [command, folder]
     if step:
         arguments.append(step)
+    if pick:
+        arguments += ["--pick", pick]
     with reporting() as (say, progress):
-        stop = commands.go_on(folder, say, progress, command_line(*arguments), step, plots)
+        stop = commands.go_on(folder, say, progress, command_line(*arguments), step, plots, pick)
     say(*stop.lines)
     exit_failed(stop.verdict)

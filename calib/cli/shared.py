@@ -1,4 +1,6 @@
-"""Shared parts of the commands: function signatures as options, the console, progress, checks of the output folder."""
+"""Shared parts of the commands: options from function signatures, console output, progress, check
+of the output folder.
+"""
 
 from __future__ import annotations
 
@@ -34,16 +36,16 @@ if TYPE_CHECKING:
 
 
 def check_destination(verb: str, robot: object, out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Raise an error, before any work is done, if the command `verb` must not write its results to the folder `out`.
+    """Check, before any other work, that a command can write its results into a folder.
 
     Args:
         verb: name of the command.
-        robot: a serial arm or another robot, as named by the user.
+        robot: the robot as the user named it: file, library name or folder of a fit.
         out: folder for the results.
         inputs: files that the command reads, which must not be overwritten; None: no file.
 
     Raises:
-        UsageError: with the file or folder concerned.
+        UsageError: if the folder contains inputs or other files; the message names the folder or file.
     """
     from calib.procedure.robot_kinds import stage_of
 
@@ -125,7 +127,7 @@ _OUTPUT: ContextVar[_Output | None] = ContextVar("output", default=None)
 
 
 class _Logged(logging.Handler):
-    """Log handler that prints the package's messages to the user, each text once."""
+    """Log handler that prints the log messages of this package for the user; each text is printed once."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
@@ -140,9 +142,9 @@ class _Logged(logging.Handler):
 
 @contextmanager
 def printing(verbose: bool) -> Iterator[None]:
-    """Print the lines that the block passes to `say`: all if `verbose`, otherwise the most important ones.
+    """Print the lines that the block passes to `say`: all lines if `verbose`, otherwise the most important ones.
 
-    Messages that the package logs are printed, too.
+    Log messages of the package are printed, too.
     """
     output = _Output(verbose)
     log = logging.getLogger("calib")
@@ -161,7 +163,13 @@ def printing(verbose: bool) -> Iterator[None]:
 
 
 def say(*lines: object, console: Console | None = None, result: bool = False) -> None:
-    """Print texts and rich renderables; those given as a `result` are always printed in full."""
+    """Print texts and rich renderables.
+
+    Args:
+        lines: the texts and renderables.
+        console: console for the output; None: standard output.
+        result: whether the lines are the requested result, which is always printed in full.
+    """
     console = console or make_console()
     output = _OUTPUT.get() or _Output(verbose=True)
     for line in lines:
@@ -169,7 +177,12 @@ def say(*lines: object, console: Console | None = None, result: bool = False) ->
 
 
 def say_written(lines: Iterable[object], out: Path, verdict: str = "") -> None:
-    """Print the lines of a result and the path that it was written to.
+    """Print the lines on a result, and the path to which the result was written.
+
+    Args:
+        lines: texts and rich renderables to print.
+        out: path of the result.
+        verdict: level of the verdict; empty: no verdict.
 
     Raises:
         typer.Exit: with code 1 if the verdict is fail.
@@ -179,14 +192,18 @@ def say_written(lines: Iterable[object], out: Path, verdict: str = "") -> None:
 
 
 def exit_failed(verdict: str) -> None:
-    """Exit with code 1 if the verdict is fail."""
+    """Exit with code 1 if the level of the verdict is fail."""
     if verdict == "fail":
         raise typer.Exit(1)
 
 
 @contextmanager
 def progress(console: Console | None = None) -> Iterator[Callable[[str], None]]:
-    """Show the progress on a console, by default stderr, if it is a terminal."""
+    """Yield a function that shows progress messages on a console, if the console is a terminal.
+
+    Args:
+        console: the console; None: stderr.
+    """
     from rich.markup import escape
 
     console = console or make_console(stderr=True)
@@ -200,7 +217,7 @@ def progress(console: Console | None = None) -> Iterator[Callable[[str], None]]:
 
 
 def _now_and_then(period: float) -> Callable[[str], None]:
-    """Return a function that prints a message on stderr, at most once in a period [s]."""
+    """Return a function that prints a message on stderr, at most once per `period` [s]; other messages are dropped."""
     due = time.monotonic() + period
 
     def say_if_due(message: str) -> None:
@@ -215,11 +232,11 @@ def _now_and_then(period: float) -> Callable[[str], None]:
 
 @contextmanager
 def reporting(logged: float = inf) -> Iterator[tuple[Callable[..., None], Callable[[str], None]]]:
-    """Yield two functions: one for permanent lines, one for progress messages.
+    """Yield two functions: one prints permanent lines, the other one shows progress messages.
 
     Args:
-        logged: interval [s] between progress messages on stderr if the output is not a terminal, but a file or a job's
-            log.
+        logged: interval [s] between progress messages on stderr if the output is not a terminal (but a file, or the log
+            of a job); infinite: no such messages.
     """
     console = make_console()
     if not console.is_terminal and logged < inf:
@@ -230,7 +247,16 @@ def reporting(logged: float = inf) -> Iterator[tuple[Callable[..., None], Callab
 
 
 def numbers(text: str, count: int, option: str) -> list[float]:
-    """Return the `count` finite numbers of an option's text ``1,2,3``; refuse any other text with a UsageError."""
+    """Return the finite numbers in an option's text such as ``1,2,3``.
+
+    Args:
+        text: the text.
+        count: expected number of values.
+        option: name of the option for the message.
+
+    Raises:
+        UsageError: for any other text.
+    """
     try:
         values = [plain_number(part) for part in text.split(",")]
     except ValueError:
@@ -259,13 +285,23 @@ class Common:
 
 
 def command(app: typer.Typer, group: str, name: str | None = None, listing: bool = False) -> Callable[[F], F]:
-    """Return a decorator that adds a function to `app` as a command of a `calib.cli.help.GROUPS` group.
+    """Return a decorator that adds a function to `app` as a command.
 
-    Its docstring ends with an example, which tests parse. What ``Args:`` of its docstring, or `Common`, says of a
-    parameter is the option's help; a flag that is off by default has no name to switch it off. A parameter that is
-    annotated with a settings dataclass becomes an option per field, described under ``Attributes:`` of that class;
-    fields that the function takes itself are left to it. Every command has ``-v``, without which it prints what
-    `calib.cli.shared.printing` lets through; not so one that lists.
+    The function's docstring ends with an example, which tests parse. The help of an option is the text on the parameter
+    under ``Args:`` of this docstring, or in `Common`. A flag that is off by default has no option to switch it off.
+
+    A parameter that is annotated with a settings dataclass becomes one option per field, with the help from
+    ``Attributes:`` of the class. A field with the name of one of the function's parameters becomes no option of its
+    own.
+
+    Every command except listing commands has the option ``-v``; without it, the output is shortened by
+    `calib.cli.shared.printing`.
+
+    Args:
+        app: the Typer application.
+        group: group of the command in the help, one of `calib.cli.help.GROUPS`.
+        name: name of the command; None: the function's name.
+        listing: whether the command prints a list, which is never shortened.
     """
 
     def add(function: F) -> F:
@@ -312,7 +348,14 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
 
 
 def _with_help(parameter: Parameter, hint: object, description: str, names: Sequence[str]) -> object:
-    """Return an annotation with help and type word of the parameter's option or argument, and metadata for Typer."""
+    """Return the annotation of a parameter for Typer, with help text and a word for the type of the value.
+
+    Args:
+        parameter: parameter of the command's function.
+        hint: its type annotation.
+        description: the help text.
+        names: names of the option, such as ``--out``; empty: Typer's default.
+    """
     kind, *metadata = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     stated = [item for item in metadata if isinstance(item, ParameterInfo)]
     if stated:
@@ -329,7 +372,11 @@ def _with_help(parameter: Parameter, hint: object, description: str, names: Sequ
 
 
 def _options(kind: type) -> Iterator[Parameter]:
-    """Yield the options of a settings dataclass, including nested settings."""
+    """Yield the options of a settings dataclass, including those of nested settings dataclasses.
+
+    Args:
+        kind: the settings dataclass.
+    """
     hints = get_type_hints(kind, include_extras=True)
     descriptions = described(kind)
     for field in fields(kind):
@@ -363,7 +410,7 @@ def _options(kind: type) -> Iterator[Parameter]:
 
 
 def _typed(metadata: Sequence[object]) -> Typed:
-    """Return how a setting is typed on the command line."""
+    """Return how a setting is typed on the command line, from its annotation's metadata; or a default."""
     for item in metadata:
         if isinstance(item, Typed):
             return item
@@ -371,7 +418,14 @@ def _typed(metadata: Sequence[object]) -> Typed:
 
 
 def _as_typed(message: str, options: Sequence[Parameter]) -> str:
-    """Return an error message in which the option it begins with (``sigmas: …``, ``lock joint9: …``) has dashes."""
+    """Return an error message whose first word, if it is the name of a parameter, is replaced by the option's name.
+
+    ``sigmas: …`` or ``lock joint9: …`` then begin with ``--sigmas`` or ``--lock``. Other messages are unchanged.
+
+    Args:
+        message: the error message.
+        options: the command's parameters.
+    """
     match = re.match(r"\w+(?=:| \S+: )", message)
     if match is None:
         return message
@@ -387,7 +441,7 @@ def _as_typed(message: str, options: Sequence[Parameter]) -> str:
 
 
 def _plain(hint: Any) -> tuple[Any, tuple[object, ...]]:
-    """Return a type without None, and its metadata."""
+    """Return the type in the annotation `hint` without None, and the metadata of the annotation."""
     if get_origin(hint) is Annotated:
         plain, metadata = _plain(get_args(hint)[0])
         return plain, (*metadata, *hint.__metadata__)
@@ -398,13 +452,27 @@ def _plain(hint: Any) -> tuple[Any, tuple[object, ...]]:
 
 
 def _is_repeated(plain: object) -> bool:
-    """Return whether an option is given once per item; a list of numbers is given as one comma-separated text."""
+    """Return whether an option is repeated for each item of a list.
+
+    A list of numbers is instead one comma-separated text.
+
+    Args:
+        plain: type of the option's value, without None.
+    """
     first, last = get_args(plain)[0], get_args(plain)[-1]
     return last is ... and _plain(first)[0] is not float
 
 
 def _built(kind: type[S], values: dict[str, object]) -> S:
-    """Return settings from the values of the command line; missing values take the defaults."""
+    """Return a settings object with the values from the command line; missing values are the defaults.
+
+    Args:
+        kind: the settings dataclass.
+        values: values of the command's options by parameter name.
+
+    Raises:
+        UsageError: for an invalid value.
+    """
     chosen = _chosen(kind, values)
     if not chosen:
         return kind()
@@ -430,7 +498,12 @@ def _chosen(kind: type, values: dict[str, object]) -> dict[str, object]:
 
 
 def _read(hint: object, value: Any) -> object:
-    """Return a value as in an option file: comma-separated texts as lists, numbers with their unit."""
+    """Return a value as it would be in an option file: comma-separated texts as lists, numbers with their unit.
+
+    Args:
+        hint: type annotation of the setting.
+        value: value from the command line.
+    """
     plain, metadata = _plain(hint)
     unit = _typed(metadata).unit
     if unit:

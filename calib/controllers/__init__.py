@@ -1,1 +1,1 @@
-"""Robot controllers: what each displays, and which programs and settings it accepts."""
+"""Robot controllers: the joint values that each displays, and the programs and settings that it accepts."""

@@ -1,8 +1,9 @@
 """Robot controllers, as declared in ``controllers.toml``: joint values, programs, accepted settings.
 
-A controller displays  s_i = sign_i · (q_i + Σ way · q_j)  for a description's joints q: signs and coupled axes (a
-FANUC's J3 is measured from the horizontal). Descriptions are ROS-Industrial's or the maker's. If a description has
-another zero of a joint, the programs would be wrong: play them in the controller's simulation first.
+For the joints q of a robot description, a controller displays s_i = sign_i · (q_i + Σ way · q_j), with signs and
+coupled axes (a FANUC's J3 is measured from the horizontal). The table is valid for descriptions of ROS-Industrial or
+the maker. If a description defines another zero of a joint, written programs would be wrong: play them in the
+controller's simulation first.
 """
 
 import tomllib
@@ -22,7 +23,7 @@ from calib.units import ANGLES, LENGTHS
 @strict
 @dataclass(frozen=True)
 class Controller:
-    """One entry of ``controllers.toml``; the head of that file explains each key."""
+    """One entry of ``controllers.toml``; the comment at the head of that file explains each key."""
 
     title: str
     files: Mapping[str, str]
@@ -61,7 +62,9 @@ class Controller:
     comment: str = ""
 
     def matrix(self, n: int) -> np.ndarray:
-        """Return the matrix (n, n) from a description's joints to the joints that the controller displays."""
+        """Return the matrix (n, n) that maps a description's joint values to the joint values that the controller
+        displays.
+        """
         coupling = np.eye(n)
         for axis, partner, sign in self.coupled:
             if max(axis, partner) <= n:
@@ -69,24 +72,26 @@ class Controller:
         return np.array(self.signs or [1] * n)[:, None] * coupling
 
     def shown(self, q: np.ndarray) -> np.ndarray:
-        """Return a description's joint values (…, n) [rad] as the controller displays them, in its unit."""
+        """Return a description's joint values q (…, n) [rad] as the controller displays them, in
+        the controller's unit.
+        """
         return q @ self.matrix(q.shape[-1]).T / ANGLES[self.unit]
 
     def described(self, controller_values: np.ndarray) -> np.ndarray:
-        """Return a description's joint values (…, n) from those that the controller displays, in the controller's
+        """Return a description's joint values (…, n) for joint values that the controller displays, in the controller's
         unit.
         """
         return controller_values @ np.linalg.inv(self.matrix(controller_values.shape[-1])).T
 
     @property
     def metres(self) -> float:
-        """Size of the unit of lengths in poses [m]."""
+        """Size of the controller's unit of length in poses [m]."""
         return LENGTHS[self.length]
 
 
 @cache
 def controllers() -> dict[str, Controller]:
-    """Return all controllers by name."""
+    """Return all known controllers: name -> controller."""
     table = tomllib.loads(shipped_text("calib.controllers", "controllers.toml"))
     result = {}
     for name, entry in table.items():
@@ -107,19 +112,34 @@ def controller_named(name: str) -> Controller:
 
 
 def check_controller(name: str, axes: int, pulses: Sequence[float] = ()) -> None:
-    """Raise a UsageError for an unknown name, an arm with another number of axes, or missing pulses per axis."""
+    """Check that a controller supports an arm.
+
+    Args:
+        name: name of the controller.
+        axes: number of joints of the arm.
+        pulses: encoder pulses per degree of each axis; empty: not stated.
+
+    Raises:
+        UsageError: for an unknown name, an unsupported number of joints, or missing pulses per degree.
+    """
     controller = controller_named(name)
     allowed = " or ".join(map(str, controller.axes))
     require(not allowed or axes in controller.axes, f"{axes} joints; {controller.title} takes {allowed}", UsageError)
-    message = f"{controller.title} needs the pulses per degree of each of {axes} axes: calib program --pulse"
+    message = (
+        f"{controller.title} needs the pulses per degree of each of {axes} axes: give them by calib program --pulse"
+    )
     require(not controller.pulses or (len(pulses) == axes and all(pulses)), message, UsageError)
 
 
 def controller_of(path: Path, name: str = "") -> Controller:
-    """Return the controller of a program at `path`: by `name`, or, if it is empty, by the file's suffix.
+    """Return the controller of a robot program.
+
+    Args:
+        path: file of the program.
+        name: name of the controller; empty: determined by the file's suffix.
 
     Raises:
-        UsageError: if no controller's programs have this suffix and targets that can be read.
+        UsageError: for an unknown controller or suffix.
     """
     if name:
         return controller_named(name)
@@ -131,10 +151,20 @@ def controller_of(path: Path, name: str = "") -> Controller:
 
 
 def as_described(name: str, controller_values: np.ndarray) -> np.ndarray:
-    """Return a description's joint values or speeds (…, n) from those that a controller displays, in the same unit."""
+    """Return a description's joint values or velocities (…, n) for those that a controller displays, in the same unit.
+
+    Args:
+        name: name of the controller.
+        controller_values: (…, n) displayed values.
+    """
     return controller_named(name).described(controller_values)
 
 
 def motors_as_described(name: str, controller_values: np.ndarray) -> np.ndarray:
-    """Return motor torques or currents (…, n) with the description's signs; coupled axes do not affect them."""
+    """Return motor torques or currents (…, n) with the signs of a description; coupled axes do not affect them.
+
+    Args:
+        name: name of the controller.
+        controller_values: (…, n) torques or currents of the controller.
+    """
     return controller_values * np.array(controller_named(name).signs or 1.0)

@@ -1,9 +1,9 @@
 """CSV tables: headers with units, columns converted to SI, errors with row and column.
 
-Separator tab, semicolon, comma or bar (the first of these that the header has), or blanks, where the first row of
-numbers has as many cells by them as the header; UTF-8 with or without a byte order mark; lines that begin with ``#``,
-but not with a spreadsheet's error (``#REF!``), are comments; the decimal mark is a point. Where no line but a comment
-names the columns (numpy's savetxt), the last comment before the numbers is the header.
+The separator is tab, semicolon, comma or bar (the first of these that the header contains). It is blanks if the first
+row of numbers, split at blanks, has as many cells as the header. Files are UTF-8 with or without a byte order mark, and
+the decimal mark is a point. Lines that begin with ``#`` are comments, except for a spreadsheet's error (``#REF!``). If
+only a comment names the columns (numpy's savetxt), the last comment before the numbers is the header.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class Table:
     Attributes:
         file: path of the file, for messages.
         header: column names without units.
-        units: unit in brackets behind each name; "" where there is none.
-        cells: one array per column: floats (NaN where a cell is empty) where every cell is a number, else texts.
+        units: unit in brackets after each name; "" where there is none.
+        cells: one array per column: floats (NaN for an empty cell) if every cell is a number, else texts.
         rows: (m,) number of each row in the file; data rows count from 1.
         notes: remarks on how a file of another program was read.
     """
@@ -73,14 +73,20 @@ class Table:
         return name in self.header
 
     def fail(self, message: str, column: str | None = None, row: int | None = None) -> NoReturn:
-        """Raise MeasurementError about the table, one of its columns, or one cell of a column (row from 0)."""
+        """Raise MeasurementError about the table, or about one of its columns or cells.
+
+        Args:
+            message: text of the error; the file's name is prepended.
+            column: name of the column; None: the whole table.
+            row: index of the cell's row, from 0; None: the whole column.
+        """
         refuse_data(self.file, message, column, None if row is None else int(self.rows[row]))
 
     def index(self, name: str) -> int:
-        """Return the index of column `name`.
+        """Return the index of the column `name`.
 
         Raises:
-            MeasurementError: for a missing column, with the most similar name.
+            MeasurementError: the column is missing; the message suggests the most similar name.
         """
         if name not in self.header:
             headings = ", ".join(self.header)
@@ -88,15 +94,23 @@ class Table:
         return self.header.index(name)
 
     def texts(self, name: str) -> list[str]:
-        """Return a column (m,) as texts; numbers in their shortest form (``0``, not ``0.0``)."""
+        """Return a column (m,) as texts, with numbers in their shortest form (``0``, not ``0.0``).
+
+        Args:
+            name: name of the column.
+        """
         cells = self.cells[self.index(name)]
         if cells.dtype == float:
             return [f"{cell:.12g}" for cell in cells]
         return [plain_text(str(cell)) for cell in cells]
 
     def block(self, head: str) -> np.ndarray | None:
-        """Return the columns head_joint1 …, or head1 …, as one array (m, n), not converted to SI; None if there are
-        none.
+        """Return the columns named `head` and a joint (``q_joint1`` or ``q1``) as an array (m, n), not in SI.
+
+        None if there are no such columns.
+
+        Args:
+            head: name of the quantity, such as ``q``.
         """
         names = [name for name in self.header if re.fullmatch(rf"{head}(\d+|_.+)", name)]
         if not names:
@@ -107,13 +121,14 @@ class Table:
         """Return a column (m,) as floats in SI.
 
         Args:
+            name: name of the column.
             dimension: ``angle`` [rad], ``length`` [m], ``joint`` (either), ``speed`` [m/s], ``time`` [s], "" (a plain
                 number) or None (not converted).
-            unit: unit of a column whose header states none; "" for SI.
+            unit: unit of the column if its header has none; "" for SI.
             gaps: whether empty and NaN cells become NaN; otherwise they are refused.
 
         Raises:
-            MeasurementError: for a cell that is no finite number, or a unit of another dimension.
+            MeasurementError: a cell that is not a finite number, or a unit of another dimension.
         """
         column = self.index(name)
         (cells,) = self.check((name,), (name,) if gaps else ())
@@ -124,14 +139,15 @@ class Table:
         return cells * self.factor(column, units[dimension], unit)
 
     def check(self, names: Sequence[str], gaps: Collection[str] = ()) -> list[np.ndarray]:
-        """Return columns (m,) as floats, not converted to SI; refuse a table with a cell that is no finite number.
+        """Return columns (m,) as floats, not converted to SI, after checking that every cell is a finite number.
 
         Args:
             names: names of the columns.
             gaps: names of columns whose cells may be empty or NaN.
 
         Raises:
-            MeasurementError: naming the first row with such a cell, and how many rows have one, in all and by column.
+            MeasurementError: a cell is not a finite number. The message names the first row with such a cell, and the
+                number of such rows, in all and by column.
         """
         cells = [self.cells[self.index(name)] for name in names]
         columns = []
@@ -144,7 +160,13 @@ class Table:
         return columns
 
     def factor(self, column: int, factors: Mapping[str, float], unit: str) -> float:
-        """Return the factor to SI of a column, one of `factors`; its unit is stated in the header or in `unit`."""
+        """Return the factor that converts a column to SI, by the unit in its header, or `unit` if the header has none.
+
+        Args:
+            column: index of the column.
+            factors: accepted units and their factors.
+            unit: unit stated by the options; "" if none. If both the header and the options state one, they must agree.
+        """
         name, header_unit = self.header[column], self.units[column]
         if header_unit and unit and header_unit != unit:
             self.fail(f"the header states [{header_unit}], the options state {unit}: remove one of them", name)
@@ -157,7 +179,7 @@ class Table:
         return factors[unit.lower()]
 
     def where(self, keep: np.ndarray) -> Table:
-        """Return the table of the rows selected by the mask `keep` (m,)."""
+        """Return the table with only those rows that the mask `keep` (m,) selects."""
         return replace(self, cells=tuple(cells[keep] for cells in self.cells), rows=self.rows[keep])
 
 
@@ -165,12 +187,13 @@ def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: b
     """Return the table of the CSV file at `path`; 100 MB of numbers take about 3 s and 100 MB of memory.
 
     Args:
-        header: names for a file that has no header.
+        path: the file.
+        header: column names for a file without a header; None: the file has a header.
         doubles: allow a name to occur twice in the header.
 
     Raises:
-        MeasurementError: for a file that is missing, empty, not UTF-8, without a header, or with decimal commas; for
-            a name that occurs twice; for a row of another length than the header.
+        MeasurementError: a file that is missing, empty, not UTF-8, without a header, or with decimal commas; a name
+            that occurs twice; a row whose number of cells differs from the header's.
     """
     with opened(path, header is None) as (lines, separator, first_line):
         if header is None:
@@ -190,7 +213,12 @@ def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: b
 
 
 def _refuse_doubles(names: tuple[str, ...], path: str | Path) -> None:
-    """Refuse a header in which a name occurs twice."""
+    """Raise MeasurementError for a header in which a name occurs twice.
+
+    Args:
+        names: the names in the header.
+        path: the file, for messages.
+    """
     for index, name in enumerate(names):
         if name in names[:index]:
             columns = " and ".join(str(column) for column, heading in enumerate(names, 1) if heading == name)
@@ -211,7 +239,12 @@ def row_width(path: str | Path) -> int:
 
 @contextmanager
 def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[str]]]:
-    """Yield a file positioned after its header line, its separator, and the header's cells."""
+    """Yield a file positioned after its header line, the file's separator, and the header's cells.
+
+    Args:
+        path: the file.
+        headed: whether the file has a header; otherwise its first row is returned in place of the header.
+    """
     try:
         check_regular(path)
         raw = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (closed below)
@@ -226,7 +259,11 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
 
 
 def _as_our_text(path: str | Path) -> IO[str] | None:
-    """Return another program's export as a stream of the toolkit's own table; None for a table of the toolkit."""
+    """Return another program's export as a text stream of a CSV table; None if the file is no known export.
+
+    Args:
+        path: the file, which may be the export of an instrument or a controller.
+    """
     for read_export in EXPORTS.all():
         export = read_export(path)
         if export is not None:
@@ -235,13 +272,23 @@ def _as_our_text(path: str | Path) -> IO[str] | None:
 
 
 def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, list[str]]:
-    """Return the separator and the header's cells; the file is then positioned after its header line."""
+    """Return the separator and the cells of the first line that is not a comment.
+
+    The file is then positioned after this line.
+
+    Args:
+        file: the open file.
+        path: its path, for messages.
+        headed: whether this line is a header; otherwise it is the first row of numbers.
+    """
     try:
         comment = ""
         line_start = 0
         for line in iter(partial(file.readline, LONGEST), ""):
             if len(line) == LONGEST:
-                refuse_data(path, f"has a line of more than {LONGEST} characters: not a table")
+                refuse_data(
+                    path, f"has a line of more than {LONGEST} characters: it is not a table; was it saved as CSV?"
+                )
             text = line.strip()
             if text.startswith("#"):
                 comment = text
@@ -262,11 +309,16 @@ def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, lis
         raise _not_utf8(error, path) from error
     except (csv.Error, StopIteration) as error:
         raise MeasurementError(f"is no CSV: {error}", path) from error
-    refuse_data(path, "is empty: no header and no rows")
+    refuse_data(path, "is empty: a header and rows are needed")
 
 
 def _with_quoted_breaks(line: str, file: IO[str]) -> str:
-    """Return a line joined with the lines after it, where a quoted name contains line breaks."""
+    """Return a line joined with the following lines, if a quoted name in it contains line breaks.
+
+    Args:
+        line: a line of the file.
+        file: the open file, from which the following lines are read.
+    """
     while line.count('"') % 2 and len(line) < LONGEST:
         continuation = file.readline(LONGEST)
         if not continuation:
@@ -276,14 +328,22 @@ def _with_quoted_breaks(line: str, file: IO[str]) -> str:
 
 
 def _headless(cells: Sequence[str], path: str | Path) -> bool:
-    """Return whether a first line contains numbers only."""
+    """Return whether most cells of a first line are numbers, so that the file has no header.
+
+    Args:
+        cells: cells of the file's first line.
+        path: the file, for messages.
+
+    Raises:
+        MeasurementError: most cells are numbers with decimal commas.
+    """
     if sum(bool(_DECIMAL_COMMA.match(cell)) for cell in cells) > len(cells) / 2:
         refuse_data(path, _not_a_number(cells[0]), row=1)
     return sum(is_number(cell) for cell in cells) > len(cells) / 2
 
 
 def _separator(line: str, next_row: Callable[[], str]) -> str:
-    """Return the separator of a first line; `next_row` returns the line after it."""
+    """Return the separator of a file from its first line; `next_row` returns the line after it."""
     line = re.sub(r'"[^"]*"', "", line)
     for mark in "\t;,|":
         if mark in line:
@@ -322,7 +382,7 @@ def _comment_header(comment: str, separator: str, width: int, path: str | Path) 
 
 
 def split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return names and units of a header's cells: ``q1 [deg]`` is ``q1`` in ``deg``; "" without a unit."""
+    """Return the names and the units in a header's cells: ``q1 [deg]`` gives ``q1`` and ``deg``; "" without a unit."""
     names, units = [], []
     for number, cell in enumerate(cells, 1):
         name, unit = plain_text(cell), ""
@@ -337,8 +397,14 @@ def split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]
 def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: str | Path) -> tuple[np.ndarray, ...]:
     """Return the columns below the header.
 
-    Blocks of rows that contain only numbers are read by numpy, about five times as fast; from the first other block on,
-    the file is read cell by cell.
+    Blocks of rows that contain only numbers are read by numpy, which is about five times faster. From the first other
+    block on, the file is read cell by cell.
+
+    Args:
+        lines: the open file, positioned below the header.
+        separator: the file's separator.
+        names: column names.
+        path: the file, for messages.
     """
     body = _without_comments(lines)
     blocks: list[np.ndarray] = []
@@ -360,7 +426,7 @@ def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: 
 
 
 def _without_comments(lines: IO[str]) -> Iterator[str]:
-    """Yield the lines that are neither empty nor a comment."""
+    """Yield the lines that are neither empty nor comments."""
     for line in lines:
         text = line.lstrip()
         if text and (text[0] != "#" or _ERROR.match(text)):
@@ -368,7 +434,13 @@ def _without_comments(lines: IO[str]) -> Iterator[str]:
 
 
 def plain_rows(block: list[str], separator: str, width: int) -> np.ndarray | None:
-    """Return the lines as an array (m, width); None if a cell is not a number or the widths of rows differ."""
+    """Return lines of numbers as an array (m, width); None if a cell is not a number or a row has another width.
+
+    Args:
+        block: m lines of the file.
+        separator: separator of the cells.
+        width: number of cells in each line.
+    """
     delimiter = None if separator == " " else separator
     try:
         values = np.loadtxt(block, delimiter=delimiter, comments=None, quotechar='"', ndmin=2)
@@ -378,7 +450,7 @@ def plain_rows(block: list[str], separator: str, width: int) -> np.ndarray | Non
 
 
 def _transposed(blocks: list[np.ndarray], width: int) -> np.ndarray:
-    """Return blocks (m_i, width) as one array (width, m) of contiguous columns; empties `blocks`."""
+    """Return blocks (m_i, width) as one array (width, m) with contiguous columns; the list `blocks` is emptied."""
     table = np.empty((width, sum(len(block) for block in blocks)))
     start = 0
     blocks.reverse()
@@ -393,7 +465,15 @@ def _transposed(blocks: list[np.ndarray], width: int) -> np.ndarray:
 def _read_cells(
     body: Iterator[str], separator: str, names: tuple[str, ...], path: str | Path, row_count: int
 ) -> list[list[np.ndarray]]:
-    """Return the columns in parts, each of floats or of texts; `row_count` rows precede them."""
+    """Return each column in parts of floats or of texts.
+
+    Args:
+        body: lines of the file.
+        separator: the file's separator.
+        names: column names.
+        path: the file, for messages.
+        row_count: number of rows read before these lines, for messages.
+    """
     parts: list[list[np.ndarray]] = [[] for _ in names]
     reader = csv.reader(body, delimiter=separator, skipinitialspace=True)
     rows = (row for row in reader if any(row))
@@ -412,7 +492,7 @@ def _read_cells(
 
 
 def _convert(column: Sequence[str]) -> np.ndarray:
-    """Return the cells as floats if all of them are numbers or empty, else as texts."""
+    """Return a column's cells as floats if all of them are numbers or empty, else as texts."""
     joined = "".join(column)
     try:
         if "_" in joined or not joined.isascii():
@@ -444,7 +524,7 @@ def _filled(cells: np.ndarray) -> bool:
 
 
 def _as_floats(texts: np.ndarray) -> np.ndarray:
-    """Return texts (m,) as floats: NaN where they are empty, infinite where they are no numbers."""
+    """Return texts (m,) as floats: NaN for an empty text, infinity for a text that is not a number."""
     values = np.full(len(texts), math.inf)
     for row, text in enumerate(texts):
         if not text:

@@ -1,8 +1,8 @@
-"""Declarations of table columns (names, dimension, bounds), and the error about a cell beyond them.
+"""Declarations of table columns (names, dimension, bounds), and the error about a cell outside the bounds.
 
-Poses, targets, waypoints and recordings read their tables by these declarations. `refuse` raises the error about an
-impossible value: the value, advice, and how many more rows have such a value (by column, if there are several columns);
-the error carries file, row and column.
+Poses, targets, waypoints and recordings are read by these declarations. `refuse` raises the error about an impossible
+value. Its message contains the value, advice, and the number of further rows with such a value (by column, if there are
+several columns); the error also has file, row and column.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from calib.units import DEG
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds on measured values; all of them our choice.
+    """Bounds on measured values; all of them are our choice.
 
     Attributes:
-        max_turn: of a turning joint without limits [rad].
-        max_length: of a tool from its instrument, and of a sliding joint's travel [m].
-        min_sigma: of an instrument [m or rad].
-        min_travel: a joint that moves less has not moved [rad or m].
+        max_turn: largest angle of a revolute joint without limits [rad].
+        max_length: largest distance of a tool from its instrument, and largest travel of a prismatic joint [m].
+        min_sigma: smallest standard deviation of an instrument [m or rad].
+        min_travel: a joint that moves less counts as not moved [rad or m].
         limit_slack: allowed encoder error beyond a joint limit [rad or m].
-        max_norm_error: of a quaternion or a matrix, rounding that is corrected.
+        max_norm_error: largest rounding error of a quaternion or a matrix, which is corrected.
     """
 
     max_turn: float = 2.1 * math.pi
@@ -45,13 +45,13 @@ BOUNDS = Bounds()
 
 @dataclass(frozen=True, eq=False)
 class Joints:
-    """Joint data of a robot for checking measurements and recordings; NaN or infinity if a limit is unknown.
+    """Joints of a robot, as needed to check measurements and recordings.
 
     Attributes:
         names: n joint names in the robot's order.
-        kinds: URDF's joint types (``revolute``, ``continuous``, ``prismatic``).
-        lower, upper: (n,) position limits [rad or m].
-        effort: (n,) [N·m or N].
+        kinds: URDF joint types (``revolute``, ``continuous``, ``prismatic``).
+        lower, upper: (n,) position limits [rad or m]; NaN or infinite if unknown.
+        effort: (n,) effort limits [N·m or N]; NaN or infinite if unknown.
     """
 
     names: tuple[str, ...]
@@ -62,7 +62,7 @@ class Joints:
 
     @staticmethod
     def of(joints: Joints | Sequence[str]) -> Joints:
-        """Return the joints; from names alone, revolute joints without limits."""
+        """Return `joints` itself, or, for names only, revolute joints without limits."""
         return joints if isinstance(joints, Joints) else Joints(tuple(joints))
 
     def __post_init__(self) -> None:
@@ -78,7 +78,7 @@ class Joints:
 
 
 class Rows(Protocol):
-    """Source of rows named in an error: a table, a recording or a block of measurements.
+    """Protocol of objects whose rows an error may name: a table, a recording or a block of measurements.
 
     Attributes:
         file: path of the file.
@@ -93,11 +93,13 @@ class Rows(Protocol):
 
 
 def refuse(source: Rows, bad: np.ndarray, columns: Sequence[str], says: Callable[[int, int], str]) -> None:
-    """Refuse the rows marked in `bad`, (m,) or (m, k), if any.
+    """Raise MeasurementError if any row is marked in `bad`, (m,) or (m, k).
 
     Args:
+        source: file and row numbers.
+        bad: which rows, or cells, are impossible.
         columns: the file's names of the k columns.
-        says: returns the message for the first bad cell from its row and column (from 0).
+        says: function of row and column (from 0) that returns the message for the first bad cell.
 
     Raises:
         MeasurementError: with file, row and column of the first bad cell, and the number of further bad rows (by
@@ -112,10 +114,14 @@ def refuse(source: Rows, bad: np.ndarray, columns: Sequence[str], says: Callable
 
 
 def more_rows(source: Rows, bad: np.ndarray, columns: Sequence[str]) -> str:
-    """Return words on the rows marked in `bad` (m, k) after the first: their number, the number of all rows, and by
-    column.
+    """Return as text the number of marked rows after the first, with counts by column; empty if there are none.
 
-    Where only a part of the file's rows was read, the words state how many were read.
+    If only a part of the file's rows was read, the text states how many were read.
+
+    Args:
+        source: file and row numbers.
+        bad: (m, k) marked cells.
+        columns: the file's names of the k columns.
     """
     count = int(bad.any(axis=1).sum()) - 1
     if not count:
@@ -138,8 +144,8 @@ class Column:
         dimension: angle, length, joint, or "" for a plain number.
         family: name under which options state a unit for all columns of the family.
         most: largest absolute value [SI].
-        likely: the likely unit of values larger than `most`.
-        positive: advice if a value is not above zero; "" if it may have any sign.
+        likely: the unit in which values larger than `most` probably are.
+        positive: advice for a value that is not above zero; "" if values may have any sign.
     """
 
     names: tuple[str, ...]
@@ -150,7 +156,13 @@ class Column:
     positive: str = ""
 
     def check(self, values: np.ndarray, source: Rows, columns: Sequence[str]) -> np.ndarray:
-        """Return the values (m, k) [SI] of a column (NaN: empty cell); refuse values beyond its bounds."""
+        """Return a column's values (m, k) [SI] (NaN for an empty cell); refuse values outside the bounds.
+
+        Args:
+            values: the column's values, in SI.
+            source: file and row numbers, for messages.
+            columns: the file's names of the k columns.
+        """
         unit = {"angle": " rad", "length": " m"}.get(self.dimension, "")
 
         def other_unit(row: int, k: int) -> str:
@@ -168,12 +180,20 @@ class Column:
 
 
 def joint_unit(kind: str) -> tuple[str, str, float]:
-    """Return the SI unit for a joint of URDF type `kind`, the unit mistaken for it, and that unit's factor to SI."""
+    """Return a joint type's SI unit, the unit that is often used by mistake, and the factor of the latter to SI.
+
+    Args:
+        kind: URDF type of the joint.
+    """
     return ("m", "mm", 1e-3) if kind == "prismatic" else ("rad", "deg", DEG)
 
 
 def max_travel(kinds: Sequence[str]) -> np.ndarray:
-    """Return the largest plausible values (n,) [rad or m] of joints of these types without known limits."""
+    """Return the largest plausible joint values (n,) [rad or m] for joints of the given types without known limits.
+
+    Args:
+        kinds: URDF type of each joint.
+    """
     travel_of = {"prismatic": BOUNDS.max_length, "continuous": math.inf}
     return np.array([travel_of.get(kind, BOUNDS.max_turn) for kind in kinds])
 
@@ -187,10 +207,15 @@ def check_travel(
     kinds: Sequence[str],
     advice: Callable[[int, str], str],
 ) -> None:
-    """Refuse joint values (m, n) [rad or m] larger than `most` (n,).
+    """Raise MeasurementError for joint values q (m, n) [rad or m] whose absolute value exceeds `most` (n,).
 
     Args:
-        advice: returns the advice for joint j, given the unit in which its values seem to be.
+        q: the joint values.
+        most: largest plausible value of each joint.
+        source: file and row numbers, for messages.
+        columns: names of the columns.
+        joints, kinds: names and types of the joints.
+        advice: function of a joint's index and the unit in which its values probably are; returns the advice.
     """
 
     def says(row: int, j: int) -> str:

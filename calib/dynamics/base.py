@@ -1,13 +1,14 @@
-"""Base parameters: the independent columns of the regressor and the standard parameters that each combines.
+"""Base parameters: the independent columns of the regressor, and the standard parameters that each of them combines.
 
     W chi = W_kept (chi_kept + K chi_dropped) = W_kept chi_base,    W_dropped = W_kept K
 
-(Gautier 1991, numerically by QR). Where several choices of kept columns are equivalent, Khalil's is taken: he regroups
-YY, MZ, M of a link behind a revolute joint, and the six moments of inertia of a link behind a prismatic joint, into the
-parameters of the links before it (Khalil & Kleinfinger 1987). The columns are tried one after another in a fixed order,
-not by the size of pivots, so that no rounding of a BLAS library decides between equivalent columns.
+(Gautier 1991, numerically by QR). If several choices of kept columns are equivalent, Khalil's choice is used: YY, MZ, M
+of a link behind a revolute joint, and the six moments of inertia of a link behind a prismatic joint, are regrouped into
+the parameters of the links before it (Khalil & Kleinfinger 1987). Columns are tested one after another in a fixed
+order, not in the order of pivot sizes, so that the choice between equivalent columns does not depend on the rounding of
+a BLAS library.
 
-Columns are chosen on the nominal chain; `regroup` recomputes K on the calibrated chain, where W_dropped = W_kept K
+Columns are chosen on the nominal chain. `regroup` recomputes K on the calibrated chain, where W_dropped = W_kept K
 holds only approximately.
 """
 
@@ -37,17 +38,17 @@ MIN_INDEPENDENT = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """Base parameters of a model.
+    """Base parameters of a model: b combinations T (b, p) of its p standard parameters, with independent columns.
 
     Attributes:
         rows: name of the model's torque rows.
-        standard: names of the p parameters of the model.
+        standard: names of the p standard parameters of the model.
         standard_units: units of the p standard parameters.
-        split: the kept and dropped columns, K = ``split.coefficients``, singular values and their gap.
-        remainder: (p - b,) part of each dropped column that W_kept K does not reproduce, relative to the column's norm:
-            rounding error on the original chain, more after `regroup`.
-        lost: (p - b,) the remainder as a torque: rms over the samples' rows per unit of the parameter [N m or N per
-            unit].
+        split: kept and dropped columns, regrouping matrix K = ``split.coefficients``, and singular values with their
+            gap.
+        remainder: (p - b,) norm of the part of each dropped column that W_kept K does not reproduce, over the column's
+            norm: rounding on the chain on which columns were chosen, more after `regroup`.
+        lost: (p - b,) that part as a torque, rms over the rows of all samples [N m or N per unit of the parameter].
     """
 
     rows: str
@@ -64,23 +65,23 @@ class Base:
 
     @property
     def kept(self) -> np.ndarray:
-        """Indices (b,) of the model's columns whose coefficients are the base parameters."""
+        """Indices (b,) of the model's columns that are kept as base columns."""
         return self.split.kept
 
     @property
     def without_effect(self) -> tuple[str, ...]:
-        """Names of the standard parameters that act on no torque."""
+        """Names of the standard parameters that affect no torque."""
         return tuple(self.standard[column] for column in self.split.without_effect)
 
     @property
     def regrouped(self) -> tuple[str, ...]:
-        """Names of the standard parameters regrouped into others."""
+        """Names of the standard parameters that are regrouped into base parameters."""
         without_effect = set(self.split.without_effect.tolist())
         return tuple(self.standard[column] for column in self.split.dropped if column not in without_effect)
 
     @property
     def transform(self) -> np.ndarray:
-        """Matrix (b, p) that maps standard to base parameters: base = transform @ standard."""
+        """Matrix T (b, p) that maps standard to base parameters: base = T @ standard."""
         result = np.zeros((self.b, len(self.standard)))
         result[np.arange(self.b), self.kept] = 1.0
         result[:, self.split.dropped] = self.split.coefficients
@@ -88,7 +89,10 @@ class Base:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the b base parameters; suffix R: others are regrouped into them by at least `MIN_COEFFICIENT`."""
+        """Names of the b base parameters, with suffix R if other parameters are regrouped into them.
+
+        A regrouping coefficient below `MIN_COEFFICIENT` gives no suffix.
+        """
         names = []
         for column, coefficients in zip(self.kept, self.split.coefficients):
             regrouped = (np.abs(coefficients) >= MIN_COEFFICIENT).any()
@@ -101,7 +105,10 @@ class Base:
         return tuple(self.standard_units[column] for column in self.kept)
 
     def to_standard(self, values: np.ndarray) -> np.ndarray:
-        """Return standard parameters (p,) with the same torques: base values for the kept ones, zero for all others."""
+        """Return standard parameters (p,) that give the same torques as the base parameters `values` (b,).
+
+        Kept parameters have the base values, all others are zero.
+        """
         result = np.zeros(len(self.standard))
         result[self.kept] = shaped(values, (self.b,), "base parameters")
         return result
@@ -109,7 +116,12 @@ class Base:
 
 @dataclass(frozen=True, eq=False)
 class BaseModel:
-    """A model reduced to its base columns: used by excitation and identification."""
+    """An identification model with its base parameters, whose regressor has the base columns only.
+
+    Attributes:
+        model: model of all standard and drive parameters.
+        base: base parameters of this model.
+    """
 
     model: IdentificationModel
     base: Base
@@ -128,20 +140,35 @@ class BaseModel:
         return self.base.units
 
     def regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the base regressor (N, rows, b) at q, v, a (N, n), with all payloads."""
+        """Return the base regressor (N, rows, b) at q, v, a (N, n), with all payloads attached.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+        """
         full = self.model.regressor(q, v, a)
         return full.transpose(2, 1, 0)[self.base.kept].transpose(2, 1, 0)
 
     def regressor_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the gradients of Σ weights · regressor, weights (N, rows, b), for q, v and a, (N, n) each."""
+        """Return the gradients of Σ weights · regressor with respect to q, v and a, (N, n) each.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+            weights: (N, rows, b) weight of each entry of the base regressor.
+        """
         return self.model.regressor_gradient(q, v, a, weights, self.base.kept)
 
     def torque_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the gradients of Σ weights · (regressor values), weights (N, rows), for q, v and a, (N, n) each."""
+        """Return the gradients of Σ weights · torques with respect to q, v and a, (N, n) each.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+            values: (b,) base parameters, which give the torques.
+            weights: (N, rows) weight of each torque.
+        """
         standard = np.zeros(self.model.p)
         standard[self.base.kept] = values
         return self.model.torque_gradient(q, v, a, standard, weights)
@@ -154,7 +181,14 @@ def random_samples(
     lower: np.ndarray | None = None,
     upper: np.ndarray | None = None,
 ) -> States:
-    """Return `count` random states from the model's `sample`, within limits (n,) of its coordinates if given."""
+    """Return `count` random states from the model's method `sample`.
+
+    Args:
+        model: model with n coordinates.
+        count: number of states.
+        seed: seed or generator of the random numbers.
+        lower, upper: (n,) limits of the coordinates [rad or m]; None: the model's default limits.
+    """
     return model.sample(count, np.random.default_rng(seed), lower, upper)
 
 
@@ -165,17 +199,16 @@ def find(
     tolerance: float = 1e-6,
     nominal: RegressorModel | None = None,
 ) -> Base:
-    """Return the base parameters of a model: independent columns of its regressor.
+    """Return the base parameters of a model: the independent columns of its regressor.
 
     Args:
-        model: torques as a linear function of p parameters.
-        samples: states at which columns are compared; default `random_samples`. With states of a recorded motion, the
-            base parameters are those that this motion identifies.
-        loads: load cases whose rows are stacked, each in the form of the regressor's argument `carried`; default: the
+        model: torques as a linear function of p parameters, with the regressor W (rows, p).
+        samples: states at which columns are compared; None: `random_samples`. For the states of a recorded motion, the
+            result has the base parameters that this motion identifies.
+        loads: load cases whose rows are stacked, each in the form of the regressor's argument `carried`; None: the
             model's `load_cases`.
-        tolerance: a column of unit norm is kept if the part of it that is independent of the columns before has at
-            least this norm.
-        nominal: the same model on the geometry on which columns are chosen; None: `model`.
+        tolerance: smallest norm, of the part independent of the columns before, at which a unit-norm column is kept.
+        nominal: the same model on the nominal geometry, on which columns are chosen; None: on `model` itself.
     """
     if samples is None:
         samples = random_samples(model)
@@ -190,11 +223,21 @@ def find(
 
 
 def regroup(base: Base, model: RegressorModel, samples: States | None = None, loads: Loads | None = None) -> Base:
-    """Return the base recomputed for another geometry with the same kept columns.
+    """Return the base parameters on another geometry, with the kept columns unchanged and K recomputed.
 
-    K follows from W_dropped ≈ W_kept K by least squares; `Base.remainder` says how well this holds over the samples.
-    Columns without effect on the nominal chain take part, since they may have a small effect on the calibrated one; the
-    singular values are those of the new geometry.
+    K (b, p - b) minimises ‖W_dropped - W_kept K‖, with W_kept and W_dropped the kept and the dropped columns of the
+    regressor over all samples; `Base.remainder` is the relative error. Columns that are zero on the nominal chain are
+    included, since they may have a small effect on the calibrated chain. The singular values are those of the new
+    geometry.
+
+    Args:
+        base: base parameters on the nominal geometry.
+        model: the model on the new geometry.
+        samples: states at which columns are compared; None: `random_samples`.
+        loads: load cases whose rows are stacked; None: the model's `load_cases`.
+
+    Raises:
+        CalibError: if the model has other rows or parameters.
     """
     _require_same(base, model)
     if samples is None:
@@ -217,10 +260,16 @@ def regroup(base: Base, model: RegressorModel, samples: States | None = None, lo
 
 
 def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> np.ndarray:
-    """Return the R factor (p, p) of the observation matrix over samples and load cases, block by block.
+    """Return the R factor (p, p) of the observation matrix over all samples and load cases.
 
-    One triangle per torque row is updated with the columns that can affect this row (the links before a joint do not
-    act on it), then all triangles are stacked: the memory needed is that of one block, whatever the number of samples.
+    Samples are processed in blocks, so that the memory does not grow with their number. There is one triangle per
+    torque row, updated only with the columns that can affect this row (the links before a joint do not); in the end all
+    triangles are combined by a QR.
+
+    Args:
+        model: model with p parameters, whose regressor is stacked to the observation matrix.
+        samples: states at which the regressor is computed.
+        loads: load cases, each in the form of the regressor's argument `carried`; (None,): once, with all payloads.
     """
     p = model.p
     states = samples.states
@@ -241,7 +290,10 @@ def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> 
 
 
 def expressions(base: Base) -> tuple[str, ...]:
-    """Return each base parameter as sum of standard ones, e.g. ``ZZ1R = ZZ1 + YY2``; small coefficients are omitted."""
+    """Return each base parameter as a sum of standard parameters, e.g. ``ZZ1R = ZZ1 + YY2``.
+
+    Coefficients below `MIN_COEFFICIENT` are omitted.
+    """
     lines = []
     for name, column, row in zip(base.names, base.kept, base.split.coefficients):
         text = base.standard[column]
@@ -259,17 +311,27 @@ def expressions(base: Base) -> tuple[str, ...]:
 
 
 def standard_name(name: str, standard: Collection[str]) -> str:
-    """Return the standard parameter of a base parameter's name in a file: ``ZZ1`` for ``ZZ1R``."""
+    """Return the name of the standard parameter for the name of a base parameter: ``ZZ1`` for ``ZZ1R``.
+
+    Args:
+        name: name of a base parameter, e.g. from a file.
+        standard: names of the model's standard parameters; a name that is in it is returned unchanged.
+    """
     if name.endswith("R") and name not in standard and name[:-1] in standard:
         return name[:-1]
     return name
 
 
 def places(parameters: Sequence[str], names: Sequence[str], standard: Collection[str]) -> list[int] | None:
-    """Return the indices of some base `parameters` in another list of `names`; None if one is not in the list.
+    """Return the indices in `names` of the base parameters in `parameters`; None if one is missing.
 
-    Names are compared as `standard_name`: which parameters are regrouped, and so the suffix R, may differ on another
+    Names are compared without the suffix R (`standard_name`): which parameters are regrouped may differ on another
     geometry or with joint corrections.
+
+    Args:
+        parameters: names of the base parameters to find.
+        names: names in which they are searched.
+        standard: names of the model's standard parameters.
     """
     index_of = {standard_name(name, standard): index for index, name in enumerate(names)}
     standard_names = [standard_name(name, standard) for name in parameters]
@@ -279,7 +341,12 @@ def places(parameters: Sequence[str], names: Sequence[str], standard: Collection
 
 
 def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the R factor (p, p) of an R factor stacked on further rows, which are given transposed (p, N)."""
+    """Return the R factor (p, p) of `triangle` (p, p) with further rows below, which are given transposed (p, N).
+
+    Args:
+        triangle: R factor of the rows so far.
+        columns: (p, N) the further N rows, transposed.
+    """
     nonzero = np.flatnonzero(columns.any(axis=1) | triangle.any(axis=0))
     count = len(nonzero)
     result = np.zeros_like(triangle)
@@ -290,7 +357,7 @@ def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def _clean(split: ColumnSplit) -> ColumnSplit:
-    """Return the split with rounding errors in the coefficients set to zero."""
+    """Return the split with coefficients set to zero if they are rounding errors, and rounded if near an integer."""
     coefficients = np.array(split.coefficients)
     size = np.abs(coefficients).max(axis=0, initial=0.0)
     coefficients[np.abs(coefficients) <= ROUNDING * size] = 0.0
@@ -301,14 +368,25 @@ def _clean(split: ColumnSplit) -> ColumnSplit:
 
 
 def _norms(factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return mask (p,) of columns without effect, and the norms (p,) of all columns (1 for those without effect)."""
+    """Return a mask (p,) of the columns that are zero, and the norms (p,) of all columns, with 1 in place of 0.
+
+    Args:
+        factor: (p, p) R factor of a matrix, whose columns have the same norms.
+    """
     norms = np.linalg.norm(factor, axis=0)
     without_effect = norms <= 1e-12 * norms.max(initial=0.0)
     return without_effect, np.where(without_effect, 1.0, norms)
 
 
 def _describe(model: RegressorModel, split: ColumnSplit, factor: np.ndarray, samples: int) -> Base:
-    """Return the base with the remainder ‖W_d - W_k K‖ of each dropped column, relative and as rms torque."""
+    """Return the base parameters with the norm ‖W_d - W_k K‖ of each dropped column, relative and as rms torque.
+
+    Args:
+        model: the model.
+        split: kept columns W_k and dropped columns W_d.
+        factor: (p, p) R factor of the observation matrix W.
+        samples: number of samples times load cases in W.
+    """
     without_effect, scale = _norms(factor)
     residual = factor[:, split.dropped] - factor[:, split.kept] @ split.coefficients
     remainder = np.linalg.norm(residual, axis=0)
@@ -324,7 +402,7 @@ def _describe(model: RegressorModel, split: ColumnSplit, factor: np.ndarray, sam
 
 
 def _require_same(base: Base, model: RegressorModel) -> None:
-    """Raise `CalibError` if base parameters belong to another model."""
+    """Raise `CalibError` if the base parameters were computed for another model."""
     if (base.rows, base.standard) != (model.torque_rows.name, model.names):
         raise CalibError("the base parameters belong to another model: rows or parameter names differ")
 
@@ -332,12 +410,12 @@ def _require_same(base: Base, model: RegressorModel) -> None:
 def information(
     model: BaseModel, q: np.ndarray, v: np.ndarray, a: np.ndarray, sigmas: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the information Σ ωᵀω (b, b) of a motion with regressors ω.
+    """Return the information matrix Σ ωᵀω (b, b) of a motion, summed over its samples with base regressors ω (rows, b).
 
     Args:
         model: base model with b columns.
         q, v, a: (N, n) the motion [rad or m, and per s, per s²].
-        sigmas: (rows,) standard deviations by which the rows of ω are divided; None: 1.
+        sigmas: (rows,) standard deviations [N m or N] by which the rows of ω are divided; None: 1.
     """
     b = len(model.names)
     total = np.zeros((b, b))
@@ -362,14 +440,14 @@ def columns_at_rest(
     known: np.ndarray | None = None,
     unused: Sequence[int] | np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the indices (c,) of base columns that stay independent when some joints are at rest.
+    """Return the indices (c,) of the base columns that remain independent while some joints are at rest.
 
     Args:
         model: base model with b columns.
-        resting: joint → its position at rest [rad or m]; None: one random position.
-        lower, upper: (n,) finite limits of the random states at which columns are compared.
-        known: (b, b) information of other motions, in which the resting joints may move; None: no other motions.
-        unused: torque rows that are not used; None: those of the resting joints.
+        resting: maps a joint at rest, from 0, to its position [rad or m], or to None for one random position.
+        lower, upper: (n,) finite limits [rad or m] of the random positions at which columns are compared.
+        known: (b, b) information matrix of other motions, in which the resting joints may move; None: no other motions.
+        unused: indices of torque rows that are not used; None: those of the resting joints.
     """
     states = random_samples(model.model, lower=lower, upper=upper)
     q = np.array(states.q)

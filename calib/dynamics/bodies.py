@@ -1,11 +1,12 @@
 """The rigid bodies of a robot as plain arrays, the input of the compiled kernels.
 
-A body's frame stands right after the element that moves it (`Chain.inertias` refer to this frame, too):
+A body's frame is located directly behind the element (elementary transform) that moves the body; `Chain.inertias` refer
+to this frame, too:
 
     T_i = T_parent(i) · placement_i · exp(axis_i · scale_i · q_{coordinate_i})
 
-with scale = sign · ratio, so that a joint that turns against its axis and the follower of a mimic joint are no special
-cases. A body without a coordinate is fixed to its parent (a payload).
+with scale = sign · ratio, so that a joint that turns against its axis and the follower of a mimic joint need no special
+treatment. A body without a coordinate is fixed to its parent (a payload).
 """
 
 from __future__ import annotations
@@ -37,19 +38,19 @@ class Bodies:
     """B rigid bodies with n coordinates, ordered with parents before children.
 
     Attributes:
-        labels: (B,) suffix of a body's parameters: ``ZZ3`` belongs to body ``3``.
+        labels: (B,) suffix of a body's parameters: ``ZZ3`` is a parameter of body ``3``.
         parents: (B,) index of the parent body, -1 for the base.
         kinds: (B,) `FIXED`, `REVOLUTE` or `PRISMATIC`.
-        axes: (B,) 0, 1, 2 for x, y, z of the body's own frame.
-        scales: (B,) sign times mimic ratio; 0 for a fixed body.
+        axes: (B,) axis of the motion, 0, 1, 2 for x, y, z of the body's own frame.
+        scales: (B,) sign of the joint times mimic ratio; 0 for a fixed body.
         coordinates: (B,) index of the coordinate that moves the body; -1 for a fixed body.
         placements: (B, 4, 4) pose of the body's frame in its parent's frame at q = 0.
         gravity: (3,) gravity vector in the base frame [m/s²].
-        paths: (B, n) coordinates that move the body, in the order base to body, then -1.
-        links: (B, 4 + n) parent, kind, coordinate, depth and path of every body, for the kernels.
-        constants: (B + 1, 13) for the kernels: per body the first three rows of its placement, between frames turned so
-            that each moving axis is z, and its scale; gravity in the last row.
-        order: (B, 10) for the kernels: indices in `STANDARD` of the parameters about the kernels' frames.
+        paths: (B, n) indices of all coordinates that move the body, from the base to the body, padded with -1.
+        links: (B, 4 + n) parent, kind, coordinate, depth (length of the path) and path of every body, for the kernels.
+        constants: (B + 1, 13) for the kernels: per body the first three rows of its placement and its scale, with
+            frames turned so that each moving axis is z; the last row contains the gravity vector.
+        order: (B, 10) for the kernels: indices in `STANDARD` of the parameters in the kernels' (turned) frames.
     """
 
     labels: tuple[str, ...]
@@ -95,9 +96,10 @@ class Bodies:
 
 
 def bodies_of(chain: Chain) -> Bodies:
-    """Return the bodies of a chain: one body behind each moving element, followers of mimic joints included.
+    """Return the bodies of a chain: one body behind each moving element, including the followers of mimic joints.
 
-    Body j is numbered like its joint, from 1; the first follower of joint 2 is body ``2b``, the second ``2c``.
+    A body has the number of its joint, from 1, as label; the first follower of joint 2 is body ``2b``, the second
+    ``2c``.
     """
     joint_elements = set(chain.moving.tolist())
     placement = np.eye(4)
@@ -130,7 +132,7 @@ def bodies_of(chain: Chain) -> Bodies:
 
 
 def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None, on: int = -1) -> Bodies:
-    """Return the bodies with a payload added, fixed to body `on` (default the last).
+    """Return the bodies with a payload added, which is fixed to body `on`.
 
     Args:
         bodies: the robot's bodies.
@@ -139,6 +141,9 @@ def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None
         label: suffix of the payload's parameters; None: the number after the last joint's, e.g. 8 on an arm of seven
             joints.
         on: index of the body that carries the payload; negative indices count from the last.
+
+    Raises:
+        RobotError: if a body with this label exists.
     """
     parent = range(bodies.count)[on]
     if label is None:
@@ -160,10 +165,12 @@ def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None
 
 
 def standard_parameters(chain: Chain) -> np.ndarray:
-    """Return the 10·B standard parameters of `bodies_of(chain)` from the chain's inertias; mimic followers: 0.
+    """Return the 10·B standard parameters of `bodies_of(chain)` from the chain's inertias.
+
+    The parameters of mimic followers are 0.
 
     Raises:
-        RobotError: where the chain has no inertias.
+        RobotError: if the chain has no inertias.
     """
     if chain.inertias is None:
         raise RobotError(f"robot '{chain.name}' has no masses; add 'inertia' to its joints")
@@ -178,7 +185,12 @@ def standard_parameters(chain: Chain) -> np.ndarray:
 # Chains differ from their neighbours by one element.
 @lru_cache(maxsize=1024)
 def _elementary(axis: str, amount: float) -> np.ndarray:
-    """Return the constant transform of an element (4, 4), exp(axis · amount)."""
+    """Return the constant transform (4, 4) of an elementary transform, exp(axis · amount).
+
+    Args:
+        axis: "rx" to "rz" for a rotation, "tx" to "tz" for a translation.
+        amount: angle [rad] or distance [m].
+    """
     transform = np.eye(4)
     along = AXES.index(axis) % 3
     if axis[0] == "t":
@@ -204,7 +216,13 @@ def _assemble(
     gravity: np.ndarray,
     n: int,
 ) -> Bodies:
-    """Return the bodies with arrays made read-only, and with the coordinates that move each body filled in."""
+    """Return `Bodies` with read-only arrays; `paths`, `links`, `constants` and `order` are computed.
+
+    Args:
+        labels, parents, kinds, axes, scales, coordinates, placements: one entry per body, as in `Bodies`.
+        gravity: (3,) gravity vector in the base frame [m/s²].
+        n: number of coordinates.
+    """
     count = len(labels)
     paths = np.full((count, n), -1)
     depths = np.zeros(count, dtype=int)
@@ -247,7 +265,11 @@ def _assemble(
 
 @cache
 def _kernel_order(axis: int) -> tuple[int, ...]:
-    """Return the indices (10,) in `STANDARD` of a body's parameters in the kernels' frame, given its moving axis."""
+    """Return the indices (10,) in `STANDARD` of a body's parameters in the kernels' frame, whose z is the joint axis.
+
+    Args:
+        axis: moving axis in the body's own frame, 0, 1, 2 for x, y, z.
+    """
     turn = _TURNS[axis]
     order = []
     for row, column in PAIRS:
@@ -259,5 +281,9 @@ def _kernel_order(axis: int) -> tuple[int, ...]:
 
 @cache
 def upright_turn(axis: int) -> np.ndarray:
-    """Return the rotation (4, 4) from a body's to the kernels' frame, whose z is the joint axis (0, 1, 2: x, y, z)."""
+    """Return the rotation (4, 4) from a body's frame to the kernels' frame, whose z axis is the joint axis.
+
+    Args:
+        axis: joint axis in the body's own frame, 0, 1, 2 for x, y, z.
+    """
     return frozen(pose(np.eye(3)[:, _TURNS[axis]]))

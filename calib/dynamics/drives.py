@@ -1,10 +1,10 @@
-"""Drives as columns of the regressor: motor inertia, friction, offsets, and couplings between joints.
+"""Drive torques as columns of the regressor: motor inertia, friction, offsets, and couplings between joints.
 
-    tau_r += parameter · Σ_joined shape(Σ_j weight_j · motion_j)
+    tau_r += parameter · shape(Σ_j weight_j · motion_j)
 
-A term acts on one torque row or on several; in each it depends on the motion of one joint or of a weighted sum of
-joints, so that a coupled wrist (TX40: tau5 += Iam6 a6 + Fvm6 v6 + Fcm6 sign(v5 + v6), tau6 += Iam6 a5 + Fvm6 v5 + Fcm6
-sign(v5 + v6)) is not a special case. Joints are counted from 0 in the code, from 1 in names.
+A term acts on one torque row r or on several. In each row the term depends on the motion of one joint or of a weighted
+sum of joints. A coupled wrist therefore needs no special treatment (TX40: tau5 += Iam6 a6 + Fvm6 v6 + Fcm6 sign(v5 +
+v6), tau6 += Iam6 a5 + Fvm6 v5 + Fcm6 sign(v5 + v6)). Joints are counted from 0 in the code, from 1 in names.
 """
 
 import math
@@ -29,9 +29,10 @@ class DriveTerm:
     Attributes:
         name: name of the term's parameter, e.g. ``Fc3``.
         shape: a key of `SHAPES`.
-        acts: pairs (torque row, motion), the motion as pairs (joint, weight); empty for a parameter without effect.
-        settings: the numbers that the shape needs; an ``edge`` may be omitted.
-        side: "link" or "motor" of a joint torque sensor; without such a sensor all terms are on the motor side.
+        acts: pairs (torque row, motion) for every row that the term affects; a motion is a tuple of pairs (joint,
+            weight). Empty for a parameter without effect.
+        settings: values of the shape's settings; an ``edge`` may be omitted and is then infinite.
+        side: side of the joint torque sensor, "link" or "motor"; without such a sensor all terms are on the motor side.
         linear: whether the joint is prismatic, which decides the units.
     """
 
@@ -55,12 +56,12 @@ class DriveTerm:
 
     @property
     def form(self) -> Shape:
-        """Properties of the term's shape."""
+        """Description of the term's shape: units, settings and properties."""
         return SHAPES[self.shape]
 
     @property
     def joint(self) -> int | None:
-        """Joint whose motion a single-joint term depends on; None for a coupling of joints."""
+        """Joint of a term that acts on one joint and depends on its motion alone; None for a coupling of joints."""
         if len(self.acts) != 1:
             return None
         row, motion = self.acts[0]
@@ -68,7 +69,7 @@ class DriveTerm:
 
     @property
     def nonnegative(self) -> bool:
-        """Whether the parameter is physically non-negative; the inertia of a coupling may be negative."""
+        """Whether the parameter must not be negative for physical reasons; a coupling's inertia may be negative."""
         return self.form.nonnegative and (self.form.dissipative or self.joint is not None)
 
     @property
@@ -77,18 +78,20 @@ class DriveTerm:
         return self.form.unit_linear if self.linear else self.form.unit
 
     def acting(self, motions: Sequence[np.ndarray | None], states: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield each torque row that the term acts on, and the term's column in this row (N,).
+        """Yield each torque row that the term acts on, with the term's column (N,) in this row.
 
         Args:
-            motions: q, v, a, load, as in `fill`.
-            states: (s, N) hysteresis states of this term alone, see `friction_states`.
+            motions: q, v, a [rad or m, per s, per s²] and load [N m or N], (n, N) each; load (the torque that the gears
+                transmit) is None if the term does not need it.
+            states: (s, N) hysteresis states of this term alone, from `friction_states`; s is 0 for a term without
+                hysteresis.
         """
         for k, (row, motion) in enumerate(self.acts):
             state = states[k] if self.form.remembers else None
             yield row, self.values(_join(self, motion, motions, state))
 
     def values(self, joined: TermMotion) -> np.ndarray:
-        """Return the term's column (N,) for a motion, per unit of the parameter."""
+        """Return the term's column (N,), its torque per unit of the parameter, for the motion `joined`."""
         if self.shape == "acceleration":
             return joined.a
         if self.shape == "velocity":
@@ -99,12 +102,21 @@ class DriveTerm:
         return values
 
     def slopes(self, joined: TermMotion) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return the derivatives of the column with respect to position and velocity (N,), and to acceleration."""
+        """Return the derivatives of the term's column by position (N,), velocity (N,) and acceleration (a number).
+
+        Args:
+            joined: motion that the term depends on.
+        """
         _, by_x, by_v = self._evaluated(joined, 3)
         return by_x, by_v, float(self.shape == "acceleration")
 
     def _evaluated(self, joined: TermMotion, rows: int) -> np.ndarray:
-        """Return the value (1, N), or the value with its derivatives with respect to position and velocity (3, N)."""
+        """Return the shape's value, with its derivatives by position and velocity if `rows` is 3, as (rows, N).
+
+        Args:
+            joined: motion of N samples that the term depends on.
+            rows: 1 for the value alone, 3 with the derivatives.
+        """
         from calib.dynamics import shape_kernels
 
         acts = np.zeros((1, 8))
@@ -119,7 +131,16 @@ class DriveTerm:
 
 
 def term(name: str, shape: str, joint: int, *settings: float, side: str = "motor", linear: bool = False) -> DriveTerm:
-    """Return a drive term of one joint that depends on that joint's motion."""
+    """Return a drive term that acts on one joint and depends on that joint's motion.
+
+    Args:
+        name: name of the term's parameter.
+        shape: a key of `SHAPES`.
+        joint: joint, from 0.
+        settings: values of the shape's settings, in the order of `Shape.settings`.
+        side: "link" or "motor" side of a joint torque sensor.
+        linear: whether the joint is prismatic.
+    """
     motion = ((joint, 1.0),)
     numbers = tuple(float(setting) for setting in settings)
     return DriveTerm(name, shape, ((joint, motion),), numbers, side, linear)
@@ -131,9 +152,14 @@ def standard(
     """Return the standard drive terms of n joints, joint after joint.
 
     Args:
-        sets: n strings of term names from Ia Fv Fc off (and Fvl Fcl offl, Fvm Fcm offm), e.g. ``["Ia Fv Fc"] * 6``.
+        sets: n strings, one per joint, of term names from Ia Fv Fc off (motor inertia, viscous and Coulomb friction,
+            offset; with a torque sensor Fvl Fcl offl on its link side, Fvm Fcm offm on its motor side), e.g. ``["Ia Fv
+            Fc"] * 6``.
         v0: smoothing of the Coulomb sign [rad/s or m/s], one value or one per joint.
-        linear: (n,) which joints are prismatic; None: none.
+        linear: (n,) whether each joint is prismatic; None: no joint is.
+
+    Raises:
+        CalibError: for an unknown term name.
     """
     shapes = STANDARD | LINK_SIDE | MOTOR_SIDE
     smoothing = np.broadcast_to(np.asarray(v0, dtype=float), (len(sets),))
@@ -153,7 +179,11 @@ def standard(
 
 
 def without_effect(label: str) -> tuple[DriveTerm, ...]:
-    """Return the seven drive parameters of a fixed body, which the papers count although they act on no torque."""
+    """Return seven drive parameters of a fixed body, which affect no torque; the papers include them in their counts.
+
+    Args:
+        label: label of the body.
+    """
     shapes = {"Ia": "acceleration"} | LINK_SIDE | MOTOR_SIDE
     terms = []
     for name, shape in shapes.items():
@@ -166,12 +196,21 @@ def without_effect(label: str) -> tuple[DriveTerm, ...]:
 def coupled(
     first: int, second: int, v0: float = V0, label: str | None = None, weight: float = 1.0
 ) -> tuple[DriveTerm, ...]:
-    """Return Iam, Fvm, Fcm of a gear whose motor turns with q_first + weight q_second.
+    """Return the terms Iam, Fvm, Fcm of two joints coupled by a gear: motor inertia, viscous and Coulomb friction.
 
-        tau_first += Iam a_second + Fvm v_second + Fcm sign(v_first + v_second), and the other way round
+    The motor turns with q_first + weight · q_second. For a weight of 1
 
-    for a weight of 1 (Gautier & Janot's TX40 model of the wrist, joints 4 and 5 counted from 0; the remaining inertia
-    and friction are in each joint's Ia, Fv, Fc). For a weight of -1, sums become differences.
+        tau_first += Iam a_second + Fvm v_second + Fcm sign(v_first + v_second),
+
+    and tau_second accordingly with both joints exchanged (Gautier & Janot's model of the TX40's wrist, joints 4 and 5
+    counted from 0). The remaining inertia and friction are in each joint's Ia, Fv, Fc. For a weight of -1, sums become
+    differences.
+
+    Args:
+        first, second: the coupled joints, from 0.
+        v0: smoothing of the Coulomb sign [rad/s].
+        label: suffix of the parameters' names; None: that of the second joint, counted from 1.
+        weight: weight of the second joint.
     """
     if label is None:
         label = str(second + 1)
@@ -187,13 +226,13 @@ def coupled(
 
 
 def fill(terms: Sequence[DriveTerm], out: np.ndarray, motions: Sequence[np.ndarray | None], states: np.ndarray) -> None:
-    """Write the columns of terms into out (k, n, N), which must be zero.
+    """Write the regressor columns of drive terms into `out`, which must be zero.
 
     Args:
         terms: k drive terms.
         out: (k, n, N) regressor columns.
-        motions: q, v, a, load, each (n, N), load None if no term needs it.
-        states: (s, N) states of friction with hysteresis, see `friction_states`.
+        motions: q, v, a, load, (n, N) each; load is None if no term needs it.
+        states: (s, N) states of friction with hysteresis, from `friction_states`.
     """
     first = 0
     for column, term in zip(out, terms, strict=True):
@@ -204,7 +243,15 @@ def fill(terms: Sequence[DriveTerm], out: np.ndarray, motions: Sequence[np.ndarr
 
 
 def fill_energies(terms: Sequence[DriveTerm], out: np.ndarray, v: np.ndarray) -> None:
-    """Write the kinetic energies ½ Σ weight v_row v_joint of acceleration terms into out (k, N), given v (n, N)."""
+    """Write kinetic energies per unit of the parameters of acceleration terms into `out` (k, N), which must be zero.
+
+    The energy of a term is ½ Σ weight · v_row · v_joint. Rows of other terms remain zero.
+
+    Args:
+        terms: k drive terms.
+        out: (k, N) energies.
+        v: (n, N) joint velocities [rad/s or m/s].
+    """
     for column, term in zip(out, terms, strict=True):
         if term.shape != "acceleration":
             continue
@@ -216,7 +263,17 @@ def fill_energies(terms: Sequence[DriveTerm], out: np.ndarray, v: np.ndarray) ->
 def slopes(
     terms: Sequence[DriveTerm], motions: Sequence[np.ndarray], weights: np.ndarray, out: Sequence[np.ndarray]
 ) -> None:
-    """Add the gradients of Σ weights · columns, weights (k, n, N), with respect to q, v and a to `out`, (n, N) each."""
+    """Add the gradients of Σ weights · columns with respect to q, v and a to `out`.
+
+    Args:
+        terms: k drive terms.
+        motions: q, v, a, (n, N) each.
+        weights: (k, n, N) weight of each entry of the columns.
+        out: three arrays (n, N), for q, v and a.
+
+    Raises:
+        CalibError: for a term that depends on past motion or on torques.
+    """
     for term_weights, term in zip(weights, terms, strict=True):
         message = f"term '{term.name}' ({term.shape}) depends on past motion or torques: no derivatives"
         require(term.form.slopes, message)
@@ -228,12 +285,17 @@ def slopes(
 
 
 def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
-    """Return the states (s, N) of friction with hysteresis along a gap-free record q (n, N), starting unstressed.
+    """Return the states (s, N) of friction with hysteresis along an uninterrupted record q (n, N), starting at zero.
 
-        z_k = clip(z_{k-1} + (x_k - x_{k-1}) / width, -1, 1):
+        z_k = clip(z_{k-1} + (x_k - x_{k-1}) / width, -1, 1)
 
-    stiff within ±width of the last turning point, Coulomb's sign beyond: friction that depends on the past (Iwan 1966;
-    several widths side by side are the Maxwell-slip model).
+    (stop operator). After a reversal the state changes in proportion to the displacement; beyond a travel of 2 · width
+    it equals Coulomb's sign. Friction thus depends on past motion (Iwan 1966; several widths side by side are the
+    Maxwell-slip model). There is one state for each torque row of each term with hysteresis.
+
+    Args:
+        terms: drive terms; s is 0 if none of them has hysteresis.
+        q: (n, N) joint positions x [rad or m].
     """
     from calib.dynamics import kernels
 
@@ -254,7 +316,14 @@ def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
 def _join(
     term: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None], state: np.ndarray | None
 ) -> TermMotion:
-    """Return the motion of a term: weighted sums of q, v, a and load."""
+    """Return the motion that a term depends on: weighted sums of the joints' q, v, a and load.
+
+    Args:
+        term: the drive term.
+        motion: pairs (joint, weight) of the joints that the term depends on.
+        motions: q, v, a, load, (n, N) each; load is None if no term needs it.
+        state: (N,) state of the stop operator; None for a term without hysteresis.
+    """
     if term.form.loaded and motions[3] is None:
         raise CalibError(f"term '{term.name}' needs the transmitted torque; give load (N, n), measured or predicted")
     q, v, a, load = motions
@@ -269,7 +338,14 @@ def _join(
 
 
 def _weighted(motion: Motion, series: np.ndarray) -> np.ndarray:
-    """Return weighted sum (N,) of the joints' series (n, N); a single joint of weight 1 is returned without a copy."""
+    """Return the weighted sum (N,) of the joints' time series (n, N).
+
+    A single joint of weight 1 is returned without a copy.
+
+    Args:
+        motion: pairs (joint, weight).
+        series: (n, N) position, velocity, acceleration or load of all joints.
+    """
     if len(motion) == 1:
         joint, weight = motion[0]
         if weight == 1.0:
@@ -281,7 +357,14 @@ def _weighted(motion: Motion, series: np.ndarray) -> np.ndarray:
 
 
 def offered(step: str, joint: int, joint_range: RecordedRange, linear: bool = False) -> tuple[DriveTerm, ...]:
-    """Return a joint's candidate terms in a step of the friction ladder, scaled by its recorded motion."""
+    """Return a joint's candidate terms in one step of the friction ladder (stepwise selection of friction terms).
+
+    Args:
+        step: a key of `STEPS`.
+        joint: joint, from 0.
+        joint_range: recorded ranges of the joint's motion, which scale the terms' settings.
+        linear: whether the joint is prismatic.
+    """
     numbered = []
     for offer in STEPS[step]:
         for number, (end, settings) in enumerate(offer.settings(joint_range).items()):

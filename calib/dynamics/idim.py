@@ -1,8 +1,8 @@
-"""The inverse dynamic identification model: torque rows as a linear function of all parameters.
+"""The inverse dynamic identification model (IDIM): torque rows as a linear function of all parameters.
 
     tau = W(q, v, a) · chi,    chi = [standard parameters of every body; drive terms]
 
-`TorqueRows` defines which torques the rows are (motors', joint torque sensors', or both).
+`TorqueRows` defines which torques the rows are: those of the motors, of joint torque sensors, or both.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ KEPT_LAST = {"revolute": (3, 8, 9), "prismatic": (0, 1, 2, 3, 4, 5)}
 
 @dataclass(frozen=True, eq=False)
 class IdentificationModel:
-    """Inverse dynamic identification model: regressor of bodies and drives.
+    """Inverse dynamic identification model of a serial robot: regressor of bodies and drives.
 
     Attributes:
         bodies: the robot's bodies, payloads included.
@@ -49,7 +49,9 @@ class IdentificationModel:
             for row, motion in term.acts:
                 joints = [row, *(joint for joint, _ in motion)]
                 if min(joints) < 0 or max(joints) >= self.n:
-                    raise CalibError(f"term '{term.name}' refers to a missing joint; the robot has {self.n}")
+                    raise CalibError(
+                        f"term '{term.name}' refers to a joint that does not exist; the robot has joints 1 to {self.n}"
+                    )
 
     @property
     def n(self) -> int:
@@ -68,7 +70,7 @@ class IdentificationModel:
 
     @property
     def inertial(self) -> int:
-        """Number of body parameters, which are the first columns."""
+        """Number of body parameters; they are the first columns, before the drive terms."""
         return 10 * self.bodies.count if self.torque_rows.has_bodies else 0
 
     @property
@@ -91,7 +93,7 @@ class IdentificationModel:
 
     @property
     def sides(self) -> tuple[str, ...]:
-        """Side of each of the p columns (``bodies``, ``link`` or ``motor``), as `TorqueRows` needs it."""
+        """Kind of each of the p columns: ``bodies``, or the side ``link`` or ``motor`` of a drive term."""
         term_sides = [term.side for term in self.columns]
         return (*([BODIES] * self.inertial), *term_sides)
 
@@ -115,15 +117,19 @@ class IdentificationModel:
         states: np.ndarray | None = None,
         link: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> np.ndarray:
-        """Return the regressor (N, rows, p); in memory it is ordered (p, rows, N), so that stacking needs no copy.
+        """Return the regressor (N, rows, p), in the memory order (p, rows, N), so that stacking needs no copy.
 
         Args:
             q, v, a: (N, n) the motion [rad or m, and per s, per s²].
-            load: (N, n) transmitted torques [N m or N], where a friction term depends on them.
-            carried: labels of the fixed bodies (payloads) present; None: all. Columns of absent payloads are zero.
+            load: (N, n) torques transmitted by the gears [N m or N]; None if no friction term depends on them.
+            carried: labels of the payloads (fixed bodies) that are attached; None: all. Columns of absent payloads are
+                zero.
             states: (s, N) states of friction with hysteresis, from `friction_states`; None: computed here, with q taken
                 as one uninterrupted record.
-            link: motion q, v, a (N, n) of the bodies, where joints deflect; None: that of the drives.
+            link: motion q, v, a (N, n) of the bodies, if joints deflect; None: that of the drives.
+
+        Raises:
+            CalibError: for a wrong shape, an unknown payload, or a missing load.
         """
         shape = (len(q), self.n)
         q = shaped(q, shape, "q")
@@ -145,12 +151,17 @@ class IdentificationModel:
     def regressor_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray, columns: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the exact gradients of Σ weights · regressor(q, v, a) for q, v and a, (N, n) each, with all payloads.
+        """Return the exact gradients of Σ weights · regressor(q, v, a) with respect to q, v and a, (N, n) each.
+
+        All payloads are attached.
 
         Args:
             q, v, a: (N, n) the motion [rad or m, and per s, per s²].
             weights: (N, rows, c) weight of each regressor entry.
             columns: (c,) ascending indices of the regressor columns that the weights refer to; None: all p.
+
+        Raises:
+            CalibError: for a term that depends on past motion or on torques, or projected rows.
         """
         if columns is None:
             columns = np.arange(self.p)
@@ -178,12 +189,17 @@ class IdentificationModel:
     def torque_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the gradients of Σ weights · (regressor values) for q, v and a, (N, n) each, with all payloads.
+        """Return the exact gradients of Σ weights · torques(q, v, a) with respect to q, v and a, (N, n) each.
+
+        All payloads are attached.
 
         Args:
             q, v, a: (N, n) the motion [rad or m, and per s, per s²].
-            values: (p,) parameter values.
+            values: (p,) parameter values, which give the torques.
             weights: (N, rows) weight of each torque.
+
+        Raises:
+            CalibError: for a term that depends on past motion or on torques, or projected rows.
         """
         side_weights = {}
         for side in set(self.sides):
@@ -206,7 +222,8 @@ class IdentificationModel:
     def acting(self) -> np.ndarray:
         """Return the mask (p, rows) of regressor entries that can differ from 0.
 
-        A body's parameters act on the joints before it, a drive's on its own joint: half of all entries, or less.
+        A body's parameters affect the joints between base and body; most drive parameters affect one joint. So at most
+        about half of all entries differ from 0.
         """
         if self.torque_rows.projection is not None:
             return np.ones((self.p, self.rows), dtype=bool)
@@ -232,10 +249,14 @@ class IdentificationModel:
         states: np.ndarray | None = None,
         link: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> np.ndarray:
-        """Return the torques (N, rows) of parameters (p,), by recursive Newton-Euler.
+        """Return the torques (N, rows) for parameters `values` (p,), by recursive Newton-Euler.
 
-        For load-dependent friction, the load is the torque that the model gives for the bodies, which move as `link`.
-        Arguments as in `regressor`.
+        For load-dependent friction, the load is the model's own torque of the bodies, which move as `link`.
+
+        Args:
+            values: (p,) parameter values.
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+            carried, states, link: as in `regressor`.
         """
         load, load_columns = None, None
         if self.inertial:
@@ -266,7 +287,13 @@ class IdentificationModel:
     def transmitted(
         self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, carried: Collection[str] | None = None
     ) -> np.ndarray:
-        """Return the torques (N, n) transmitted by the gears to the bodies, for load-dependent friction."""
+        """Return the torques (N, n) [N m or N] that the gears transmit to the bodies, for load-dependent friction.
+
+        Args:
+            values: (p,) parameters.
+            q, v, a: (N, n) motion of the bodies [rad or m, and per s, per s²].
+            carried: labels of the attached payloads; None: all.
+        """
         present = np.ones(self.inertial)
         if carried is not None:
             present = self.carried_columns(carried)
@@ -274,9 +301,14 @@ class IdentificationModel:
         return rigid_body.inverse_dynamics(self.bodies, parameters, q, v, a)
 
     def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
-        """Return the energy h (N, p) per unit of each parameter, whose time derivative is the power; zero for friction.
+        """Return the energy (N, p) per unit of each parameter, whose time derivative is the power; zero for friction.
 
-        Columns of bodies are from `rigid_body.energies`, a motor inertia's is ½ v², a coupled one's v_i v_j.
+        The energies per unit of the bodies' parameters are computed by `rigid_body.energies`. The energy per unit of a
+        motor inertia is ½ v², per unit of a coupled motor inertia v_i v_j.
+
+        Args:
+            q, v: (N, n) joint positions and velocities [rad or m, and per s].
+            carried: labels of the attached payloads; None: all.
         """
         out = np.zeros((len(q), self.p))
         if self.inertial:
@@ -286,14 +318,18 @@ class IdentificationModel:
         return out
 
     def carried_columns(self, carried: Collection[str]) -> np.ndarray:
-        """Return factors (10 B,) of the body parameters: zero for those of absent payloads, one for all others."""
+        """Return factors (10 B,) of the body parameters: 0 for payloads not in `carried`, 1 for all other bodies."""
         present = []
         for label, kind in zip(self.bodies.labels, self.bodies.kinds):
             present.append(kind != FIXED or label in carried)
         return np.repeat(np.array(present, dtype=float), 10)
 
     def preference(self) -> np.ndarray:
-        """Return the columns (p,) in order of preference: Khalil's choice on moving links, drives, others, payloads."""
+        """Return the column indices (p,) in order of preference as base columns.
+
+        First the columns of moving links that Khalil keeps, then the drive terms, the other columns of moving links,
+        and the payloads.
+        """
         bodies = self.bodies
         kept_first: list[int] = []
         kept_last: list[int] = []
@@ -313,7 +349,10 @@ class IdentificationModel:
         return np.array([*kept_first, *drive_columns, *kept_last, *payloads], dtype=int)
 
     def load_cases(self) -> Loads:
-        """Return the load cases: with all payloads and with none; a single case if the model has no payloads."""
+        """Return the load cases for choosing base columns: all payloads, and none.
+
+        A model without payloads has a single case.
+        """
         if self.inertial and np.any(self.bodies.kinds == FIXED):
             return (None, ())
         return (None,)
@@ -321,7 +360,13 @@ class IdentificationModel:
     def sample(
         self, count: int, rng: np.random.Generator, lower: np.ndarray | None = None, upper: np.ndarray | None = None
     ) -> States:
-        """Return `count` random states: q uniform within its limits (default ±π), v and a within ±3 [per s, per s²]."""
+        """Return `count` random states: q uniform between its limits, v and a uniform within ±3 [per s, per s²].
+
+        Args:
+            count: number of states.
+            rng: generator of the random numbers.
+            lower, upper: (n,) limits of q [rad or m]; None: ±π.
+        """
         if lower is None:
             lower = np.full(self.n, -np.pi)
         if upper is None:
@@ -332,7 +377,7 @@ class IdentificationModel:
         return States(q, v, a, load, rng.uniform(-1.0, 1.0, (state_count, count)))
 
     def _drop_absent(self, out: np.ndarray, carried: Collection[str] | None) -> None:
-        """Set the columns of absent payloads in `out` to zero."""
+        """Set the rows of `out` (p, …) to zero that are columns of payloads not in `carried`; None: no change."""
         if carried is None:
             return
         payloads = set()
@@ -347,16 +392,16 @@ class IdentificationModel:
             out[first : first + 10] = 0.0
 
     def with_load(self) -> tuple[str, ...]:
-        """Return the names of the terms that depend on `load`."""
+        """Return the names of the drive terms that depend on the transmitted torque (`load`)."""
         return tuple(term.name for term in self.columns if term.form.loaded)
 
     def with_terms(self, *terms: DriveTerm) -> IdentificationModel:
-        """Return the model with more drive terms appended."""
+        """Return the model with further drive terms appended."""
         return replace(self, terms=(*self.terms, *terms))
 
 
 def _columns_of(q: np.ndarray, v: np.ndarray, a: np.ndarray) -> list[np.ndarray]:
-    """Return the motion of each joint (n, N), contiguous in time, from q, v and a (N, n)."""
+    """Return q, v and a (N, n) transposed to (n, N), each joint's series contiguous in memory."""
     return [np.ascontiguousarray(np.asarray(series, dtype=float).T) for series in (q, v, a)]
 
 
@@ -367,14 +412,17 @@ def from_chain(
     rows: TorqueRows = MOTOR,
     v0: float | Sequence[float] = V0,
 ) -> IdentificationModel:
-    """Return the model of a chain with the same drive terms on all joints, or one set per joint.
+    """Return the identification model of a chain with standard drive terms.
 
     Args:
         chain: the robot.
-        sets: names of standard drive terms (`drives.standard`), as one string for all joints or n strings.
-        payload: (4, 4) frame of a payload in the last body's frame (`Chain.tail` for the tip); None for none.
+        sets: names of standard drive terms (`drives.standard`), as one string for all joints or one string per joint.
+        payload: (4, 4) pose of a payload's frame in the last body's frame (`Chain.tail` for the tip); None: no payload.
         rows: torque rows that the model explains.
         v0: smoothing of the Coulomb sign [rad/s or m/s], one value or one per joint.
+
+    Raises:
+        CalibError: for a wrong number of strings, or an unknown drive term.
     """
     joint_sets = [sets] * chain.n if isinstance(sets, str) else list(sets)
     if len(joint_sets) != chain.n:
@@ -387,6 +435,9 @@ def from_chain(
 
 
 def friction_states(model: RegressorModel, q: np.ndarray) -> np.ndarray:
-    """Return states (s, N) of friction with hysteresis along an uninterrupted record q (N, n), not cut into blocks."""
+    """Return the states (s, N) of a model's friction with hysteresis along an uninterrupted record q (N, n).
+
+    States depend on past motion, so the record must not be cut into blocks. s is 0 without such friction.
+    """
     q = shaped(q, (None, model.n), "q")
     return drives.friction_states(model.columns, np.ascontiguousarray(q.T))

@@ -1,17 +1,19 @@
-"""Compiled rigid-body kernels (numba) on the arrays of `Bodies`: torques, regressor, inertia.
+"""Compiled rigid-body kernels (numba) on the arrays of `Bodies`: torques and regressor.
 
 Notation, all in the frame of body i: w angular velocity, dw its derivative, a acceleration of the frame's origin minus
-gravity, (u_j, s_j) angular and linear velocity of the frame per unit rate of coordinate j. The wrench of body i,
+gravity, (u_j, s_j) angular and linear velocity of the frame per unit rate of coordinate j (its twist). The wrench of
+body i,
 
     f = M a + dw × h + w × (w × h),    n = J dw + w × J w + h × a,
 
-J the inertia about the origin, h = [MX, MY, MZ] (Gautier & Khalil 1990), is linear in the parameters, and
-tau_j = Σ_i (u_j · n_i + s_j · f_i): the regressor needs no backward pass. Products and sums may be fused ("contract");
-otherwise IEEE arithmetic holds.
+with J the inertia about the origin and h = [MX, MY, MZ] (Gautier & Khalil 1990), is linear in the parameters, and tau_j
+= Σ_i (u_j · n_i + s_j · f_i); so the regressor needs no backward pass. Products and sums may be fused by the compiler
+("contract"); otherwise arithmetic follows IEEE 754.
 
 ``links`` and ``constants`` are those of `Bodies` with B bodies and n coordinates: every frame is turned so that its
-joint's axis is z, and ``parameters`` (10 B) follow `Bodies.order`. Row 0 of ``motion`` and ``twists`` is the base, row
-i + 1 body i; row i of ``frames`` is its rotation (0 to 8) and origin (9 to 11) in its parent's frame.
+joint's axis is z, and ``parameters`` (10 B) follow `Bodies.order`. Row 0 of ``motion`` and ``twists`` is that of the
+base, row i + 1 that of body i. Row i of ``frames`` contains rotation (0 to 8) and origin (9 to 11) of body i in its
+parent's frame.
 """
 
 import numpy as np
@@ -36,9 +38,9 @@ JOINED = {**OPTIONS, "forceinline": True}
 
 @njit(**OPTIONS)
 def sincos(x):
-    """Return sine and cosine of abs(x) < 1e6 within 2e-16: polynomials of fdlibm (Sun, 1993), no branches.
+    """Return sine and cosine of x within 2e-16, for abs(x) < 1e6, by polynomials of fdlibm (Sun, 1993).
 
-    Library calls, one per value, could not be vectorised and would take a third of the regressor's time.
+    There are no branches. Library functions could not be vectorised and would take a third of the regressor's time.
     """
     n = (x * 0.6366197723675814 + ROUND) - ROUND
     r = ((x - n * 1.57079632673412561417) - n * 6.07710050630396597660e-11) - n * 2.02226624879595063154e-21
@@ -61,7 +63,15 @@ def sincos(x):
 
 @njit(**OPTIONS)
 def place(links, constants, i, amount, cosine, sine, frames):
-    """Write the frame of body i into row i of `frames`, at joint position `amount`."""
+    """Write rotation and origin of body i, in its parent's frame, into row i of `frames`.
+
+    Args:
+        links, constants: those of `Bodies`.
+        i: index of the body.
+        amount: joint position [rad or m].
+        cosine, sine: cosine and sine of this position.
+        frames: (B, 12) array to write: nine entries of the rotation, row by row, then the origin.
+    """
     for r in range(3):
         x = constants[i, 4 * r]
         y = constants[i, 4 * r + 1]
@@ -80,7 +90,7 @@ def place(links, constants, i, amount, cosine, sine, frames):
 
 @njit(**JOINED)
 def three(x, i, k):
-    """Return three numbers of row i from column k on, as a tuple, which the compiler keeps in registers."""
+    """Return the vector x[i, k], x[i, k + 1], x[i, k + 2] as a tuple, which the compiler keeps in registers."""
     return x[i, k], x[i, k + 1], x[i, k + 2]
 
 
@@ -125,7 +135,7 @@ def cross(a, b):
 
 @njit(**JOINED)
 def inertia_times(J, a):
-    """Return J a, J being the symmetric matrix of the six values XX, XY, XZ, YY, YZ, ZZ."""
+    """Return J a, where J is the symmetric matrix with the six entries XX, XY, XZ, YY, YZ, ZZ."""
     x = dot((J[0], J[1], J[2]), a)
     y = dot((J[1], J[3], J[4]), a)
     z = dot((J[2], J[4], J[5]), a)
@@ -134,7 +144,7 @@ def inertia_times(J, a):
 
 @njit(**JOINED)
 def turned(frames, i, a, k=0):
-    """Return R a, R being the rotation matrix stored row by row in row i of `frames` from column k on."""
+    """Return R a for a vector a (3,), with the rotation R stored row by row in row i of `frames`, from column k on."""
     x = dot(three(frames, i, k), a)
     y = dot(three(frames, i, k + 3), a)
     z = dot(three(frames, i, k + 6), a)
@@ -143,7 +153,7 @@ def turned(frames, i, a, k=0):
 
 @njit(**JOINED)
 def turned_back(frames, i, a, k=0):
-    """Return Rᵀ a, with R as in `turned`."""
+    """Return Rᵀ a for a vector a (3,), with the rotation R stored row by row in row i of `frames`, from column k on."""
     x = scaled(a[0], three(frames, i, k))
     y = scaled(a[1], three(frames, i, k + 3))
     z = scaled(a[2], three(frames, i, k + 6))
@@ -152,7 +162,11 @@ def turned_back(frames, i, a, k=0):
 
 @njit(**JOINED)
 def ten_columns(w, e, a, u, s):
-    """Return a body's ten regressor columns in the row of a coordinate with twist (u, s), from w, e = dw and a."""
+    """Return the ten regressor columns of a body in the torque row of one coordinate.
+
+    w, e = dw and a are the body's angular velocity, angular acceleration and acceleration minus gravity; (u, s) is the
+    body's twist per unit rate of the coordinate.
+    """
     c = cross(u, w)
     xx = u[0] * e[0] + c[0] * w[0]
     xy = u[0] * e[1] + c[0] * w[1]
@@ -170,7 +184,16 @@ def ten_columns(w, e, a, u, s):
 
 @njit(**OPTIONS)
 def advance(links, i, rate, change, frames, motion):
-    """Write w, dw, a of body i from its parent's into row i + 1 of `motion` (B + 1, 9)."""
+    """Write w, dw, a of body i, computed from its parent's, into row i + 1 of `motion` (B + 1, 9).
+
+    Args:
+        links: those of `Bodies`.
+        i: index of the body.
+        rate, change: joint velocity and joint acceleration.
+        frames: (B, 12) rotation and origin of each body in its parent's frame, from `place`.
+        motion: (B + 1, 9) angular velocity w, angular acceleration dw and acceleration a of the bodies; row 0 is the
+            base.
+    """
     p = links[i, PARENT] + 1
     h = i + 1
     w = three(motion, p, 0)
@@ -195,7 +218,15 @@ def advance(links, i, rate, change, frames, motion):
 
 @njit(**OPTIONS)
 def carry(links, constants, i, frames, twists):
-    """Write the twists (u_j, s_j) of body i from its parent's into row i + 1 of `twists` (B + 1, n, 6)."""
+    """Write the twists (u_j, s_j) of body i, computed from its parent's, into row i + 1 of `twists` (B + 1, n, 6).
+
+    Args:
+        links, constants: those of `Bodies`.
+        i: index of the body.
+        frames: (B, 12) rotation and origin of each body in its parent's frame, from `place`.
+        twists: (B + 1, n, 6) angular and linear velocity of each body per unit rate of each coordinate; row 0 is the
+            base.
+    """
     p = links[i, PARENT]
     coordinate = links[i, COORDINATE]
     up = twists[p + 1]
@@ -216,7 +247,14 @@ def carry(links, constants, i, frames, twists):
 
 @njit(**OPTIONS)
 def _place_lanes(constants, i, joint, turn):
-    """Write rotation (rows 0 to 8) & origin (9 to 11) of body i into `turn`, from cosine, sine and shift in `joint`."""
+    """Write rotation (rows 0 to 8) and origin (rows 9 to 11) of body i into `turn`, for L samples.
+
+    Args:
+        constants: those of `Bodies`.
+        i: index of the body.
+        joint: flat (5 L,), rows of L samples: cosine, sine and shift of the joint in rows 0 to 2.
+        turn: flat (12 L,) array to write.
+    """
     a0 = constants[i, 0]
     a1 = constants[i, 1]
     a2 = constants[i, 2]
@@ -249,7 +287,7 @@ def _place_lanes(constants, i, joint, turn):
 
 @njit(**JOINED)
 def _lane(x, r, k):
-    """Return the vector of sample k, stored in rows r to r + 2 of x."""
+    """Return the vector of sample k, stored in rows r to r + 2 of x; each row of x has L samples."""
     return x[r * L + k], x[(r + 1) * L + k], x[(r + 2) * L + k]
 
 
@@ -260,7 +298,13 @@ def _write_lane(x, r, k, a):
 
 @njit(**JOINED)
 def _lane_back(turn, k, a):
-    """Return Rᵀ a for sample k, with its rotation R in `turn`."""
+    """Return Rᵀ a for sample k, with the rotation R of this sample from `turn`.
+
+    Args:
+        turn: flat (12 L,) rotations and origins of L samples, from `_place_lanes`.
+        k: index of the sample.
+        a: vector (3,).
+    """
     x = scaled(a[0], _lane(turn, 0, k))
     y = scaled(a[1], _lane(turn, 3, k))
     z = scaled(a[2], _lane(turn, 6, k))
@@ -269,7 +313,15 @@ def _lane_back(turn, k, a):
 
 @njit(**OPTIONS)
 def _advance_lanes(turning, joint, turn, up, motion_here):
-    """Compute `advance` for L samples, for a joint that turns about z (turning 1) or slides along z (turning 0)."""
+    """Compute `advance` for L samples, for a joint about z (turning 1), or one along z or a fixed body (turning 0).
+
+    Args:
+        turning: 1.0 for a revolute joint, 0.0 otherwise.
+        joint: flat (5 L,): cosine, sine, shift, velocity and acceleration of the joint, from `_load_lanes`.
+        turn: flat (12 L,) rotation and origin of the body, from `_place_lanes`.
+        up: flat (9 L,) w, dw, a of the parent.
+        motion_here: flat (9 L,) array to write, those of the body.
+    """
     f, g = turning, 2.0 - 2.0 * turning
     for k in range(L):
         w = _lane(up, 0, k)
@@ -290,7 +342,13 @@ def _advance_lanes(turning, joint, turn, up, motion_here):
 
 @njit(**OPTIONS)
 def _carry_lanes(turn, up, twist_here):
-    """Compute the step of `carry` for the twist of one coordinate, for L samples."""
+    """Compute the twist of one coordinate as in `carry`, from the parent's twist `up`, for L samples.
+
+    Args:
+        turn: flat (12 L,) rotation and origin of the body, from `_place_lanes`.
+        up: flat (6 L,) twist of the parent.
+        twist_here: flat (6 L,) array to write, the twist of the body.
+    """
     for k in range(L):
         u = _lane(up, 0, k)
         _write_lane(twist_here, 0, k, _lane_back(turn, k, u))
@@ -300,7 +358,13 @@ def _carry_lanes(turn, up, twist_here):
 
 @njit(**OPTIONS)
 def _project_lanes(motion, twist, columns):
-    """Write the ten regressor columns of one body in one coordinate's row for L samples."""
+    """Write the ten regressor columns of one body in one coordinate's torque row, for L samples.
+
+    Args:
+        motion: flat (9 L,) w, dw, a of the body.
+        twist: flat (6 L,) twist of the body per unit rate of the coordinate.
+        columns: flat (10 L,) array to write.
+    """
     for k in range(L):
         w = _lane(motion, 0, k)
         e = _lane(motion, 3, k)
@@ -323,7 +387,15 @@ def _project_lanes(motion, twist, columns):
 
 @njit(**OPTIONS)
 def _load_lanes(kind, scale, amount, v, a, joint):
-    """Write cosine, sine, shift, rate and change of one joint for all samples in amount, v, a (L or fewer)."""
+    """Write cosine, sine, shift, velocity and acceleration of one joint into `joint`, for up to L samples.
+
+    Args:
+        kind: kind of the joint, as in `Bodies.kinds`.
+        scale: factor of the coordinate, as in `Bodies.scales`.
+        amount: position of the joint in each sample [rad or m].
+        v, a: velocity and acceleration of the coordinate in each sample.
+        joint: flat (5 L,) array to write.
+    """
     for k in range(amount.shape[0]):
         joint[2 * L + k] = amount[k]
         joint[3 * L + k] = scale * v[k]
@@ -340,14 +412,16 @@ def _load_lanes(kind, scale, amount, v, a, joint):
 
 @njit(**OPTIONS)
 def regressor(links, constants, order, amount, v, a, out):
-    """Fill out (10 B, n, N), initially zero, with the standard regressor.
+    """Write the standard regressor into out (10 B, n, N), which must be zero.
 
-    L samples at a time, the sample index innermost, so that the compiler turns every line into vector instructions.
+    L samples are processed at once with the sample index innermost, so that the compiler vectorises every line.
 
     Args:
-        order: (B, 10) `Bodies.order`, the position of each body's columns in `out`.
+        links, constants: those of `Bodies`.
+        order: (B, 10) `Bodies.order`, the index in `out` of each column of a body.
         amount: (B, N) joint position that moves each body [rad or m], below 1e6.
         v, a: (n, N) joint velocities and accelerations.
+        out: (10 B, n, N) the regressor.
     """
     bodies = amount.shape[0]
     count = amount.shape[1]
@@ -392,7 +466,14 @@ def regressor(links, constants, order, amount, v, a, out):
 
 @njit(**OPTIONS)
 def _wrench(i, parameters, motion, wrench):
-    """Write force and moment of body i about its frame's origin into row i of `wrench` (B, 6)."""
+    """Write the inertial force and moment of body i about its frame's origin into row i of `wrench` (B, 6).
+
+    Args:
+        i: index of the body.
+        parameters: (10 B,) standard parameters in the kernels' frames.
+        motion: (B + 1, 9) w, dw, a of all bodies, from `advance`.
+        wrench: (B, 6) array to write.
+    """
     w = three(motion, i + 1, 0)
     e = three(motion, i + 1, 3)
     a = three(motion, i + 1, 6)
@@ -408,7 +489,15 @@ def _wrench(i, parameters, motion, wrench):
 
 @njit(**OPTIONS)
 def _return(links, constants, i, frames, wrench, tau):
-    """Add body i's torque to tau (n,) and its wrench to its parent's (the backward step of Newton-Euler)."""
+    """Add body i's joint torque to tau (n,) and its wrench to its parent's (the backward step of Newton-Euler).
+
+    Args:
+        links, constants: those of `Bodies`.
+        i: index of the body.
+        frames: (B, 12) rotation and origin of each body in its parent's frame, from `place`.
+        wrench: (B, 6) force and moment about each body's origin; the parent's row is increased.
+        tau: (n,) joint torques [N m or N].
+    """
     c = links[i, COORDINATE]
     p = links[i, PARENT]
     if c >= 0:
@@ -424,10 +513,14 @@ def _return(links, constants, i, frames, wrench, tau):
 
 @njit(**OPTIONS)
 def inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, out):
-    """Fill out (N, n), initially zero, with the torques (recursive Newton-Euler; Luh, Walker, Paul 1980).
+    """Write the joint torques into out (N, n), which must be zero (recursive Newton-Euler; Luh, Walker, Paul 1980).
 
     Args:
+        links, constants: those of `Bodies`.
+        parameters: (10 B,) standard parameters in the kernels' frames.
         amount, cosine, sine: (N, B) joint position that moves each body [rad or m], its cosine and sine.
+        v, a: (N, n) joint velocities and accelerations.
+        out: (N, n) the torques.
     """
     bodies = amount.shape[1]
     frames = np.empty((bodies, 12))
@@ -453,7 +546,14 @@ def inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, o
 
 @njit(**OPTIONS)
 def stop(x, width):
-    """Return the states (N,) of a stop operator of half-width `width` driven by x (N,), unstressed at first."""
+    """Return the states (N,) within ±1 of a stop operator of half-width `width` driven by positions x (N,).
+
+    The first state is 0. The state follows x / width and saturates at ±1 (hysteresis of friction).
+
+    Args:
+        x: (N,) positions in order of time.
+        width: travel over which the state changes by 1.
+    """
     out = np.zeros(x.shape[0])
     for k in range(1, x.shape[0]):
         free = out[k - 1] + (x[k] - x[k - 1]) / width

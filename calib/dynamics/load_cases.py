@@ -1,4 +1,4 @@
-"""One motion run under several loads: base regressor of the rows of all runs, with derivatives."""
+"""One motion repeated under several loads: the stacked base regressor of all runs, with derivatives."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
@@ -11,32 +11,36 @@ from calib.dynamics.base import BaseModel
 
 @dataclass(frozen=True, eq=False)
 class LoadCases(BaseModel):
-    """Base model of a motion that is run once with each load, with (loads x rows per sample) rows and b base columns.
+    """Base model of a motion that is run once with each load.
 
-    Kolyubin, Shiriaev & Jubien (2019), section 6.2: the payload's and the arm's parameters are columns of one
-    observation matrix, in which the runs with and without the payload are stacked.
+    The regressor has (loads x rows per sample) rows and b base columns. The parameters of arm and payload are columns
+    of one observation matrix, in which the runs with and without the payload are stacked (Kolyubin, Shiriaev & Jubien
+    2019, section 6.2).
 
     Attributes:
-        loads: for each run, the labels of the payloads carried; None: all payloads of the model.
+        loads: for each run, the labels of the attached payloads; None: all payloads of the model.
     """
 
     loads: Sequence[Collection[str] | None] = (None,)
 
     @property
     def joint_of_row(self) -> np.ndarray:
-        """Joint index of each row (loads x rows per sample,), from 0."""
+        """Joint index, from 0, of each of the (loads x rows per sample) rows."""
         joints = np.arange(self.model.rows) % self.model.n
         return np.tile(joints, len(self.loads))
 
     @property
     def limited(self) -> np.ndarray:
-        """Indices (loads, n) of the motor torque rows; of the sensors' rows in a model of joint torque sensors."""
+        """Indices (loads, n) of the rows to which torque limits apply: the motor torques.
+
+        In a model of joint torque sensors alone, they are the rows of the sensors.
+        """
         last = np.arange(self.model.rows - self.model.n, self.model.rows)
         return self.model.rows * np.arange(len(self.loads))[:, None] + last
 
     @property
     def row_names(self) -> tuple[str, ...]:
-        """Names of the rows: the joint, e.g. joint 1, followed by the load if there are several."""
+        """Names of the rows: the joint, e.g. joint 1, followed by the load if there are several loads."""
         n = self.model.n
         joint_names = [f"joint {joint + 1}" for joint in range(n)] * (self.model.rows // n)
         if len(self.loads) == 1:
@@ -50,13 +54,22 @@ class LoadCases(BaseModel):
         return tuple(names)
 
     def of_rows(self, of_joints: np.ndarray, fill: float = np.inf) -> np.ndarray:
-        """Return values (all rows,): at the rows of `limited` those of their joints (n,), elsewhere `fill`."""
+        """Return values of the n joints at the corresponding rows of `limited`, and `fill` at all other rows.
+
+        Args:
+            of_joints: (n,) one value per joint.
+            fill: value of the rows without torque limit.
+        """
         values = np.full(len(self.joint_of_row), fill)
         values[self.limited] = of_joints
         return values
 
     def regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the stacked base regressor (N, loads x rows per sample, b); columns of absent payloads are zero."""
+        """Return the stacked base regressor (N, loads x rows per sample, b); columns of absent payloads are zero.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+        """
         regressor = super().regressor(q, v, a)
         if self._plain:
             return regressor
@@ -70,7 +83,12 @@ class LoadCases(BaseModel):
     def regressor_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the gradients of Σ weights · regressor for q, v, a, (N, n) each; weights (N, all rows, b)."""
+        """Return the gradients of Σ weights · regressor with respect to q, v and a, (N, n) each.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+            weights: (N, loads x rows per sample, b) weight of each regressor entry.
+        """
         if self._plain:
             return super().regressor_gradient(q, v, a, weights)
         parts = np.split(weights.transpose(2, 1, 0), len(self.loads), axis=1)
@@ -82,7 +100,13 @@ class LoadCases(BaseModel):
     def torque_gradient(
         self, q: np.ndarray, v: np.ndarray, a: np.ndarray, values: np.ndarray, weights: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the gradients of Σ weights · (regressor values) for q, v, a, (N, n) each; weights (N, all rows)."""
+        """Return the gradients of Σ weights · torques with respect to q, v and a, (N, n) each.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+            values: (b,) base parameters, which give the torques.
+            weights: (N, loads x rows per sample) weight of each torque.
+        """
         gradients = []
         for part, absent in zip(np.split(weights, len(self.loads), axis=1), self._absent):
             present_values = np.where(absent, 0.0, values)
@@ -91,7 +115,12 @@ class LoadCases(BaseModel):
         return by_q, by_v, by_a
 
     def largest_torques(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the motor torques (N, n) of base parameters (b,), each for the load that makes it largest."""
+        """Return the motor torques (N, n) of a motion, each under the load that gives the largest |torque|.
+
+        Args:
+            values: (b,) base parameters.
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+        """
         # (N, loads, n)
         torques = (self.regressor(q, v, a) @ values)[:, self.limited]
         largest = np.abs(torques).argmax(axis=1, keepdims=True)
@@ -99,12 +128,12 @@ class LoadCases(BaseModel):
 
     @property
     def _plain(self) -> bool:
-        """Whether there is a single load case, that with all payloads."""
+        """Whether there is a single load case, in which all payloads are attached."""
         return len(self.loads) == 1 and not self._absent[0].any()
 
     @cached_property
     def _absent(self) -> list[np.ndarray]:
-        """Masks (b,) for each load of the base columns that belong to absent payloads."""
+        """For each load, the mask (b,) of the base columns of payloads that are not attached."""
         model = self.model
         drives = np.ones(model.p - model.inertial)
         absent = []

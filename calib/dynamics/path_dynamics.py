@@ -3,10 +3,11 @@
     tau = A(s) s̈ + B(s) ṡ² + Γ(s) + f(Φ, Φ' ṡ),    v = Φ' ṡ,    a = Φ' s̈ + Φ'' ṡ²
     Γ = w(Φ, 0, 0) X,    B = w(Φ, Φ', Φ'') X - Γ,    A = w(Φ, Φ', Φ' + Φ'') X - B - Γ = w(Φ, 0, Φ') X - Γ
 
-(Kolyubin, Shiriaev, Jubien 2019, Proposition 1, eq. 29 to 32), so A = M Φ', B = M Φ'' + C(Φ, Φ') Φ' and Γ = G without
-computing M, C or G. X are the parameters without friction (their Remark 2): motor inertia Ia belongs to M where tau is
-the motors' torque, and a torque offset or a spring to Γ. Every term that depends on speed is friction f: Coulomb
-friction depends on the sign of Φ', viscous friction is proportional to ṡ, which is not affine in ṡ².
+(Kolyubin, Shiriaev, Jubien 2019, Proposition 1, eq. 29 to 32), where w is the regressor. So A = M Φ', B = M Φ'' + C(Φ,
+Φ') Φ' and Γ = G are found without computing M, C or G. X are the parameters without friction (their Remark 2). Motor
+inertia Ia is part of M if tau is the motors' torque; a torque offset or a spring is part of Γ. All terms that depend on
+speed form the friction f: Coulomb friction depends on the sign of Φ', and viscous friction is proportional to ṡ, so
+that it is not affine in ṡ².
 """
 
 from collections.abc import Callable, Sequence
@@ -26,12 +27,13 @@ Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class PathDynamics:
-    """Dynamics along a path: a model with parameter values, friction separate from all other torques.
+    """Dynamics along a path: a model with parameter values, in which friction is separate from all other torques.
 
     Attributes:
-        regressor: function that maps q, v, a (N, n) to (N, rows, b); the last n rows are the limited torques.
-        parameters: (b,) X of the module docstring, zero for friction.
-        terms, amounts: all drive terms, with the exact Coulomb sign, and their values (k,).
+        regressor: function that maps q, v, a (N, n) to a regressor (N, rows, b), whose last n rows are the limited
+            torques.
+        parameters: (b,) parameters X of the module's docstring, without friction.
+        terms, amounts: all k drive terms, with the exact Coulomb sign, and their values (k,).
         bodies, inertial: bodies and their standard parameters (10 B,).
     """
 
@@ -56,7 +58,11 @@ class PathDynamics:
     def along(
         self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the coefficients A, B, Γ of the path dynamics, each (N, n), at Φ, Φ', Φ'' (N, n)."""
+        """Return the coefficients A, B, Γ of the torques A s̈ + B ṡ² + Γ, each (N, n), at N points of the path.
+
+        Args:
+            q, slope, curvature: (N, n) path q = Φ(s) and its derivatives Φ', Φ'' with respect to the path parameter s.
+        """
         zero = np.zeros_like(q)
         gravity = self.rigid(q, zero, zero)
         by_acceleration = self.rigid(q, zero, slope) - gravity
@@ -64,11 +70,21 @@ class PathDynamics:
         return by_acceleration, by_square_of_speed, gravity
 
     def rigid(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the torques (N, n) without friction."""
+        """Return the torques (N, n) [N m or N] without friction.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+        """
         return self.regressor(q, v, a)[:, -self.n :] @ self.parameters
 
     def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the friction torques (N, n); friction with hysteresis (stop operators) counts as fully stressed."""
+        """Return the friction torques (N, n).
+
+        The state of friction with hysteresis is taken as ±1, the value in continued sliding.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+        """
         terms, amounts = [], []
         for term, amount in zip(self.terms, self.amounts):
             if term.form.friction:
@@ -80,7 +96,11 @@ class PathDynamics:
         return self._drives(terms, np.array(amounts), q, v, a, load)
 
     def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the torques (N, n) of a motion with friction, by recursive Newton-Euler."""
+        """Return the complete torques (N, n) of a motion, friction included, by recursive Newton-Euler.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+        """
         load = rigid_body.inverse_dynamics(self.bodies, np.array(self.inertial), q, v, a)
         return load + self._drives(self.terms, np.asarray(self.amounts), q, v, a, load)
 
@@ -93,7 +113,13 @@ class PathDynamics:
         a: np.ndarray,
         load: np.ndarray | None,
     ) -> np.ndarray:
-        """Return the torques (N, n) of drive terms with values (k,); `load` (N, n) transmitted torques, or None."""
+        """Return the torques (N, n) of drive terms with parameter values `amounts` (k,).
+
+        Args:
+            terms, amounts: drive terms and their values.
+            q, v, a: (N, n) the motion.
+            load: (N, n) torques that the gears transmit [N m or N]; None if no term depends on them.
+        """
         motions: list[np.ndarray | None] = [np.ascontiguousarray(series.T) for series in (q, v, a)]
         motions.append(None if load is None else load.T)
         columns = np.zeros((len(terms), self.n, len(q)))
@@ -102,7 +128,15 @@ class PathDynamics:
 
 
 def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
-    """Return the path dynamics of a model with standard (or regrouped) parameters (p,), with all payloads."""
+    """Return the path dynamics of a model with parameter values (p,), with all payloads attached.
+
+    Args:
+        model: the identification model.
+        values: (p,) standard parameters, or base parameters with zeros for the regrouped ones.
+
+    Raises:
+        CalibError: if the model's rows contain no body parameters.
+    """
     values = shaped(values, (model.p,), "parameters of the model")
     if not model.torque_rows.has_bodies:
         raise CalibError("rows tau - tau_l contain no bodies: no motion planning; use a model of the torques tau")
@@ -130,7 +164,7 @@ def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
 
 
 def _with_exact_sign(term: DriveTerm) -> DriveTerm:
-    """Return the term with the exact Coulomb sign in place of the smoothed one, which is smaller at low speed."""
+    """Return the term with the exact Coulomb sign instead of the smoothed sign, which is smaller at low speed."""
     settings = []
     for name, setting in zip(term.form.settings, term.settings):
         settings.append(0.0 if name == "v0" else setting)
@@ -138,7 +172,7 @@ def _with_exact_sign(term: DriveTerm) -> DriveTerm:
 
 
 def _stressed(terms: Sequence[DriveTerm], v: np.ndarray) -> np.ndarray:
-    """Return the states (s, N) of stop operators that slide in the direction of motion, given v (n, N)."""
+    """Return the states (s, N), ±1, of the terms' stop operators that slide in the direction of velocity v (n, N)."""
     count = v.shape[1]
     states = []
     for term in terms:

@@ -1,11 +1,11 @@
-"""The pseudo-inertia of a body: ten standard parameters as one symmetric matrix, positive definite where possible.
+"""The pseudo-inertia of a body: its ten standard parameters as one symmetric 4×4 matrix.
 
     P = [ Σ   h ]        Σ = ½ tr(I) 1 - I = ∫ x xᵀ dm,    h = ∫ x dm = (MX MY MZ),    m = ∫ dm,
         [ hᵀ  m ]
 
-about the link frame's origin. P ≻ 0 if and only if some density of mass ≥ 0 has these ten parameters (Wensing, Kim &
-Slotine 2018, theorem 1): mass above zero, and the triangle inequality of the moments about the centre of mass. The map
-is linear and one to one, so the ten parameters of a body are a point of the cone of 4×4 matrices.
+about the link frame's origin. P ≻ 0 if and only if some non-negative mass density has these ten parameters (Wensing,
+Kim & Slotine 2018, theorem 1). This is equivalent to a positive mass and the triangle inequality of the moments of
+inertia about the centre of mass. The map from ten parameters to P is linear and one to one.
 """
 
 import numpy as np
@@ -19,7 +19,10 @@ def from_standard(parameters: np.ndarray) -> np.ndarray:
 
 
 def to_standard(pseudo: np.ndarray) -> np.ndarray:
-    """Return the standard parameters (…, 10) of pseudo-inertias P (…, 4, 4), with the inertia I = tr(Σ) 1 - Σ."""
+    """Return the standard parameters (…, 10) of pseudo-inertias P (…, 4, 4); the inertia is I = tr(Σ) 1 - Σ.
+
+    Σ (3, 3) is the upper left block of P, the second moment of mass.
+    """
     pseudo = np.asarray(pseudo, dtype=float)
     second = pseudo[..., :3, :3]
     trace = np.trace(second, axis1=-2, axis2=-1)
@@ -32,12 +35,11 @@ def to_standard(pseudo: np.ndarray) -> np.ndarray:
 
 
 def margin(parameters: np.ndarray) -> float:
-    """Return the margin of physical consistency [m].
+    """Return the margin of physical consistency [m] of ten standard parameters (10,).
 
-    The root of the smallest eigenvalue of Σ / mass about the centre of mass.
-
-    This is the standard deviation of the mass in the body's thinnest direction (t / √12 for a plate of thickness t);
-    negative for a physically inconsistent inertia; -inf if the mass is not positive.
+    The margin is the square root of the smallest eigenvalue of Σ / mass about the centre of mass: the standard
+    deviation of the mass distribution in the body's thinnest direction (t / √12 for a plate of thickness t). It is
+    negative for a physically inconsistent inertia, and -inf if the mass is not positive.
     """
     pseudo = from_standard(parameters)
     mass = pseudo[3, 3]
@@ -52,7 +54,12 @@ def margin(parameters: np.ndarray) -> float:
 def divergence(pseudo: np.ndarray, reference: np.ndarray) -> float:
     """Return the entropic divergence tr(P₀⁻¹ P) - log det(P₀⁻¹ P) - 4 of P from P₀ (Lee, Wensing & Park 2020).
 
-    The divergence is zero only at P = P₀, infinite at the boundary, independent of frame and units.
+    The divergence is zero only at P = P₀, infinite where P is singular or inconsistent, and independent of frame and
+    units.
+
+    Args:
+        pseudo: P (4, 4).
+        reference: P₀ (4, 4), positive definite.
     """
     ratio = np.linalg.solve(reference, pseudo)
     sign, log_det = np.linalg.slogdet(ratio)
@@ -62,7 +69,13 @@ def divergence(pseudo: np.ndarray, reference: np.ndarray) -> float:
 
 
 def ball(mass: float, radius: float, centre: np.ndarray | None = None) -> np.ndarray:
-    """Return ten standard parameters about the link frame of a homogeneous ball (mass [kg], radius and centre [m])."""
+    """Return the ten standard parameters of a homogeneous ball about the link frame's origin.
+
+    Args:
+        mass: mass [kg].
+        radius: radius [m].
+        centre: (3,) centre in the link frame [m]; None: the origin.
+    """
     if centre is None:
         centre = np.zeros(3)
     centre = np.asarray(centre, dtype=float)
@@ -76,7 +89,13 @@ def ball(mass: float, radius: float, centre: np.ndarray | None = None) -> np.nda
 
 
 def rod(mass: float, end: np.ndarray, radius: float) -> np.ndarray:
-    """Return the ten parameters of a uniform rod from the origin to `end` [m], as thick as a ball of `radius`."""
+    """Return the ten standard parameters of a uniform rod from the link frame's origin to `end`.
+
+    Args:
+        mass: mass [kg].
+        end: (3,) end of the rod [m].
+        radius: thickness of the rod, as the radius of a ball with equal spread of mass across the rod [m].
+    """
     end = np.asarray(end, dtype=float)
     pseudo = from_standard(ball(mass, radius, end / 2.0))
     pseudo[:3, :3] += mass * np.outer(end, end) / 12.0
@@ -84,7 +103,7 @@ def rod(mass: float, end: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _basis() -> np.ndarray:
-    """Return the pseudo-inertia P of each of the ten unit parameters (10, 4, 4)."""
+    """Return the pseudo-inertias (10, 4, 4) of the ten unit vectors of standard parameters."""
     basis = np.zeros((10, 4, 4))
     for k, (row, column) in enumerate(SYMMETRIC):
         basis[k, row, column] -= 1.0
@@ -100,7 +119,7 @@ def _basis() -> np.ndarray:
 
 
 def _units() -> np.ndarray:
-    """Return an orthonormal basis (10, 4, 4) of the symmetric matrices."""
+    """Return an orthonormal basis (10, 4, 4) of the symmetric 4×4 matrices."""
     row, column = np.triu_indices(4)
     entry = np.where(row == column, 1.0, np.sqrt(0.5))
     units = np.zeros((10, 4, 4))
@@ -113,9 +132,14 @@ BASIS, UNITS = _basis(), _units()
 
 
 def unknown_bodies(count: int, term_count: int) -> np.ndarray:
-    """Return the P of each body as a linear function of all unknowns, (count, 4, 4, 10 count + terms).
+    """Return each body's pseudo-inertia as a linear function of all unknowns, (count, 4, 4, 10 · count + term_count).
 
-    The unknowns are ten coordinates in `UNITS` per body, followed by the drive terms, on which P does not depend.
+    The unknowns are ten coordinates per body in the basis `UNITS`, followed by the drive parameters, on which the
+    pseudo-inertias do not depend.
+
+    Args:
+        count: number of bodies.
+        term_count: number of drive parameters.
     """
     bodies = np.einsum("ij,krs->irsjk", np.eye(count), UNITS)
     bodies = bodies.reshape(count, 4, 4, 10 * count)

@@ -1,8 +1,9 @@
-"""Interface of models for identification: torques as a linear function of parameters, W(q, v, a) x = y.
+"""Interface of models for identification: torques as a linear function of parameters, y = W(q, v, a) x.
 
-A serial chain implements the interface (`calib.dynamics.idim.IdentificationModel`), and so can any model whose torques
-are linear in its parameters: a closed chain reduced to its actuated coordinates, a model of the power alone. Properties
-that only a serial chain has (joint limits, CAD masses, another geometry) are passed to identification separately.
+A serial chain implements the interface (`calib.dynamics.idim.IdentificationModel`). Other models whose torques are
+linear in their parameters can implement it, too: a closed chain reduced to its actuated coordinates, or a model of the
+power alone. Properties that only a serial chain has (joint limits, CAD masses, another geometry) are passed to
+identification separately.
 """
 
 from collections.abc import Collection, Sequence
@@ -19,12 +20,13 @@ Loads = Sequence[Collection[str] | None]
 
 @dataclass(frozen=True, eq=False)
 class States:
-    """Random or recorded states for comparing columns.
+    """Random or recorded states of the robot, at which regressor columns are compared.
 
     Attributes:
-        q, v, a: (N, n) [rad or m, and per s, per s²].
-        load: (N, n) transmitted torques [N m or N], needed where friction depends on them; None otherwise.
-        states: (s, N) from `idim.friction_states`, needed where friction depends on past motion; None otherwise.
+        q, v, a: (N, n) joint positions, velocities and accelerations [rad or m, and per s, per s²].
+        load: (N, n) transmitted torques [N m or N], needed if friction depends on them; None otherwise.
+        states: (s, N) friction states from `idim.friction_states`, needed if friction depends on past motion; None
+            otherwise.
     """
 
     q: np.ndarray
@@ -35,7 +37,7 @@ class States:
 
 
 class RegressorModel(Protocol):
-    """Interface of a model with n recorded coordinates and p parameters: first of bodies, then of drive terms."""
+    """Interface of a model with n recorded coordinates and p parameters: body parameters, then drive parameters."""
 
     @property
     def n(self) -> int:
@@ -57,12 +59,12 @@ class RegressorModel(Protocol):
 
     @property
     def inertial(self) -> int:
-        """Number of body parameters."""
+        """Number of body parameters, which precede the drive parameters."""
         ...
 
     @property
     def columns(self) -> tuple[DriveTerm, ...]:
-        """Drive terms of the last p - inertial parameters."""
+        """Drive terms of the last (p - inertial) parameters."""
         ...
 
     @property
@@ -84,7 +86,13 @@ class RegressorModel(Protocol):
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return W (N, rows, p) at q, v, a (N, n); for further arguments see `IdentificationModel.regressor`."""
+        """Return the regressor W (N, rows, p) of a motion.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+            load, carried, states: as in `IdentificationModel.regressor`: transmitted torques, attached payloads and
+                states of friction with hysteresis.
+        """
         ...
 
     def torque(
@@ -96,7 +104,14 @@ class RegressorModel(Protocol):
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the torques (N, rows) of parameters (p,): W · values, possibly by a faster algorithm."""
+        """Return the torques (N, rows) W · values for parameters `values` (p,), possibly by a faster algorithm.
+
+        Args:
+            values: (p,) parameter values.
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+            carried: labels of the attached payloads; None: all.
+            states: states of friction with hysteresis, as in `regressor`.
+        """
         ...
 
     def acting(self) -> np.ndarray:
@@ -104,15 +119,21 @@ class RegressorModel(Protocol):
         ...
 
     def preference(self) -> np.ndarray:
-        """Return all columns (p,) in order of preference as base columns."""
+        """Return the indices of all columns (p,) in order of preference as base columns."""
         ...
 
     def load_cases(self) -> Loads:
-        """Return the payload combinations for choosing base columns, as in the regressor's argument `carried`."""
+        """Return the load cases for choosing base columns, each in the form of the regressor's argument `carried`."""
         ...
 
     def sample(
         self, count: int, rng: np.random.Generator, lower: np.ndarray | None = None, upper: np.ndarray | None = None
     ) -> States:
-        """Return `count` random states of the model, within limits (n,) of its coordinates if given."""
+        """Return `count` random states of the model.
+
+        Args:
+            count: number of states.
+            rng: generator of the random numbers.
+            lower, upper: (n,) limits of the coordinates [rad or m]; None: default limits.
+        """
         ...

@@ -1,8 +1,8 @@
-"""Regressor, torques and inertia matrix of `Bodies` for many samples at once: checks of shapes, then the kernels.
+"""Regressor, torques and inertia matrix of `Bodies` for many samples at once; shapes are checked, then kernels called.
 
     tau = Y(q, v, a) · chi,    chi the standard parameters XX XY XZ YY YZ ZZ MX MY MZ M, body after body.
 
-Sign: the drives of an arm at rest exert +g(q). numba is imported at the first call, not before.
+Sign: the drives of an arm at rest exert the gravity torques +g(q). numba is imported at the first call, not before.
 """
 
 import numpy as np
@@ -15,12 +15,13 @@ MAX_ANGLE = 1e6
 
 
 def regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return the regressor of the standard parameters, (N, n, 10 B).
+    """Return the regressor (N, n, 10 B) of the standard parameters.
 
-    Its memory is ordered (10 B, n, N), so that each column is contiguous in time and stacking it copies nothing.
+    Its memory order is (10 B, n, N), so that each column is contiguous in time and stacking needs no copy.
 
     Args:
-        q, v, a: (N, n) [rad or m, and per s, per s²].
+        bodies: the robot's bodies.
+        q, v, a: (N, n) joint motion [rad or m, and per s, per s²].
     """
     q, v, a = _states(bodies, q=q, v=v, a=a)
     out = np.zeros((10 * bodies.count, bodies.n, len(q)))
@@ -29,7 +30,13 @@ def regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np
 
 
 def fill_regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, out: np.ndarray) -> None:
-    """Write the regressor into out (10 B, n or more, N), initially zero; q, v, a (N, n) are not checked here."""
+    """Write the regressor into `out`, without checks of q, v, a.
+
+    Args:
+        bodies: the robot's bodies.
+        q, v, a: (N, n) joint motion [rad or m, and per s, per s²].
+        out: (10 B, n or more, N) array of zeros, whose first n rows are filled.
+    """
     from calib.dynamics import kernels
 
     coordinates = q.T[bodies.coordinates]
@@ -43,15 +50,16 @@ def fill_regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, 
 
 
 def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return kinetic and potential energy per unit of each standard parameter, (N, 10 B).
+    """Return kinetic plus potential energy (N, 10 B) per unit of each standard parameter.
 
-        ½ q̇ᵀ [Y(q, 0, q̇) - Y(q, 0, 0)] - [0, gᵀ R, gᵀ p],    R, p the body's frame in the base
+        ½ q̇ᵀ [Y(q, 0, q̇) - Y(q, 0, 0)] - [0, gᵀ R, gᵀ p],    R, p: pose of the body's frame in the base
 
-    (Gautier 1997, with Y the regressor of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi.)
+    Here g is the gravity vector and Y the regressor of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi
+    for the inertia matrix M and standard parameters chi (Gautier 1997).
 
     Args:
-        bodies: the robot's bodies.
-        q, v: (N, n) [rad or m, and per s].
+        bodies: the B bodies of the robot.
+        q, v: (N, n) joint positions and velocities [rad or m, and per s].
     """
     zero = np.zeros_like(np.asarray(v, dtype=float))
     weightless = bodies.with_gravity(np.zeros(3))
@@ -67,7 +75,7 @@ def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _frames(bodies: Bodies, q: np.ndarray) -> np.ndarray:
-    """Return the poses of the bodies' frames in the base frame, (B, N, 4, 4)."""
+    """Return the poses (B, N, 4, 4) of the bodies' frames in the base frame, at joint positions q (N, n) [rad or m]."""
     frames = np.empty((bodies.count, len(q), 4, 4))
     for body, parent in enumerate(bodies.parents):
         placement = bodies.placements[body]
@@ -98,9 +106,13 @@ def regressor_gradient(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the exact gradients of Σ weights · Y(q, v, a) with respect to q, v and a, three arrays (N, n).
 
+    The gradient of any scalar function of Y needs one call. Weights of rank one, ``weights[k] = outer(lambda_k, chi)``,
+    give the gradients of Σ lambda · tau.
+
     Args:
-        weights: (N, n, 10 B); weights of rank one, ``weights[k] = outer(lambda_k, chi)``, give the derivatives of Σ
-            lambda · tau. The gradient of any function of Y needs one call.
+        bodies: the robot's bodies.
+        q, v, a: (N, n) joint motion [rad or m, and per s, per s²].
+        weights: (N, n, 10 B) weight of each entry of Y.
     """
     from calib.dynamics import gradient_kernels
 
@@ -120,12 +132,15 @@ def regressor_gradient(
 def torque_gradient(
     bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the exact gradients of Σ weights · tau(q, v, a), weights (N, n), for q, v and a, three arrays (N, n).
+    """Return the exact gradients of Σ weights · tau(q, v, a) with respect to q, v and a, three arrays (N, n).
 
-    Equals `regressor_gradient` with weights of rank one, at a fraction of the cost.
+    The result equals `regressor_gradient` with weights of rank one, at a fraction of the cost.
 
     Args:
+        bodies: the robot's bodies.
         parameters: (10 B,) standard parameters.
+        q, v, a: (N, n) joint motion [rad or m, and per s, per s²].
+        weights: (N, n) weight of each torque.
     """
     from calib.dynamics import gradient_kernels
 
@@ -146,10 +161,12 @@ def torque_gradient(
 
 
 def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return the rigid-body torques (N, n) [N m or N]: no motor inertia, no friction.
+    """Return the rigid-body torques (N, n) [N m or N], without motor inertia and friction.
 
     Args:
+        bodies: the robot's bodies.
         parameters: (10 B,) standard parameters; they need not be physically consistent.
+        q, v, a: (N, n) joint motion [rad or m, and per s, per s²].
     """
     from calib.dynamics import kernels
 
@@ -162,7 +179,13 @@ def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: n
 
 
 def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the joint-space inertia matrices M(q) (N, n, n) of the bodies."""
+    """Return the joint-space inertia matrices M(q) (N, n, n) of the bodies, without motor inertia.
+
+    Args:
+        bodies: the robot's bodies.
+        parameters: (10 B,) standard parameters.
+        q: (N, n) joint positions [rad or m].
+    """
     q = np.asarray(q, dtype=float)
     weightless = bodies.with_gravity(np.zeros(3))
     zero = np.zeros_like(q)
@@ -174,7 +197,12 @@ def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.nda
 
 
 def kernel_parameters(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
-    """Return standard parameters (10 B,) in the kernels' frames, whose z is the joint axis."""
+    """Return standard parameters (10 B,) in the order of the kernels' frames, whose z axis is the joint axis.
+
+    Args:
+        bodies: the robot's bodies.
+        parameters: (10 B,) in the order of the bodies' own frames.
+    """
     parameters = shaped(parameters, (10 * bodies.count,), "standard parameters")
     rows = parameters.reshape(bodies.count, 10)
     return np.take_along_axis(rows, bodies.order, axis=1).ravel()
@@ -184,7 +212,12 @@ _NAMES = {"q": "joint positions q", "v": "joint velocities v", "a": "joint accel
 
 
 def _states(bodies: Bodies, **arrays: np.ndarray) -> list[np.ndarray]:
-    """Return q, v, a as finite (N, n) arrays of one memory layout (numba compiles a kernel per layout)."""
+    """Return q, v, a as checked, finite arrays (N, n) of one memory layout (numba compiles a kernel per layout).
+
+    Args:
+        bodies: the robot's bodies, which give n.
+        arrays: the arrays by the names used in messages.
+    """
     rows: int | None = None
     checked = []
     for key, array in arrays.items():
@@ -200,7 +233,12 @@ def _plain(array: np.ndarray) -> np.ndarray:
 
 
 def _placed(bodies: Bodies, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the joint position that moves each body, its cosine and sine, (N, B) each."""
+    """Return the joint position that moves each body, its cosine and its sine, (N, B) each.
+
+    Args:
+        bodies: the robot's bodies.
+        q: (N, n) joint positions [rad or m].
+    """
     # Not q[:, …], which is laid out by columns.
     amount = q.take(bodies.coordinates, axis=1) * bodies.scales
     return amount, np.cos(amount), np.sin(amount)

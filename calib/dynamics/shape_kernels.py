@@ -1,7 +1,8 @@
-"""Compiled shapes of friction and other drive torques (numba): one formula with derivatives for arrays and simulations.
+"""Compiled shapes (numba) of friction and other drive torques, used for arrays of samples and in simulations.
 
-One row of `acts` holds a shape's settings, from column 1 on, in the order of `calib.dynamics.shapes.SHAPES`; the
-simulator uses the other columns. The code of a shape is the constant named after it.
+Each shape is a formula with its derivatives. One row of `acts` contains a shape's settings, from column 1 on, in the
+order of `calib.dynamics.shapes.SHAPES`; the simulator uses the other columns. The code of a shape is the constant with
+the shape's name.
 """
 
 from math import cos, exp, isinf, pi, sin, sqrt, tanh
@@ -35,15 +36,21 @@ def smooth_sign(v, v0):
 
 @njit(**JOINED)
 def _sign_slope(sign, v0):
-    """Return the derivative of `smooth_sign` with respect to v, given its value `sign`."""
+    """Return the derivative of `smooth_sign` with respect to v, given its value `sign` and its width `v0`."""
     return (1.0 - sign * sign) / v0 if v0 > 0.0 else 0.0
 
 
 @njit(**JOINED)
 def _band(acts, t, x, v):
-    """Return the gain of ripple in one band and one direction: triangular over the frequency order · |v| / 2π [Hz].
+    """Return the gain of torque ripple that is identified for one frequency band and one direction of motion.
 
-    The gain decreases to zero within `FADE` beyond the range of positions of the identification, lower … upper.
+    The gain is a triangular function of the frequency order · |v| / 2π [Hz]. Beyond the positions of the identification
+    (lower … upper) it decreases to zero within `FADE`.
+
+    Args:
+        acts: array of settings, one row per shape.
+        t: row of this shape.
+        x, v: position and velocity [rad or m, per s].
     """
     left = acts[t, 2]
     middle = acts[t, 3]
@@ -61,13 +68,13 @@ def _band(acts, t, x, v):
 
 @njit(**OPTIONS)
 def shape(code, acts, t, x, v, state):
-    """Return the value of a shape per unit parameter, and its derivatives with respect to position and velocity.
+    """Return the torque of a shape per unit parameter, and its derivatives with respect to position and velocity.
 
     Args:
         code: code of the shape.
-        acts, t: array of settings, and the row of this shape in it.
+        acts, t: array of settings, and the row of this shape in the array.
         x, v: position and velocity [rad or m, per s].
-        state: state of the stop operator, see `calib.dynamics.drives.friction_states`.
+        state: state of the stop operator, from `calib.dynamics.drives.friction_states`.
     """
     first = acts[t, 1]
     second = acts[t, 2]
@@ -124,7 +131,15 @@ def shape(code, acts, t, x, v, state):
 
 @njit(**OPTIONS)
 def steepest(code, acts, t):
-    """Return a smoothed sign's largest slope, the |v| where it occurs, its width in v, and a stop's stiffness."""
+    """Return four numbers that limit a simulator's step size where a shape is steep.
+
+    They are the largest slope of a smoothed sign, the |v| of that slope, its width in v, and the stiffness of a stop
+    operator; 0, 0, 1, 0 for other shapes.
+
+    Args:
+        code: code of the shape.
+        acts, t: array of settings, and the row of this shape in the array.
+    """
     first = acts[t, 1]
     second = acts[t, 2]
     third = acts[t, 3]
@@ -145,7 +160,14 @@ def steepest(code, acts, t):
 
 @njit(**OPTIONS)
 def fill(code, acts, x, v, state, out):
-    """Write the values of one shape into out (1, N); if out is (3, N), also its derivatives with respect to x and v."""
+    """Write the values of one shape into `out`.
+
+    Args:
+        code: code of the shape.
+        acts: settings of the shape in row 0.
+        x, v, state: (N,) position, velocity and state of the stop operator.
+        out: (1, N) for the values, or (3, N) for the values and their derivatives with respect to x and v.
+    """
     for k in range(v.shape[0]):
         value, by_x, by_v = shape(code, acts, 0, x[k], v[k], state[k])
         out[0, k] = value

@@ -1,15 +1,15 @@
 """Shapes of drive torques: one row per shape; formulas and derivatives are in `calib.dynamics.shape_kernels`.
 
-A shape sees x, v, a [rad or m, per s, per s²] of one joint (or of a sum of joints, where a gear couples them), the
-torque the joint transmits, and its settings; its value is the torque per unit of its parameter. To add a shape: a row
-here (and in `STEPS`, if the friction ladder is to try it), and its formula with a code in `shape_kernels`; arrays,
-simulator, tangents and option files follow from both.
+A shape is a function of the motion x, v, a [rad or m, per s, per s²] of one joint (or of a sum of joints that a gear
+couples), of the torque that the joint transmits, and of the shape's settings; its value is the torque per unit of the
+parameter. To add a shape, add a row here (and in `STEPS`, if the friction ladder is to try it), and a formula with a
+code in `shape_kernels`. Arrays, simulator, tangents and option files use both.
 
-The Coulomb sign is smoothed as s(v) = tanh(v / v0) (v0 = 0: the exact sign; BIRDy's choice is v0 = 0.01 rad/s). In
-shapes called ``dead`` the sign has a dead zone instead: 0 where abs(v) <= v0.
+The Coulomb sign is smoothed as s(v) = tanh(v / v0); v0 = 0 is the exact sign, and BIRDy uses v0 = 0.01 rad/s. The shape
+``dead`` instead has a dead zone: 0 for abs(v) <= v0.
 
-Shapes that are nonlinear in speed keep their value beyond an ``edge`` [rad/s or m/s], the fastest speed of their
-identification (infinite where it is not given): beyond the edge, friction continues linearly.
+Shapes that are nonlinear in speed are constant beyond an ``edge`` [rad/s or m/s], the fastest speed of their
+identification (infinite if not given). Beyond the edge, friction changes only by its linear terms.
 """
 
 import math
@@ -31,7 +31,13 @@ STRIBECK_SHARES = {"": 0.05, ".2": 0.2}
 
 @dataclass(frozen=True)
 class TermMotion:
-    """Motion that one drive term depends on, each (N,); `load` [N m or N] and `state` are None if not needed."""
+    """Motion that one drive term depends on.
+
+    Attributes:
+        x, v, a: (N,) position, velocity, acceleration [rad or m, per s, per s²].
+        load: (N,) transmitted torque [N m or N]; None if the term does not need it.
+        state: (N,) state of the stop operator; None if the term does not need it.
+    """
 
     x: np.ndarray
     v: np.ndarray
@@ -42,7 +48,7 @@ class TermMotion:
 
 @dataclass(frozen=True)
 class RecordedRange:
-    """Ranges of a joint's recorded motion, which scale its terms.
+    """Ranges of a joint's recorded motion, which scale the settings of its candidate terms.
 
     Attributes:
         v0: smoothing of the joint's Coulomb sign [rad/s or m/s].
@@ -61,13 +67,13 @@ class Shape:
     """One shape of drive torque and its properties.
 
     Attributes:
-        unit: unit of the parameter for a revolute joint; `unit_linear` is that for a prismatic joint.
-        settings: names of the numbers that the shape needs, with units; ``v0`` smooths Coulomb's sign.
-        slopes: whether the shape has derivatives (none if it depends on past motion or torques).
+        unit, unit_linear: units of the parameter for a revolute and for a prismatic joint.
+        settings: names of the shape's settings; ``v0`` smooths Coulomb's sign.
+        slopes: whether the shape has derivatives (not if it depends on past motion or torques).
         loaded, remembers: whether the shape needs `TermMotion.load` and `TermMotion.state`.
         friction: whether the shape depends on speed; if not, its torque along a path is affine in s̈ and ṡ².
         dissipative: whether the shape dissipates energy for a positive parameter.
-        of_velocity: whether the shape is a function of v alone (a constant counts as one).
+        of_velocity: whether the shape is a function of v alone (or constant).
         nonnegative: whether the parameter is positive in every robot: inertia, viscous and Coulomb friction.
         exact: whether the shape's columns are free of the noise of q, v and a: constants, and signs except at
             reversals.
@@ -116,9 +122,14 @@ SHAPES: dict[str, Shape] = {
 
 
 class Offer(NamedTuple):
-    """Candidate terms of a joint in a step of the friction ladder.
+    """Candidate terms of a joint in one step of the friction ladder.
 
-    A term's name is ``label + joint + ending``; `settings` returns, for a joint's range, the settings of each ending.
+    Attributes:
+        label: start of the terms' names; a name is ``label + joint number + ending``.
+        shape: a key of `SHAPES`.
+        settings: function of a joint's recorded range that returns the settings of each candidate, by the ending of its
+            name.
+        side: "link" or "motor" side of a joint torque sensor.
     """
 
     label: str
@@ -128,32 +139,48 @@ class Offer(NamedTuple):
 
 
 def _presliding(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return candidate stop operators of several widths, each as z - sign(v): Fc remains the friction of sliding."""
+    """Return settings of candidate stop operators of several widths, by the ending of their names.
+
+    Each shape is the stop operator's state minus sign(v), so that Fc remains the friction of sliding.
+
+    Args:
+        joint: recorded range of the joint's motion; the widths are shares of its travel.
+    """
     return {f".{k}": (share * joint.travel, joint.v0) for k, share in enumerate(PRESLIDING_SHARES, 1)}
 
 
 def _cable(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return candidate harmonics of period 2 · travel, which represent any smooth torque of cables and hoses."""
+    """Return settings of candidate harmonics of the joint position, by the ending of their names.
+
+    With the period 2 · travel they represent any smooth torque of cables and hoses.
+
+    Args:
+        joint: recorded range of the joint's motion.
+    """
     return {f".{k}": (k * math.pi / joint.travel, math.inf) for k in CABLE_HARMONICS}
 
 
 def _stribeck(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return candidate Stribeck torques of two speeds."""
+    """Return settings of candidate Stribeck terms with two Stribeck speeds, by the ending of their names.
+
+    Args:
+        joint: recorded range of the joint's motion; the Stribeck speeds are shares of its peak speed.
+    """
     return {end: (share * joint.peak, 1.0, joint.v0) for end, share in STRIBECK_SHARES.items()}
 
 
 def _smoothed(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return one candidate with a smoothed sign."""
+    """Return settings of one candidate: the smoothing v0 of the Coulomb sign of `joint`."""
     return {"": (joint.v0,)}
 
 
 def _up_to_edge(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return one candidate whose value is constant beyond the joint's fastest speed."""
+    """Return settings of one candidate: the joint's fastest speed, beyond which its torque is constant."""
     return {"": (joint.edge,)}
 
 
 def _root(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return one candidate whose value is constant beyond the joint's fastest speed, smoothed at rest."""
+    """Return settings of one candidate: the joint's fastest speed (constant torque beyond it) and its smoothing."""
     return {"": (joint.edge, joint.v0)}
 
 

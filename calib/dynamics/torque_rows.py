@@ -1,6 +1,7 @@
 """Torque rows that a model explains: a linear map of joint torques, for regressors and measured torques.
 
-With torque sensors in the joints (Kolyubin, Shiriaev, Jubien 2019, section 6.2) four kinds of rows exist:
+With torque sensors in the joints (Kolyubin, Shiriaev, Jubien 2019, section 6.2) there are four kinds of rows, where tau
+are the motor torques and tau_l the torques of the sensors on the link side of the gears:
 
     MOTOR   tau             bodies and all drive terms (a robot without such sensors)
     LINK    tau_l           Model 1: bodies and link-side terms
@@ -28,12 +29,13 @@ Map = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class _JointBlock:
-    """One torque row per joint.
+    """Block of torque rows with one row per joint.
 
     Attributes:
         prefix: prefix of the rows' labels.
-        sides: which columns act on the rows: ``bodies``, drive terms of the ``link`` side, drive terms of the ``motor``
-        side. motor, sensor: factors of the measured torques in a row: motor · tau + sensor · tau_l.
+        sides: kinds of columns that affect the rows: ``bodies``, drive terms of the ``link`` side, drive terms of the
+            ``motor`` side.
+        motor, sensor: factors of the measured torques in a row: motor · tau + sensor · tau_l.
         suffix: suffix of the rows' full names, after the joint's name.
     """
 
@@ -46,13 +48,12 @@ class _JointBlock:
 
 @dataclass(frozen=True)
 class Projection:
-    """A linear map of joint rows, which may depend on the state.
+    """A linear map of joint torque rows to other rows, which may depend on the state.
 
     Attributes:
         labels, units: labels and units of the projected rows.
-        torques: function of q, v (N, n) that returns the map (N, rows, k) applied to the k joint rows of a regressor.
-        measured: function of q, v (N, n) that returns the map (N, rows, k) applied to the k measured torques; None:
-            `torques`.
+        torques: function of q, v (N, n) that returns the map (N, rows, k) for the k joint rows of a regressor.
+        measured: function of q, v (N, n) that returns the map (N, rows, k) for the k measured torques; None: `torques`.
     """
 
     labels: tuple[str, ...]
@@ -70,7 +71,7 @@ class TorqueRows:
         blocks: blocks of rows, each with one row per joint.
         drives: names of the standard drive terms of a joint that these rows can identify
             (`calib.dynamics.drives.standard`).
-        projection: a map of the blocks' rows; None: the blocks themselves.
+        projection: linear map applied to the rows of the blocks; None: the rows are those of the blocks.
     """
 
     name: str
@@ -80,32 +81,32 @@ class TorqueRows:
 
     @property
     def sides(self) -> frozenset[str]:
-        """Sides of the columns that affect any row: ``bodies``, ``link``, ``motor``."""
+        """Kinds of columns that affect any row: ``bodies``, ``link``, ``motor``."""
         return frozenset().union(*(block.sides for block in self.blocks))
 
     @property
     def has_bodies(self) -> bool:
-        """Whether the rows have columns of the bodies' parameters."""
+        """Whether the rows depend on the parameters of the bodies."""
         return BODIES in self.sides
 
     @property
     def sensed(self) -> bool:
-        """Whether torques of sensors on the link side of the gears are needed."""
+        """Whether the rows need torques of sensors on the link side of the gears."""
         return any(block.sensor for block in self.blocks)
 
     @property
     def driven(self) -> bool:
-        """Whether the motors' torques are needed."""
+        """Whether the rows need the motors' torques."""
         return any(block.motor for block in self.blocks)
 
     @property
     def motors_alone(self) -> bool:
-        """Whether the rows are the motor torques only, one per joint."""
+        """Whether the rows are exactly the motor torques, one per joint."""
         return self.projection is None and self.with_motors and len(self.blocks) == 1
 
     @property
     def with_motors(self) -> bool:
-        """Whether the last rows are the complete motor torques, one per joint."""
+        """Whether the last n rows are the complete motor torques (bodies and all drive terms), one per joint."""
         block = self.blocks[-1]
         return self.projection is None and block.motor == 1.0 and block.sensor == 0.0 and BODIES in block.sides
 
@@ -116,41 +117,54 @@ class TorqueRows:
         return n * len(self.blocks)
 
     def of_side(self, side: str, joint: int, n: int) -> list[int]:
-        """Return the rows affected by a drive term of one of n joints, on the ``link`` or ``motor`` side."""
+        """Return the indices of the rows that a drive term of `joint` affects.
+
+        Args:
+            side: ``link`` or ``motor`` side of the term.
+            joint: joint, from 0.
+            n: number of joints.
+        """
         return [k * n + joint for k, block in enumerate(self.blocks) if side in block.sides]
 
     def labels(self, joints: Sequence[str]) -> tuple[str, ...]:
-        """Return the labels of the rows in tables, given the joint labels."""
+        """Return the labels of the rows for tables, from the labels of the joints."""
         if self.projection is not None:
             return self.projection.labels
         return tuple(block.prefix + joint for block in self.blocks for joint in joints)
 
     def numbered(self, n: int) -> tuple[str, ...]:
-        """Return the labels of the rows for joints numbered 1 to n."""
+        """Return the labels of the rows for joints that are numbered 1 to n."""
         return self.labels([str(number) for number in range(1, n + 1)])
 
     def titles(self, joints: Sequence[str]) -> tuple[str, ...]:
-        """Return the full names of the rows, given the joint names."""
+        """Return the full names of the rows, from the names of the joints."""
         if self.projection is not None:
             return self.projection.labels
         return tuple(joint + block.suffix for block in self.blocks for joint in joints)
 
     def units(self, prismatic: Sequence[bool]) -> tuple[str, ...]:
-        """Return the unit of each row, N m or N."""
+        """Return the unit of each row: N m or N, or the projection's units.
+
+        Args:
+            prismatic: (n,) whether each joint is prismatic.
+        """
         if self.projection is not None:
             return self.projection.units
         joint_units = ["N" if linear else "N m" for linear in prismatic]
         return tuple(joint_units * len(self.blocks))
 
     def of_joints(self, mask: np.ndarray) -> np.ndarray:
-        """Return flags of rows (N, rows) from flags of joints (N, n); projected rows: where all joints are flagged."""
+        """Return flags of rows (N, rows) from `mask`, flags of joints (N, n).
+
+        A projected row is flagged if all joints are.
+        """
         if self.projection is not None:
             of_sample = mask.all(axis=1, keepdims=True)
             return np.repeat(of_sample, len(self.projection.labels), axis=1)
         return np.tile(mask, (1, len(self.blocks)))
 
     def observe(self, torques: np.ndarray, sides: Sequence[str], q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the rows (N, rows, p) for columns of joint torques (N, n, p), in the columns' memory order.
+        """Return the torque rows (N, rows, p) for columns of joint torques (N, n, p), with the columns' memory order.
 
         Args:
             torques: regressor of the n joint torques, or joint torques themselves as columns.
@@ -165,9 +179,13 @@ class TorqueRows:
         return self.observe_in_place(columns, sides, q, v)
 
     def observe_in_place(self, columns: np.ndarray, sides: Sequence[str], q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the rows, as `observe`, from columns (p, n per block, N): torques in the first n rows, zero in others.
+        """Return the torque rows (N, rows, p) as `observe` does, but overwrite the columns, which saves a copy.
 
-        The columns are overwritten, to avoid a copy of a large regressor.
+        Args:
+            columns: (p, n per block, N) regressor columns: joint torques in the first n rows, zero in the rows of other
+                blocks.
+            sides: (p,) side of each column: ``bodies``, ``link`` or ``motor``.
+            q, v: (N, n) the motion [rad or m, and per s].
         """
         n = columns.shape[1] // len(self.blocks)
         # Backwards: the first block holds the joint torques that the others copy.
@@ -183,19 +201,25 @@ class TorqueRows:
         return self._projected(columns.transpose(2, 1, 0), q, v)
 
     def _projected(self, torques: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return rows of the blocks (N, rows, p), projected where there is a projection."""
+        """Return the rows of the blocks `torques` (N, k, p), multiplied by the projection at q, v (N, n), if any."""
         if self.projection is None:
             return torques
         return self.projection.torques(q, v) @ torques
 
     def fold(self, weights: np.ndarray, sides: Sequence[str]) -> np.ndarray:
-        """Return the adjoint of `observe`: weights of rows (N, rows, p) turned into weights of joint torques (N, n, p).
+        """Return weights of joint torques (N, n, p) from weights of rows (N, rows, p): the adjoint map of `observe`.
+
+        Args:
+            weights: (N, rows, p) weight of each entry of the rows.
+            sides: (p,) side of each column: ``bodies``, ``link`` or ``motor``.
 
         Raises:
-            CalibError: for rows with a projection, whose derivative with respect to the state would be missing.
+            CalibError: for rows with a projection, whose derivative with respect to the state is not implemented.
         """
         if self.projection is not None:
-            raise CalibError(f"rows '{self.name}' use a projection that depends on the state: no derivatives")
+            raise CalibError(
+                f"rows '{self.name}' use a projection that depends on the state and have no derivatives: use other rows"
+            )
         acting = []
         for block in self.blocks:
             acts = [side in block.sides for side in sides]
@@ -214,6 +238,9 @@ class TorqueRows:
             motor: (N, n) the motors' torques [N m or N].
             sensor: (N, n) torques of sensors on the link side of the gears; None without sensors.
             q, v: (N, n) the motion [rad or m, and per s].
+
+        Raises:
+            CalibError: if the rows need sensor torques and there are none.
         """
         if sensor is None and self.sensed:
             raise CalibError(f"rows '{self.name}' need torques of sensors behind the gears")
@@ -232,7 +259,10 @@ class TorqueRows:
         return np.einsum("nrk,nk->nr", projection(q, v), stacked)
 
     def repeated(self, n: int) -> np.ndarray:
-        """Return for each row (rows,) the index of a row with the same non-zero entries, otherwise its own index."""
+        """Return for each row (rows,) the index of a row from which its entries can be copied, or its own index.
+
+        For several blocks it is the joint's row in the last block; a copied entry is one that both rows have.
+        """
         rows = np.arange(self.count(n))
         if self.projection is not None:
             return rows
@@ -240,7 +270,13 @@ class TorqueRows:
 
 
 def projected(name: str, projection: Projection, of: TorqueRows | None = None) -> TorqueRows:
-    """Return torque rows that project other rows (`of`; None: the motors') onto fewer coordinates."""
+    """Return torque rows that project other rows onto fewer coordinates.
+
+    Args:
+        name: name of the new rows in options and files.
+        projection: the linear map.
+        of: rows that are projected; None: the motor torques.
+    """
     return replace(of or MOTOR, name=name, projection=projection)
 
 
@@ -248,7 +284,7 @@ def torque_rows(name: str) -> TorqueRows:
     """Return the torque rows with this name in options and files.
 
     Raises:
-        CalibError: for a name that is not in `ROWS`.
+        CalibError: for a name that is not a key of `ROWS`.
     """
     one_of(name, ROWS, "model kind")
     return ROWS[name]
@@ -272,7 +308,7 @@ MODELS = {1: LINK, 2: BOTH, 3: DRIVE}
 
 
 def _power_of(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return the map (N, 1, n) from joint torques to their power."""
+    """Return the map (N, 1, n) from joint torques to their power, for velocities v (N, n)."""
     return v[:, None, :]
 
 

@@ -1,4 +1,4 @@
-"""Linearly independent columns of an observation matrix, for geometry and dynamics."""
+"""Choice of linearly independent columns of an observation matrix W, for geometry and dynamics."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,15 +16,15 @@ TIE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ColumnSplit:
-    """Columns of W split into independent ones and those that depend on them.
+    """Columns of an observation matrix W (rows, p), split into independent columns and linear combinations of them.
 
     Attributes:
-        kept: (b,) indices of the base columns, in W's order.
-        dropped: (p - b,) indices of the other columns, including those without effect.
+        kept: (b,) indices of the independent (base) columns, ascending.
+        dropped: (p - b,) indices of all other columns, including columns that are zero.
         without_effect: indices of the columns that are zero.
         coefficients: (b, p - b) with ``W[:, dropped] = W[:, kept] @ coefficients`` up to the tolerance.
         singular_values: (p,) singular values of W with its non-zero columns scaled to unit norm, descending.
-        tolerance: norm below which the independent part of a scaled column counts as zero.
+        tolerance: norm below which the independent part of a unit-norm column counts as zero.
     """
 
     kept: np.ndarray
@@ -50,17 +50,18 @@ class ColumnSplit:
 def split_columns(
     matrix: np.ndarray, groups: Sequence[np.ndarray] | None = None, tolerance: float = 1e-6
 ) -> ColumnSplit:
-    """Return a choice of independent columns of W by pivoted QR, groups of columns in order of preference.
+    """Return a choice of independent columns of W by pivoted QR, preferring the columns of the first groups.
 
-    Within a group the columns enter by pivoted QR (Gautier 1991), the earlier of two equivalent ones (so that rounding
-    does not decide); a later group only adds columns independent of the earlier groups. Columns are scaled to unit norm
-    first, except those of negligible norm, which have no effect (scaling a column of 1e-17 would turn rounding into
-    information).
+    Groups are processed in turn. Within a group, pivoted QR chooses the columns (Gautier 1991); of two nearly
+    equivalent columns the earlier is chosen, so that rounding does not decide. A later group adds only columns that are
+    independent of the earlier groups. All columns are first scaled to unit norm, except columns of negligible norm,
+    which count as zero (scaling a column of norm 1e-17 would turn rounding into information).
 
     Args:
-        matrix: (rows, p) W, whitened or in one unit; only its R factor is used.
-        groups: arrays of column indices, most preferred first; columns in no group come last. None: one group.
-        tolerance: see `ColumnSplit`.
+        matrix: observation matrix W (rows, p), its rows divided by their standard deviations or all in one unit.
+        groups: arrays of column indices, one per group, most preferred group first; columns in no group form a last
+            group. None: one group of all columns.
+        tolerance: norm below which the independent part of a unit-norm column counts as zero.
     """
     p = matrix.shape[1]
     factor = np.asarray(matrix, dtype=float)
@@ -89,7 +90,12 @@ def split_columns(
 
 
 def _with_all_columns(groups: Sequence[np.ndarray] | None, p: int) -> list[np.ndarray]:
-    """Return the groups with the columns in no group appended."""
+    """Return the groups of column indices, with a last group of all columns 0 … p - 1 that are in no group.
+
+    Args:
+        groups: arrays of column indices, most preferred first; None: no groups.
+        p: number of columns.
+    """
     result: list[np.ndarray] = []
     remaining = np.arange(p)
     if groups is None:
@@ -103,7 +109,14 @@ def _with_all_columns(groups: Sequence[np.ndarray] | None, p: int) -> list[np.nd
 
 
 def _independent(scaled: np.ndarray, groups: list[np.ndarray], silent: np.ndarray, tolerance: float) -> np.ndarray:
-    """Return the sorted indices of independent columns, chosen group by group."""
+    """Return the sorted indices of independent columns, chosen group by group.
+
+    Args:
+        scaled: (rows, p) the matrix to split, with columns of unit norm or zero.
+        groups: arrays of column indices, most preferred first.
+        silent: indices of the zero columns, which are never chosen.
+        tolerance: norm below which the independent part of a column counts as zero.
+    """
     basis = np.zeros((scaled.shape[0], 0))
     independent: list[int] = []
     for group in groups:

@@ -1,4 +1,4 @@
-"""Cone programs: least squares under linear constraints and positive semidefinite matrices, solved by Clarabel."""
+"""Cone programs solved by Clarabel: least squares under linear constraints and semidefinite matrix constraints."""
 
 # pyright: reportAttributeAccessIssue=false
 # clarabel is a compiled extension without stubs
@@ -29,9 +29,13 @@ MAX_MOVE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ConeOptimum:
-    """Optimum b (p,) of a cone program, with multipliers of its rows (c,), matrices (k, n, n) and equalities (e,).
+    """Optimum of a cone program with the Lagrange multipliers of its constraints.
 
     Attributes:
+        values: (p,) optimal unknowns b.
+        rows: (c,) multipliers of the linear inequalities, >= 0.
+        matrices: (k, n, n) multipliers of the semidefinite constraints, symmetric.
+        equalities: (e,) multipliers of the linear equalities.
         sets: multipliers (k,) of each convex set's rows.
     """
 
@@ -53,20 +57,20 @@ def minimise(
     equality_values: np.ndarray | None = None,
     sets: Sequence[ConvexSet] = (),
 ) -> ConeOptimum:
-    """Minimise ½ ‖R b - z‖² under A b + c >= 0, E b = d, M_k(b) ⪰ λ 1 and b in convex sets; no squares are formed.
+    """Minimise ½ ‖R b - z‖² over b (p,) subject to A b + c >= 0, E b = d, M_k(b) ⪰ λ_k 1 and b in convex sets.
 
-    t = R b - z is added to the unknowns.
+    RᵀR is never formed: t = R b - z is added to the unknowns of the program.
 
     Args:
-        upper, target: R (m, p), z (m,), scaled to order one.
-        rows, offset: A (c, p), c (c,).
-        matrices: (k, n, n, p) coefficients A_kj of M_k = Σ_j A_kj b_j.
-        least: λ, one number or (k,).
-        equality_rows, equality_values: E (e, p), d (e,); None without equalities.
+        upper, target: R (m, p) and z (m,), scaled to order one.
+        rows, offset: A (c, p) and c (c,).
+        matrices: (k, n, n, p) coefficients A_kj of M_k(b) = Σ_j A_kj b_j.
+        least: lower bound λ of the eigenvalues of the M_k, one number or (k,).
+        equality_rows, equality_values: E (e, p) and d (e,); None without equalities.
         sets: convex sets of b.
 
     Raises:
-        NotConverged: where no point satisfies all constraints.
+        NotConverged: if no b satisfies all constraints, or Clarabel finds no optimum.
     """
     import clarabel
     from scipy import sparse
@@ -110,10 +114,16 @@ def minimise(
         if solution is not None and str(solution.status) in FINAL:
             break
     if solution is None:
-        raise NotConverged("the constraints are not solvable to any accuracy: Clarabel's eigenvalues do not converge")
+        raise NotConverged(
+            "the constraints are not solvable to any accuracy: Clarabel's eigenvalues do not converge; relax or "
+            "remove constraints"
+        )
     values = np.array(solution.x)[:p]
     if str(solution.status) not in OPTIMAL:
-        raise NotConverged(f"the constraints may contradict each other: Clarabel reports {solution.status}", values)
+        raise NotConverged(
+            f"the constraints may contradict each other: Clarabel reports {solution.status}; relax or remove some",
+            values,
+        )
     dual = np.array(solution.z)
     matrix_multipliers = np.zeros((size, n, n))
     matrix_multipliers[:, i, j] = dual[end_of_rows:end_of_matrices].reshape(size, len(i)) / weight
@@ -129,9 +139,9 @@ def minimise(
 
 
 def _solved(solver: "clarabel.DefaultSolver") -> "clarabel.DefaultSolution | None":
-    """Return Clarabel's solution; None where it panics, as an eigenvalue computation of LAPACK breaks down.
+    """Return the solution found by Clarabel's `solver`; None if Clarabel panics as an eigenvalue computation fails.
 
-    Whether this happens at an extreme step depends on the processor's kernels of LAPACK.
+    Whether LAPACK's eigenvalue computation fails depends on the processor, since LAPACK's kernels differ.
     """
     try:
         return solver.solve()
@@ -143,14 +153,14 @@ def _solved(solver: "clarabel.DefaultSolver") -> "clarabel.DefaultSolution | Non
 
 
 def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Return the estimate under A b = d from the unconstrained estimate b_f.
+    """Return the least-squares estimate under the equalities A b = d, computed from the unconstrained estimate b_f.
 
         b_f - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ (A b_f - d),    Q = RᵀR
 
-    (Gouriéroux & Monfort 1995, section 10.3); under inequalities with A and d of the binding ones.
+    (Gouriéroux & Monfort 1995, section 10.3). For inequalities, A and d are the rows of the binding ones.
 
     Args:
-        factor: (p + 1, p + 1) triangle [R z; 0 ρ].
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem min ‖R b - z‖².
         free: (p,) unconstrained estimate b_f.
         normals: A (k, p), of full rank.
         sides: d (k,).
@@ -165,14 +175,19 @@ def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, sides: 
 
 
 def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return argmin ‖R x - z‖² (p,) under A x >= 0, exact on the rows that Clarabel finds binding.
+    """Return argmin ‖R x - z‖² (p,) subject to A x >= 0.
 
-    Where this is degenerate (a multiplier would change its sign, or another row be violated), Clarabel's solution is
-    returned as it is.
+    Clarabel finds which rows of A bind; x is then computed from the equalities A x = 0 of these rows, without
+    Clarabel's tolerance. If that point is not optimal (a multiplier is negative, another row is violated, or the point
+    is far from Clarabel's), Clarabel's solution is returned.
 
     Args:
-        factor: (p + 1, p + 1) triangle [R z; 0 ρ], R of full rank.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of a least-squares problem, with R of full rank; ρ is not used.
         rows: A (c, p); a row with a single non-zero entry is satisfied exactly.
+
+    Raises:
+        Unidentifiable: if R is singular.
+        NotConverged: if Clarabel finds no optimum.
     """
     p = len(factor) - 1
     norms = np.linalg.norm(factor[:p, :p], axis=0)

@@ -1,4 +1,4 @@
-"""Elimination of base parameters down to essential ones: drop parameters that the data do not identify, one by one."""
+"""Elimination from base to essential parameters: parameters that the data do not identify are dropped one by one."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,8 +16,9 @@ from calib.records import Number
 class Rule(Enum):
     """Criterion that ends the elimination.
 
-    RSD rests on a ratio: with one parameter known to 0.01 % it drops others known to 1 %. F keeps every significant
-    parameter, however small its effect. BOTH drops only parameters that both criteria would drop.
+    RSD compares relative standard deviations: if one parameter is known to 0.01 %, RSD drops others known to 1 %. F
+    keeps every statistically significant parameter, however small its effect. BOTH drops only parameters that both
+    criteria would drop.
     """
 
     RSD = "rsd"
@@ -27,16 +28,17 @@ class Rule(Enum):
 
 @dataclass(frozen=True)
 class EliminationStep:
-    """One step of the elimination: a dropped parameter.
+    """One step of the elimination, in which one parameter is dropped.
 
     Attributes:
         name: name of the dropped parameter.
-        rsd: its relative standard deviation before it was dropped [%]; infinite for a value of zero.
-        ratio: largest over smallest RSD of all parameters before it was dropped.
-        f, p: statistic F = (x / σ)² of dropping the parameter, and the probability of a larger F if it is truly zero.
-        p_total: the same probability for all parameters dropped so far, tested together against the base model.
-        residual_std: standard deviation of the weighted residuals after it was dropped.
-        listed: whether it was dropped because it was on the drop list.
+        rsd: relative standard deviation of this parameter before it was dropped [%]; infinite for a value of zero.
+        ratio: largest over smallest RSD of all parameters before this step.
+        f, p: statistic F = (x / σ)² of this parameter, and the probability of a larger F if its true value is zero.
+        p_total: probability of a larger F in the joint test that all parameters dropped so far are zero in the base
+            model.
+        residual_std: standard deviation of the weighted residuals after this step.
+        listed: whether the caller's list `drop` contains this parameter.
     """
 
     name: str
@@ -54,10 +56,10 @@ class Elimination:
     """Result of the elimination from base to essential parameters.
 
     Attributes:
-        base, essential: the fit before and after the elimination, with the same weights of rows.
+        base, essential: the fits before and after the elimination, both with the same row weights.
         kept: (b_e,) indices of the essential columns.
-        steps: dropped parameters, in order.
-        refused: the rejected step that ended the elimination; None if all candidates were dropped.
+        steps: the steps that were made, in order.
+        refused: the step that the rule rejected, which ended the elimination; None if all candidates were dropped.
     """
 
     base: LinearFit
@@ -78,24 +80,30 @@ def eliminate(
     std: np.ndarray | None = None,
     inflation: np.ndarray | None = None,
 ) -> Elimination:
-    """Return the elimination: repeatedly drop the parameter with the largest RSD and re-estimate, until the rule stops.
+    """Return the elimination: drop the parameter with the largest RSD and re-estimate, until the rule stops.
 
-    RSD rule: stop when max RSD / min RSD < r_σ (Kolyubin et al. 2019; Jubien, Gautier & Janot 2014: r_σ in 10 … 30). F
-    rule: stop when dropping the next parameter is refuted, by F = x² / σ² ~ F(1, r - b_e), or dropping all of them
-    together, by F = [(RSS_ess - RSS_base) / (b - b_e)] / [RSS_base / (r - b)]; both are computed as Wald statistics
-    from the covariance, which gives the same number and respects `inflation`. Testing both is our choice: the total
-    alone lets one strong parameter hide among many that are zero.
+    The RSD rule stops when max RSD / min RSD < r_σ (Kolyubin et al. 2019; Jubien, Gautier & Janot 2014: r_σ in 10 …
+    30). The F rule stops when one of two hypotheses is rejected: that the next parameter is zero, by F = x² / σ² ~ F(1,
+    r - b_e), or that all dropped parameters are zero, by F = [(RSS_ess - RSS_base) / (b - b_e)] / [RSS_base / (r - b)].
+    Both are computed as Wald statistics from the covariance, which gives equal numbers without inflation and accounts
+    for `inflation`. Making both tests is our choice: in the joint test alone, one significant parameter may be masked
+    by many that are zero.
 
     Args:
-        data: triangles of the base columns.
-        rule: see `Rule`.
-        ratio: r_σ.
-        level: probability of keeping a parameter that is zero, per step.
+        data: R factors of the columns of the b base parameters, in g groups of rows.
+        rule: criterion that ends the elimination.
+        ratio: r_σ, the largest over the smallest RSD (relative standard deviation) at which the RSD rule stops.
+        level: significance level of each test, i.e. the probability of keeping a parameter that is zero.
         keep: names of parameters that are never dropped.
-        drop: names of parameters dropped first, whatever the rule.
-        std: (g,) standard deviations of the groups; None: `settled_std` of the base model, then constant.
-        inflation: (g,) variance inflation, see `linear`; without it too many parameters are kept for autocorrelated
-            residuals.
+        drop: names of parameters that are dropped first, whatever the rule.
+        std: (g,) noise standard deviations of the groups of rows, in units of y; None: `settled_std` of the base model.
+            They remain constant during the elimination.
+        inflation: (g,) variance inflation of autocorrelated residuals (module `linear`); without it too many parameters
+            are kept.
+
+    Raises:
+        CalibError: for an unknown name in `keep` or `drop`, or a name in both.
+        Unidentifiable: if `drop` names all parameters.
     """
     _check_lists(data.names, keep, drop)
     if std is None:
@@ -124,9 +132,14 @@ def eliminate(
 
 
 def nested_test(base: LinearFit, dropped: Sequence[int]) -> tuple[float, float]:
-    """Return F and its p-value for the hypothesis that the parameters with these indices are all zero.
+    """Return the F statistic and its p-value for the hypothesis that the parameters at indices `dropped` are zero.
 
-    F equals that of the test of the two residual sums of squares; it uses the residual variance of the base fit.
+    F is the Wald statistic with the residual variance of the base fit. It equals the F statistic of the two residual
+    sums of squares (with and without these parameters).
+
+    Args:
+        base: fit of all base parameters.
+        dropped: indices of the parameters that are tested jointly.
     """
     values = base.estimate.values[list(dropped)]
     covariance = base.estimate.covariance[np.ix_(dropped, dropped)] * base.estimate.residual_std**2
@@ -140,7 +153,16 @@ def nested_test(base: LinearFit, dropped: Sequence[int]) -> tuple[float, float]:
 def _step(
     base: LinearFit, current: LinearFit, smaller: LinearFit, worst: int, dropped: list[int], listed: bool
 ) -> EliminationStep:
-    """Return the step from the current to a smaller model; `dropped`: indices in the base model of all dropped ones."""
+    """Return the elimination step from the fit `current` to the fit `smaller`, which has one parameter less.
+
+    Args:
+        base: fit of all base parameters.
+        current: fit before the step.
+        smaller: fit after the step.
+        worst: index of the dropped parameter in `current`.
+        dropped: indices in `base` of all parameters dropped so far, including this one.
+        listed: whether the caller's list of parameters to drop contains this parameter.
+    """
     rsd = current.estimate.rsd
     ratio = np.inf
     if rsd.min() > 0.0:
@@ -160,7 +182,14 @@ def _step(
 
 
 def _next(current: LinearFit, keep: Sequence[str], drop: Sequence[str]) -> int | None:
-    """Return the index of the next parameter to drop: listed ones first, then the largest RSD."""
+    """Return the index of the next parameter to drop, None if no candidate remains.
+
+    Args:
+        current: fit of the parameters that remain.
+        keep: names of parameters that are never dropped.
+        drop: names of parameters that are dropped first; of those not in `keep`, and of several in `drop`, the one with
+            the largest RSD (relative standard deviation) is next.
+    """
     names = current.estimate.names
     rsd = current.estimate.rsd
     candidates = [k for k, name in enumerate(names) if name in drop]
@@ -172,7 +201,14 @@ def _next(current: LinearFit, keep: Sequence[str], drop: Sequence[str]) -> int |
 
 
 def _refused(step: EliminationStep, rule: Rule, ratio: float, level: float) -> bool:
-    """Return whether the rule ends the elimination before this step."""
+    """Return whether the rule rejects this step and so ends the elimination.
+
+    Args:
+        step: the step to judge.
+        rule: criterion that ends the elimination.
+        ratio: largest over smallest RSD (relative standard deviation) below which the RSD rule rejects the step.
+        level: significance level of both F tests; a smaller p-value rejects the step.
+    """
     even = step.ratio < ratio
     significant = step.p < level or step.p_total < level
     if rule is Rule.RSD:
@@ -186,5 +222,10 @@ def _check_lists(names: Sequence[str], keep: Sequence[str], drop: Sequence[str])
     unknown = [name for name in (*keep, *drop) if name not in names]
     require(not unknown, f"keep or drop: unknown {', '.join(unknown)}; the parameters are {', '.join(names)}")
     both = [name for name in keep if name in drop]
-    require(not both, f"{', '.join(both)} cannot be both kept and dropped")
-    require(len(set(drop)) < len(names), "all parameters are dropped: no model remains", Unidentifiable, drop)
+    require(not both, f"{', '.join(both)} cannot be both kept and dropped: remove them from keep or drop")
+    require(
+        len(set(drop)) < len(names),
+        "all parameters are dropped, so that no model remains: drop fewer",
+        Unidentifiable,
+        drop,
+    )

@@ -1,4 +1,4 @@
-"""Result of an estimation: values with their covariance."""
+"""Result of an estimation: parameter values with their covariance."""
 
 from dataclasses import dataclass
 
@@ -9,14 +9,14 @@ from calib.records import Frozen
 
 @dataclass(frozen=True, eq=False)
 class Estimate(Frozen):
-    """Estimates of p parameters with covariance.
+    """Estimates of p parameters with their covariance.
 
     Attributes:
         names, units: p strings each.
-        values: (p,) values in these units.
+        values: (p,) values, in `units`.
         covariance: (p, p) covariance of the values.
-        residual_std: standard deviation of the whitened residuals (1 where the stated sigmas explain the residuals).
-        dof: degrees of freedom, rows minus parameters.
+        residual_std: standard deviation of the residuals divided by their stated sigmas; 1 if these sigmas are correct.
+        dof: degrees of freedom, number of rows minus number of parameters.
     """
 
     names: tuple[str, ...]
@@ -28,7 +28,7 @@ class Estimate(Frozen):
 
     @property
     def sigma(self) -> np.ndarray:
-        """Standard deviations (p,)."""
+        """Standard deviations of the values (p,), in `units`."""
         return np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
 
     @property
@@ -51,7 +51,10 @@ class Estimate(Frozen):
 
 
 def whitened(values: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return [R z] (p, p + 1) with RᵀR = Σ⁻¹ and z = R x, of values x and covariance Σ; zero variances count as 1."""
+    """Return [R z] (p, p + 1) with RᵀR = Σ⁻¹ and z = R x, for values x (p,) with covariance Σ (p, p).
+
+    Then ‖R b - z‖² is the squared Mahalanobis distance of b from x. Variances of zero are replaced by 1.
+    """
     sigma = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     sigma = np.where(sigma > 0.0, sigma, 1.0)
     correlation = covariance / np.outer(sigma, sigma)

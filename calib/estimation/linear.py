@@ -1,10 +1,11 @@
-"""Least squares of y = W x + ρ from R factors of [W y]: ordinary, weighted per group, and with a prior.
+"""Least squares of y = W x + ρ from R factors of [W y]: ordinary, weighted per group of rows, and with a prior.
 
-Covariances are those of the stated model of the noise. Filtered and decimated residuals are not white, and a covariance
-that counts every row as independent is too small; `inflation` corrects the covariance: group g counts as rows_g /
-inflation_g rows. The inflation is the integrated autocorrelation 1 + 2 Σ ρ_k of the residuals (`whiteness.inflation`),
-or the sampling rate over twice the band that was kept. The correction is exact for columns that vary slowly against the
-residuals and cautious for other columns. The estimated values do not depend on it.
+Covariances are those of the stated noise model. Filtered and decimated residuals are autocorrelated, and a covariance
+that counts every row as independent is then too small. The variance inflation corrects it: group g counts as rows_g /
+inflation_g independent rows. Inflation is the integrated autocorrelation 1 + 2 Σ ρ_k of the residuals
+(`whiteness.inflation`), or the sampling rate over twice the filter's bandwidth. The correction is exact for columns
+that vary slowly compared with the residuals, and conservative for other columns. The estimated values do not depend on
+inflation.
 """
 
 from dataclasses import dataclass
@@ -26,13 +27,13 @@ MIN_STD = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class LinearFit(Frozen):
-    """Linear estimate with the residuals of groups and condition numbers.
+    """Linear least-squares estimate with residual standard deviations per group and condition numbers.
 
     Attributes:
         estimate: values, covariance, standard deviation of the weighted residuals, degrees of freedom.
         group_std: (g,) standard deviation of the residuals of each group, in units of y.
-        condition: condition number of W as solved (rows weighted, columns in their units).
-        condition_normalised: condition number of W with columns of unit norm.
+        condition: condition number of the weighted W, columns in the parameters' units.
+        condition_normalised: condition number of the weighted W with columns scaled to unit norm.
     """
 
     estimate: Estimate
@@ -42,27 +43,37 @@ class LinearFit(Frozen):
 
 
 def ols(data: Triangles, inflation: np.ndarray | None = None) -> LinearFit:
-    """Estimate x = argmin ‖y - W x‖² with covariance σ² (WᵀW)⁻¹, σ² = ‖ρ‖² / (r - p).
+    """Estimate x = argmin ‖y - W x‖² with covariance σ² (WᵀW)⁻¹, σ² = ‖ρ‖² / (r - p), by ordinary least squares.
 
-    The covariance holds where all groups have the same noise; otherwise use `wls`.
+    This covariance is correct if the noise of y has the same standard deviation in all groups of rows; otherwise use
+    `wls`.
 
     Args:
-        data: triangles of W and y.
-        inflation: (g,) >= 1, see the module; None: 1, every row is independent.
+        data: R factors of [W y], W (r, p) the observation matrix and y (r,) the measured values; ρ are the residuals.
+        inflation: (g,) variance inflation >= 1 of each group, explained in the module's docstring; None: every row is
+            independent.
+
+    Raises:
+        Unidentifiable: for dependent columns, or too few rows to estimate the residuals' variance.
     """
     return _fit(data, np.ones(data.groups), inflation, stated=False)
 
 
 def wls(data: Triangles, std: np.ndarray | None = None, inflation: np.ndarray | None = None) -> LinearFit:
-    """Estimate x = (Wᵀ R⁻¹ W)⁻¹ Wᵀ R⁻¹ y with R = diag(σ_g² I), covariance (Wᵀ R⁻¹ W)⁻¹.
+    """Estimate x = (Wᵀ R⁻¹ W)⁻¹ Wᵀ R⁻¹ y with R = diag(σ_g² I) and covariance (Wᵀ R⁻¹ W)⁻¹, by weighted least squares.
 
     Kolyubin et al. (2019), eq. 22 and 25; the RSD of eq. 26 is ``fit.estimate.rsd``.
 
     Args:
-        data: triangles of W and y, one group per standard deviation.
-        std: (g,) standard deviation of each group in units of y; `subsystem_std` is Kolyubin et al.'s choice. None:
-            `settled_std`.
-        inflation: (g,) >= 1, see the module; None: 1.
+        data: R factors of [W y], W (r, p) the observation matrix and y (r,) the measured values, with one group of rows
+            per standard deviation.
+        std: (g,) noise standard deviation σ_g of each group in units of y; None: `settled_std`. Kolyubin et al. use
+            `subsystem_std`.
+        inflation: (g,) variance inflation >= 1 of each group, explained in the module's docstring; None: every row is
+            independent.
+
+    Raises:
+        Unidentifiable: for dependent columns, or too few rows to estimate the residuals' variance.
     """
     if std is None:
         std = settled_std(data)
@@ -72,13 +83,18 @@ def wls(data: Triangles, std: np.ndarray | None = None, inflation: np.ndarray | 
 def ridge(data: Triangles, mean: np.ndarray, covariance: np.ndarray, std: np.ndarray | None = None) -> LinearFit:
     """Estimate x from the data and a prior x ~ N(mean, covariance), by QR of [R; L⁻¹] with L Lᵀ = covariance.
 
-    The result has the covariance of the posterior, and the condition number of data and prior together.
+    The covariance of the result is that of the posterior; its condition numbers are those of data and prior together.
 
     Args:
-        data: triangles of W and y.
+        data: R factors of [W y], W (r, p) the observation matrix and y (r,) the measured values.
         mean: (p,) prior mean.
-        covariance: (p, p) prior covariance; an infinite diagonal entry means no prior knowledge.
-        std: (g,) noise of each group in units of y; None: `settled_std` of the data, which must then determine x alone.
+        covariance: (p, p) prior covariance; an infinite diagonal entry means no prior knowledge of that parameter.
+        std: (g,) noise standard deviation of each group in units of y; None: `settled_std`, for which the data alone
+            must identify x.
+
+    Raises:
+        Unidentifiable: for columns that neither data nor prior determine, or too few rows to estimate the residuals'
+            variance.
     """
     p = data.parameters
     mean = shaped(mean, (p,), "prior mean")
@@ -97,9 +113,16 @@ def ridge(data: Triangles, mean: np.ndarray, covariance: np.ndarray, std: np.nda
 
 
 def subsystem_std(data: Triangles) -> np.ndarray:
-    """Return σ_g (g,) of each group fitted alone, σ_g² = ‖ρ_g‖² / (r_g - rank W_g).
+    """Return the residual standard deviation σ_g (g,) of each group fitted alone, σ_g² = ‖ρ_g‖² / (r_g - rank W_g).
 
     Kolyubin et al. (2019), after eq. 22.
+
+    Args:
+        data: R factors of [W y] (observation matrix and measured values), one group g with r_g rows per standard
+            deviation; ρ_g are the group's residuals in units of y.
+
+    Raises:
+        CalibError: for a group with no more rows than independent columns.
     """
     p = data.parameters
     result = np.empty(data.groups)
@@ -116,10 +139,20 @@ def subsystem_std(data: Triangles) -> np.ndarray:
 
 
 def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> np.ndarray:
-    """Return the converged σ_g (g,): σ_g² = ‖y_g - W_g x‖² / (r_g - h_g), x being the WLS estimate with these σ.
+    """Return the noise standard deviations σ_g (g,) of the groups at which weighted least squares is self-consistent.
 
-    h_g = ‖W_g R⁻¹‖² / σ_g² is the group's share of the p parameters; the fixed point is the restricted maximum
-    likelihood (Patterson & Thompson 1971). The iteration starts from `subsystem_std`.
+    At this fixed point σ_g² = ‖y_g - W_g x‖² / (r_g - h_g), where x is the WLS estimate with weights 1 / σ_g² and the
+    leverage h_g = ‖W_g R⁻¹‖² / σ_g² is the group's share of the p parameters. It is the restricted maximum likelihood
+    estimate (Patterson & Thompson 1971). The iteration starts from `subsystem_std`.
+
+    Args:
+        data: R factors of [W y], W (r, p) the observation matrix and y (r,) the measured values; a group g has r_g
+            rows.
+        tolerance: largest relative change of any σ_g at which the iteration ends.
+        limit: largest number of iterations.
+
+    Raises:
+        NotConverged: if the standard deviations still change after `limit` iterations.
     """
     std = subsystem_std(data)
     change = np.inf
@@ -139,7 +172,15 @@ def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> n
 
 
 def _fit(data: Triangles, std: np.ndarray, inflation: np.ndarray | None, stated: bool) -> LinearFit:
-    """Return fit with rows divided by std; `stated`: whether std is the noise itself or the noise up to a factor."""
+    """Return the weighted least-squares fit with the rows of group g divided by std[g].
+
+    Args:
+        data: R factors of [W y].
+        std: (g,) noise standard deviations of the groups of rows, in units of y.
+        inflation: (g,) variance inflation of each group; None: 1.
+        stated: whether `std` is the noise itself; if not, only its proportions are used and the residuals give the
+            scale of the covariance.
+    """
     values, inverse, conditions = solve_triangle(combine(data, std), data.names)
     covariance = inverse @ inverse.T
     tau = np.ones(data.groups)
@@ -165,7 +206,18 @@ def _pack(
     inverse: np.ndarray,
     conditions: tuple[float, float],
 ) -> LinearFit:
-    """Return the fit with the residuals' standard deviations; its degrees of freedom account for the inflation τ."""
+    """Return the fit with residual standard deviations and degrees of freedom, both corrected for variance inflation.
+
+    Args:
+        data: R factors of [W y].
+        values, covariance: (p,) estimate and its (p, p) covariance.
+        std, tau: (g,) noise standard deviation (in units of y) and variance inflation of each group of rows.
+        inverse: (p, p) R⁻¹ of the weighted W.
+        conditions: condition numbers of the weighted W, as it is and with unit-norm columns.
+
+    Raises:
+        Unidentifiable: if no degrees of freedom remain.
+    """
     squares = data.residual_squares(values)
     group_dof = data.rows - tau * leverage(data, std, inverse)
     dof = int(np.round(np.sum(group_dof / tau), 6))
@@ -190,13 +242,22 @@ def _pack(
 
 
 def leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Return the leverage h_g = ‖W_g R⁻¹‖² / σ_g² (g,) of each group; their sum is p."""
+    """Return the leverage h_g = ‖W_g R⁻¹‖² / σ_g² (g,) of each group; the leverages of all groups sum to p.
+
+    Args:
+        data: R factors of [W y], W_g being the rows of group g of the observation matrix W.
+        std: (g,) standard deviations σ_g of the groups, in units of y.
+        inverse: (p, p) R⁻¹ of the weighted W.
+    """
     whitened = data.factors[:, :, :-1] @ inverse
     return np.sum(whitened**2, axis=(1, 2)) / std**2
 
 
 def _floored(std: np.ndarray) -> np.ndarray:
-    """Return std (g,) with a floor relative to the largest one, so that weights of exact data remain finite."""
+    """Return standard deviations (g,) raised to at least `MIN_STD` times the largest, so that weights remain finite.
+
+    If all are zero (exact data), ones are returned.
+    """
     largest = std.max(initial=0.0)
     if largest > 0.0:
         return np.maximum(std, MIN_STD * largest)

@@ -1,8 +1,8 @@
 """Nonlinear least squares on whitened residuals: Gauss–Newton and Levenberg–Marquardt, solved by QR.
 
-The problem is stated by two functions, so that the unknowns may live on a manifold: ``linearise(state)``, the rows
-r = y - f(state) and W = ∂f/∂x reduced to a triangle (`reduced`), and ``retract(state, dx) -> state``. Robust losses
-enter as weights of the rows.
+Two functions define the problem, so that the unknowns may live on a manifold. ``linearise(state)`` returns the
+residuals r = y - f(state) and W = ∂f/∂x, reduced to a triangle (`reduced`). ``retract(state, dx)`` returns the state
+moved by dx. Robust losses are applied as row weights.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ Rows = tuple[np.ndarray, np.ndarray]
 
 
 class Status(Enum):
-    """Reason why an iteration ended; each value is a message with advice."""
+    """Reason why an iteration ended; the value of a member is its message with advice."""
 
     CONVERGED = "converged"
-    STALLED = "stalled: no damping gives a better step; the model is at its smallest residual or the Jacobian is wrong"
+    STALLED = "stalled: no damping gives a better step; the residual is at its minimum, or the Jacobian is wrong"
     ITERATIONS = "stopped at the iteration limit; start closer (better nominal values, fewer free parameters)"
 
     @property
@@ -52,11 +52,11 @@ class Solution(Generic[State]):
 
     Attributes:
         state: the estimate.
-        factor: (p, p) upper triangular R of W at the solution, ``inv(RᵀR)`` being the unscaled covariance.
-        cost: ‖r‖² at the solution.
-        history: ‖r‖ after each accepted step, the start first.
-        status: a `Status`.
-        iterations: linearisations made.
+        factor: (p, p) upper triangular R of W at the estimate; ``inv(RᵀR)`` is the unscaled covariance.
+        cost: ‖r‖² at the estimate.
+        history: ‖r‖ at the start and after each accepted step.
+        status: reason why the iteration ended.
+        iterations: number of linearisations.
     """
 
     state: State
@@ -69,12 +69,12 @@ class Solution(Generic[State]):
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """A least-squares problem min ‖r - W x‖ reduced to min ‖z - R x‖.
+    """Least-squares problem min ‖r - W x‖² reduced by QR to min ‖z - R x‖², which has the same solution.
 
     Attributes:
         factor: R (p, p), upper triangular.
         target: z (p,).
-        cost: ‖r‖².
+        cost: ‖r‖² of the whole residual, not ‖z‖².
         rows: number of rows of W.
     """
 
@@ -84,13 +84,21 @@ class Reduced:
     rows: int
 
     def extended(self, residual: np.ndarray, matrix: np.ndarray) -> Reduced:
-        """Return the problem with further residuals r (m,) and rows W (m, p)."""
+        """Return the problem extended by further residuals r (m,) and rows W (m, p).
+
+        Args:
+            residual: r (m,).
+            matrix: W (m, p), derivatives of the model by the parameters.
+        """
         stacked = triangle(np.concatenate([self.target, residual]), np.vstack([self.factor, matrix]))
         cost = self.cost + float(residual @ residual)
         return replace(stacked, cost=cost, rows=self.rows + len(residual))
 
     def moved(self, change: np.ndarray) -> Reduced:
-        """Return the problem with r + W dx in place of r, given `change` dx (p,)."""
+        """Return the problem with the residual r + W dx instead of r, for `change` dx (p,) of the parameters.
+
+        W are the rows of the problem, the derivatives of the model by the parameters.
+        """
         target = self.target + self.factor @ change
         cost = self.cost + float(target @ target - self.target @ self.target)
         return replace(self, target=target, cost=cost)
@@ -101,9 +109,11 @@ class Reduced:
 
 
 def triangle(residual: np.ndarray, matrix: np.ndarray) -> Reduced:
-    """Return the problem of r (rows,) and W (rows, p) reduced by one QR of [W r].
+    """Return the problem min ‖r - W x‖² of r (rows,) and W (rows, p), reduced by one QR of [W r].
 
-    If `matrix` is column-major, LAPACK needs a single copy.
+    Args:
+        residual: r (rows,), whitened.
+        matrix: W (rows, p); column-major order saves a copy.
     """
     p = matrix.shape[1]
     stacked = np.empty((len(residual), p + 1), order="F")
@@ -114,15 +124,16 @@ def triangle(residual: np.ndarray, matrix: np.ndarray) -> Reduced:
 
 
 def reduced(pieces: Callable[[], Iterable[Rows]], total: Gram | None = None) -> Reduced:
-    """Return the problem of many pieces of rows, reduced with the memory of one piece.
+    """Return the reduced problem of many pieces of rows, with the memory of one piece.
 
-    If W has up to `MOST_NUMBERS` entries, one QR is used. A larger one is reduced by Cholesky of WᵀW with columns
-    scaled to unit norm, which takes a quarter of the time but squares the condition number; if this exceeds
-    `MAX_CONDITION`, by QR, updated piece by piece.
+    If W has at most `MOST_NUMBERS` entries, one QR is used. A larger W is reduced by Cholesky of WᵀW with columns
+    scaled to unit norm, which takes a quarter of the time but squares the condition number. If the condition number
+    exceeds `MAX_CONDITION`, QR is used piece by piece.
 
     Args:
-        pieces: yields the rows, the same at every call.
-        total: sufficient statistics of all rows, where they are known already; None: computed where needed.
+        pieces: function that yields the problem in pieces (r, W), residuals (rows,) with their rows of W (rows, p);
+            each call yields the same pieces.
+        total: sufficient statistics WᵀW, Wᵀr, rᵀr of all rows, if they are already known; None: computed if needed.
     """
     if total is None:
         rows, total = _gathered(pieces())
@@ -139,7 +150,13 @@ def reduced(pieces: Callable[[], Iterable[Rows]], total: Gram | None = None) -> 
 
 
 def _gathered(pieces: Iterable[Rows]) -> tuple[list[Rows], Gram | None]:
-    """Return the pieces of rows and None; if W has more than `MOST_NUMBERS` entries, their statistics instead."""
+    """Return the list of all pieces and None, or an empty list and the sufficient statistics for a large W.
+
+    W is large if it has more than `MOST_NUMBERS` entries.
+
+    Args:
+        pieces: the problem in pieces (r, W), residuals (rows,) with their rows of W (rows, p).
+    """
     rows = list[Rows]()
     total = None
     for residual, matrix in pieces:
@@ -166,14 +183,22 @@ def _by_qr(pieces: Iterable[Rows]) -> Reduced:
 
 
 def _stacked(matrices: list[np.ndarray]) -> np.ndarray:
-    """Return matrices stacked vertically, column-major; a single matrix is returned as it is."""
+    """Return the matrices stacked vertically, in column-major order; a single matrix is returned unchanged."""
     if len(matrices) == 1:
         return matrices[0]
     return np.concatenate([matrix.T for matrix in matrices], axis=1).T
 
 
 def damped_step(factor: np.ndarray, target: np.ndarray, damping: float) -> np.ndarray:
-    """Solve [WᵀW + λ diag(WᵀW)] dx = Wᵀ r by QR of [R; sqrt(λ) D] (Kolyubin et al. 2019, eq. 12; λ = 0 is eq. 11)."""
+    """Return the step dx (p,) that solves [RᵀR + λ diag(RᵀR)] dx = Rᵀz, by QR of [R; sqrt(λ) D] with D² = diag(RᵀR).
+
+    Kolyubin et al. (2019), eq. 12; λ = 0 is eq. 11.
+
+    Args:
+        factor: R (p, p), upper triangular factor of the rows W = ∂f/∂x.
+        target: z (p,) = Qᵀr, the reduced residuals (`Reduced`).
+        damping: λ >= 0.
+    """
     p = len(target)
     stacked = np.zeros((p + 1, p + 1))
     stacked[:p, :p] = factor
@@ -195,22 +220,23 @@ def solve(
     tolerance: float = 1e-3,
     limit: int = 300,
 ) -> Solution[State]:
-    """Return the state that minimises ‖y - f(state)‖², by Levenberg–Marquardt with the paper's damping rule.
+    """Return the state that minimises ‖y - f(state)‖², by Levenberg–Marquardt (Kolyubin et al. 2019, after eq. 12).
 
-    A better step divides λ by ten, a worse one is rejected and multiplies it by ten (Kolyubin et al. 2019, after
-    eq. 12). ``damping=0`` is the iterative linear least squares of eq. 11: every step is taken.
+    After a step that reduces the cost, λ is divided by ten; another step is rejected, and λ is multiplied by ten.
+    ``damping=0`` is the iterative linear least squares of eq. 11, which accepts every step.
 
-    Converged (our choice): the next Gauss–Newton step is shorter than ``tolerance`` standard deviations of the
-    estimate, ‖Qᵀr‖ <= tolerance · ‖r‖ / sqrt(dof); or ‖r‖ has fallen to rounding, 1e-11 of where it started; or no step
-    improves any more, or the limit is reached, while the residuals' rms is below `EXACT_RMS` standard deviations, as
-    with computed (noise-free) measurements: directions that these do not determine cannot be followed further.
+    The iteration has converged (our choice) in any of three cases. The next Gauss–Newton step is shorter than
+    ``tolerance`` standard deviations of the estimate: ‖z‖ <= tolerance · ‖r‖ / sqrt(dof), with z = Qᵀr. Or ‖r‖ has
+    fallen to 1e-11 of its first value, which is rounding. Or no step reduces the cost any more, or the limit is
+    reached, while the rms residual is below `EXACT_RMS` standard deviations; this happens with computed (noise-free)
+    measurements, where poorly determined directions cannot be followed further.
 
     Args:
         linearise: function of a state that returns the whitened problem, reduced.
-        retract: function of a state and dx (p,) that returns the next state.
+        retract: function of a state and a step dx (p,) that returns the next state.
         start: the first state.
-        damping: first λ; 0 for eq. 11.
-        tolerance: length of the last step in standard deviations.
+        damping: first value of λ; 0 for eq. 11.
+        tolerance: length of the last step in standard deviations of the estimate.
         limit: largest number of linearisations.
     """
     state = start
@@ -244,10 +270,14 @@ def solve(
 
 
 def covariance(factor: np.ndarray, variance: float = 1.0) -> np.ndarray:
-    """Return variance · (RᵀR)⁻¹ (p, p).
+    """Return the covariance variance · (RᵀR)⁻¹ (p, p) from an upper triangular R (p, p).
+
+    Args:
+        factor: R (p, p), the triangular factor of the whitened W.
+        variance: variance of the whitened residuals.
 
     Raises:
-        LinAlgError: for an R with a zero on its diagonal.
+        LinAlgError: if R has a zero on its diagonal.
     """
     inverse, failed = dtrtri(factor)
     if failed:

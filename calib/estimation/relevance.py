@@ -1,5 +1,6 @@
-"""Ridge regression with one ridge per group of columns, each estimated from the data (automatic relevance
-determination).
+"""Ridge regression with a separate ridge per group of columns (automatic relevance determination).
+
+The ridge of a group is the prior precision of the group's parameters; the data determine each ridge.
 """
 
 from __future__ import annotations
@@ -25,7 +26,14 @@ MAX_PRIOR_WEIGHT = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Gram:
-    """Sufficient statistics of y = W x: WᵀW (p, p), Wᵀy (p,), yᵀy and the number of rows; those of parts add up."""
+    """Sufficient statistics of the least-squares problem y = W x; the statistics of two sets of rows can be added.
+
+    Attributes:
+        square: WᵀW (p, p).
+        cross: Wᵀy (p,).
+        total: yᵀy.
+        rows: number of rows of W.
+    """
 
     square: np.ndarray
     cross: np.ndarray
@@ -39,24 +47,25 @@ class Gram:
         return Gram(self.square - term.square, self.cross - term.cross, self.total - term.total, self.rows - term.rows)
 
     def scaled(self, factor: float) -> Gram:
-        """Return the statistics of rows multiplied by √factor."""
+        """Return the statistics after multiplication of W and y by √`factor`; the number of rows does not change."""
         return Gram(factor * self.square, factor * self.cross, factor * self.total, self.rows)
 
 
 def gram(residual: np.ndarray, matrix: np.ndarray) -> Gram:
-    """Return the sufficient statistics of residual (rows,) and W (rows, p)."""
+    """Return the sufficient statistics of y ≈ W x, with y = `residual` (rows,) and W = `matrix` (rows, p)."""
     return Gram(matrix.T @ matrix, matrix.T @ residual, float(residual @ residual), len(residual))
 
 
 @dataclass(frozen=True, eq=False)
 class Relevance:
-    """Result of the ridge regression: estimate, ridges and noise.
+    """Result of the ridge regression: parameter values, ridges and noise.
 
     Attributes:
-        values: (p,) estimate; zero where a group was switched off.
-        ridge: (p,) prior standard deviation of each column; infinite for those without a ridge, 0 where switched off.
-        effective: how many of the ridged parameters the data determine, Σ 1 - λ_i Σ_ii.
-        noise: standard deviation of the residuals, in units of the whitening.
+        values: (p,) estimate; zero for the columns of a group without evidence, which is switched off.
+        ridge: (p,) prior standard deviation of each parameter; infinite without a ridge, 0 in a group that is switched
+            off.
+        effective: effective number of ridged parameters that the data determine, Σ_i (1 - λ_i Σ_ii).
+        noise: standard deviation of the residuals; 1 if the rows' whitening is correct.
     """
 
     values: np.ndarray
@@ -67,17 +76,17 @@ class Relevance:
 
 @dataclass(frozen=True, eq=False)
 class Condensed:
-    """Coordinates z (r,), r ≤ p, that replace the columns x (p,) without loss of information on any group.
+    """Coordinates z (r,), r ≤ p, that replace the columns' parameters x (p,) without loss of information on any group.
 
-    Harmonics of a joint that moves by less than a turn are, to within rounding, linear combinations of fewer columns:
-    the evidence then costs r³ operations, not p³.
+    The harmonics of a joint that moves by less than a turn are, to within rounding, linear combinations of fewer
+    columns. In the coordinates z the evidence costs r³ operations instead of p³.
 
     Attributes:
         groups: (r,) group of each coordinate; -1 for no ridge.
         sizes: (r,) first guess of each coordinate's prior standard deviation, equal within a group.
         counts: (r,) number of columns of x that each coordinate replaces.
-        blocks: pairs of indices of columns of x and their matrix (columns, coordinates); None for unchanged columns.
-            The coordinates of the blocks are consecutive.
+        blocks: pairs of column indices of x and a matrix (columns, coordinates) that maps z to these x; the matrix is
+            None where z = x. The coordinates of consecutive blocks are consecutive in z.
     """
 
     groups: np.ndarray
@@ -86,7 +95,11 @@ class Condensed:
     blocks: tuple[tuple[np.ndarray, np.ndarray | None], ...]
 
     def columns(self, matrix: np.ndarray) -> np.ndarray:
-        """Return Wᵀ (r, ...) in the coordinates z from Wᵀ (p, ...) in the original ones."""
+        """Return Wᵀ (r, ...) in the coordinates z, from Wᵀ (p, ...) in the original parameters x.
+
+        Args:
+            matrix: (p, ...) Wᵀ, or any stack of columns with one entry per original parameter.
+        """
         flat = matrix.reshape(len(matrix), -1)
         parts = []
         for columns, basis in self.blocks:
@@ -97,7 +110,11 @@ class Condensed:
         return np.concatenate(parts).reshape(-1, *matrix.shape[1:])
 
     def gram(self, data: Gram) -> Gram:
-        """Return the sufficient statistics in the coordinates z."""
+        """Return the sufficient statistics in the coordinates z, from those in the original parameters x.
+
+        Args:
+            data: statistics of the p original parameters.
+        """
         half = self.columns(data.square)
         parts = []
         for columns, basis in self.blocks:
@@ -109,12 +126,13 @@ class Condensed:
 
 
 def condensed(square: Callable[[np.ndarray], np.ndarray], groups: np.ndarray, start: np.ndarray) -> Condensed:
-    """Return coordinates that replace p columns; within a group all have the same prior standard deviation.
+    """Return coordinates z that replace the p parameters; within a group all have the same prior standard deviation.
 
     Args:
-        square: function of indices of columns (k,) that returns their WᵀW (k, k), over all rows that will ever be used.
+        square: function of column indices (k,) that returns WᵀW (k, k) of these columns, over all rows of the problem.
         groups: (p,) group of each column; -1 for no ridge.
-        start: (p,) first guess of each column's prior standard deviation; ratios within a group are kept.
+        start: (p,) first guess of each parameter's prior standard deviation, in the parameter's unit; the ratios within
+            a group are kept.
     """
     numbers, number_of_column, members = np.unique(groups, return_inverse=True, return_counts=True)
     single = np.flatnonzero((groups < 0) | (members[number_of_column] == 1))
@@ -139,13 +157,13 @@ def condensed(square: Callable[[np.ndarray], np.ndarray], groups: np.ndarray, st
 
 @dataclass(frozen=True, eq=False)
 class _Elimination:
-    """Columns without a ridge, eliminated from the statistics; their values follow from those of the other columns.
+    """Columns without a ridge, eliminated from the sufficient statistics.
 
     Attributes:
         columns: (f,) indices of the eliminated columns.
-        root: (f, f) lower Cholesky factor of their WᵀW.
-        half: (f, p) root⁻¹ times their rows of WᵀW.
-        target: (f,) root⁻¹ times their Wᵀy.
+        root: (f, f) lower Cholesky factor of WᵀW of the eliminated columns.
+        half: (f, p) root⁻¹ times the eliminated columns' rows of WᵀW.
+        target: (f,) root⁻¹ times the eliminated columns' entries of Wᵀy.
     """
 
     columns: np.ndarray
@@ -155,14 +173,18 @@ class _Elimination:
 
     @classmethod
     def of(cls, data: Gram, columns: np.ndarray) -> _Elimination:
-        """Return the elimination of columns (f,) from sufficient statistics."""
+        """Return the elimination of the columns with indices `columns` (f,) from the statistics `data`."""
         root = _root(data.square[np.ix_(columns, columns)])
         half = solve_triangular(root, data.square[columns], lower=True)
         target = solve_triangular(root, data.cross[columns], lower=True)
         return cls(columns, root, half, target)
 
     def values(self, other_values: np.ndarray) -> np.ndarray:
-        """Return values (f,) of the eliminated columns from those of all others (p,), zero at the eliminated ones."""
+        """Return the eliminated columns' parameters (f,) for given values of all other parameters.
+
+        Args:
+            other_values: (p,) parameters, zero at the eliminated columns.
+        """
         return solve_triangular(self.root, self.target - self.half @ other_values, trans=1, lower=True)
 
 
@@ -174,21 +196,26 @@ def relevance(
     settled: float = 0.0,
     counts: np.ndarray | None = None,
 ) -> Relevance:
-    """Estimate x with prior x_g ~ N(0, 1/λ_g) per group, every λ and the noise at their most probable values.
+    """Return the estimate of x with a prior x_g ~ N(0, 1/λ_g) per group, with the most probable λ_g and noise.
 
-    MacKay's fixed point (1992; Tipping 2001, eq. 16–18): λ_g = γ_g / ‖x_g‖² with γ_g = Σ_{i in g} (1 - λ_g Σ_ii), and
-    β = (N - Σ γ - p_free) / ‖y - W x‖². Works on WᵀW, which the ridges keep well conditioned; columns without a ridge
-    must be independent.
+    x_g are the parameters of group g, Σ is the posterior covariance. MacKay's fixed point (1992; Tipping 2001, eq.
+    16–18) is λ_g = γ_g / ‖x_g‖² with γ_g = Σ_{i in g} (1 - λ_g Σ_ii), and the noise precision is β = (N - Σ γ - p_free)
+    / ‖y - W x‖², where p_free is the number of columns without a ridge. A group is switched off (its parameters become
+    zero) once its prior is `MAX_PRIOR_WEIGHT` times as precise as the data. The ridges keep WᵀW well conditioned;
+    columns without a ridge must be independent.
 
     Args:
-        data: statistics of all rows.
+        data: sufficient statistics WᵀW, Wᵀy, yᵀy of all N rows.
         groups: (p,) group of each column; -1 for no ridge.
-        start: (p,) first guess of each column's prior standard deviation, equal within a group (otherwise use
+        start: (p,) first guess of each parameter's prior standard deviation, equal within a group (otherwise use
             `condensed`); ignored for columns without a ridge.
         iterations: largest number of fixed-point iterations.
-        settled: the search ends when values change by less than this share of their standard deviations, rms
+        settled: the iteration ends when the rms change of the values is below this share of their standard deviations
             (`SETTLED`); 0: all iterations are made.
-        counts: (p,) number of original columns that each column replaces (`Condensed.counts`); None: one each.
+        counts: (p,) number of original columns that each column replaces (`Condensed.counts`); None: 1 each.
+
+    Raises:
+        Unidentifiable: if the regularised WᵀW cannot be factorised.
     """
     if counts is None:
         counts = np.ones(len(groups))
@@ -254,7 +281,13 @@ def relevance(
 def _posterior(
     square: np.ndarray, cross: np.ndarray, penalty: np.ndarray, beta: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the posterior mean (p,) and variances (p,) of x from WᵀW, Wᵀy, the penalty and the noise precision β."""
+    """Return the posterior mean (p,) and posterior variances (p,) of x.
+
+    Args:
+        square, cross: WᵀW (p, p) and Wᵀy (p,).
+        penalty: (p,) prior precision of each parameter.
+        beta: β, the inverse variance of y's noise.
+    """
     if not len(cross):
         return cross, cross
     # the variances need no more than the inverse of the root
@@ -266,8 +299,15 @@ def _posterior(
 def _root(square: np.ndarray, penalty: np.ndarray | float = 0.0) -> np.ndarray:
     """Return the lower Cholesky factor of WᵀW with a penalty added to its diagonal.
 
-    The diagonal is raised by 1e-12, or as much more as is needed to factorise: repeated rows leave columns that no two
-    poses distinguish.
+    The diagonal is raised by a relative 1e-12, or by the smallest larger power of ten with which the factorisation
+    succeeds: repeated rows may leave columns that no two poses distinguish.
+
+    Args:
+        square: WᵀW (p, p).
+        penalty: (p,) or one number, added to the diagonal.
+
+    Raises:
+        Unidentifiable: if the factorisation fails even with a doubled diagonal.
     """
     for raised in 10.0 ** np.arange(-12.0, 1.0, 2.0):
         system = square.copy()

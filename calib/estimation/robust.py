@@ -1,6 +1,6 @@
-"""Weights of robust losses for the residuals of single rows, and variances as weighted sums of known shapes.
+"""Weights of robust losses for the residuals of single rows, and variances estimated from squared errors.
 
-`variance_weights` estimates variances as a sum of known shapes with unknown non-negative weights.
+`variance_weights` estimates variances as a sum of known functions with unknown non-negative weights.
 """
 
 import numpy as np
@@ -20,14 +20,16 @@ def variance_weights(
 ) -> np.ndarray:
     """Return the most probable weights θ >= 0 (k,) of  e² ~ (shapes θ) · χ²,  by multiplicative updates.
 
-    Each update multiplies by the ratio of the two halves of the likelihood's gradient, so that all stay positive.
+    The variance of error e_i is modelled as the weighted sum Σ_k shapes_ik θ_k. Each update multiplies the weights by
+    the ratio of the positive and negative parts of the likelihood's gradient, so that they remain non-negative. A
+    squared error counts as at most `MAX_RATIO` times its variance, for robustness.
 
     Args:
         squares: (m,) squared errors.
-        shapes: (m, k) columns whose non-negative combination is the variance; not negative.
-        start: (k,) not negative; zeros stay zero.
+        shapes: (m, k) non-negative columns whose weighted sum is the variance.
+        start: (k,) non-negative first values of the weights θ; zeros remain zero.
         counts: (m,) number of errors that each squared error represents.
-        rounds: number of fixed-point updates; fewer suffice if `start` is from nearly the same errors.
+        rounds: number of updates; few suffice if `start` is the result for nearly equal errors.
     """
     weights = np.array(start, dtype=float)
     columns = np.ascontiguousarray(shapes.T)
@@ -40,15 +42,18 @@ def variance_weights(
 
 
 def weights(size: np.ndarray, loss: str, scale: float | None = None) -> np.ndarray:
-    """Return IRLS weights w(s) for residual sizes s in units of sigma.
+    """Return the weights w(s) of iteratively reweighted least squares (IRLS) for residual sizes s in units of sigma.
 
-    Huber (1964): 1 for s <= k, else k / s, k = 1.345; Cauchy: 1 / (1 + (s / c)²), c = 2.385 (both 95 % efficient on
-    normal residuals; Holland & Welsch 1977).
+    Huber (1964): w = 1 for s <= k, else k / s, with k = 1.345. Cauchy: w = 1 / (1 + (s / c)²) with c = 2.385. Both are
+    95 % efficient on normal residuals (Holland & Welsch 1977).
 
     Args:
-        size: residuals' absolute values over sigma, of any shape.
-        loss: one of `LOSSES`.
-        scale: k or c; None: the values above.
+        size: s, absolute values of the residuals over their standard deviations, of any shape.
+        loss: one of `LOSSES`; "none" gives weights of 1.
+        scale: k or c; None: the default values 1.345 or 2.385.
+
+    Raises:
+        ValueError: for an unknown loss.
     """
     if loss == "none":
         return np.ones_like(size)

@@ -1,9 +1,9 @@
-"""R factors ("triangles") of [W y], one per group of rows, which hold all information of y = W x.
+"""R factors ("triangles") of [W y], one per group of rows, which contain all information of y = W x.
 
-An hour at 1 kHz of seven joints with 100 parameters is a matrix of 20 GB and a triangle of 80 kB. They are updated
-block by block. One triangle is kept per group (a joint, a load case, a file), so that weights may change afterwards
-without another pass over the data: the weighted problem is the QR of the stacked R_g / σ_g. WᵀW is never formed, so
-that the triangles are as accurate as a QR of the whole matrix.
+For seven joints with 100 parameters, an hour at 1 kHz is a matrix of 20 GB but a triangle of 80 kB. Triangles are
+updated with one block of rows at a time. One triangle per group (a joint, a load case, a file) is stored, so that
+weights may change afterwards without another pass over the data: the weighted problem is the QR of the stacked R_g /
+σ_g. WᵀW is never formed, so the triangles are as accurate as a QR of the whole matrix.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Triangles:
     """R factors of [W y], one per group of rows.
 
     Attributes:
-        names, units: names and units of the p columns of W.
-        factors: (g, p + 1, p + 1) upper triangular; its last column belongs to y.
+        names, units: names and units of the p parameters (columns of W).
+        factors: (g, p + 1, p + 1) upper triangular matrices; the last column contains y.
         rows: (g,) number of rows absorbed so far in each group.
     """
 
@@ -54,17 +54,17 @@ class Triangles:
         return len(self.names)
 
     def residual_squares(self, values: np.ndarray) -> np.ndarray:
-        """Return ‖y_g - W_g x‖² of every group (g,) for values x (p,), from the R factors alone."""
+        """Return ‖y_g - W_g x‖² of every group (g,) for parameter values x (p,)."""
         return np.sum((self.factors @ np.append(values, -1.0)) ** 2, axis=1)
 
     def relative_errors(self, values: np.ndarray) -> np.ndarray:
-        """Return 100 ‖y_g - W_g x‖ / ‖y_g‖ [%] of every group (g,) for values x (p,); 0 where y_g is zero."""
+        """Return 100 ‖y_g - W_g x‖ / ‖y_g‖ [%] of every group (g,) for parameter values x (p,); 0 where y_g is zero."""
         size = self.residual_squares(np.zeros(self.parameters))
         ratio = self.residual_squares(values) / np.where(size > 0.0, size, np.inf)
         return 100.0 * np.sqrt(ratio)
 
     def select(self, columns: np.ndarray) -> Triangles:
-        """Return the R factors of the model with only these columns (indices), in the given order."""
+        """Return the R factors of the model with only the columns at the indices `columns`, in their given order."""
         columns = np.asarray(columns, dtype=int)
         with_target = np.append(columns, self.parameters)
         factors = np.stack([retriangulate(factor[:, with_target]) for factor in self.factors])
@@ -74,7 +74,13 @@ class Triangles:
 
 
 def empty(names: Sequence[str], units: Sequence[str] | None = None, groups: int = 1) -> Triangles:
-    """Return the R factors of a problem without rows; units None: none known."""
+    """Return the R factors of a problem without rows.
+
+    Args:
+        names: names of the parameters.
+        units: their units; None: units are unknown (empty strings).
+        groups: number of groups of rows.
+    """
     p = len(names)
     if units is None:
         units = [""] * p
@@ -84,15 +90,19 @@ def empty(names: Sequence[str], units: Sequence[str] | None = None, groups: int 
 
 
 def absorb(data: Triangles, matrix: np.ndarray, target: np.ndarray, group: np.ndarray | int = 0) -> Triangles:
-    """Return the R factors updated by more rows: R_g becomes the R of [R_g; W_g y_g].
+    """Return the R factors updated with more rows: R_g becomes the R factor of [R_g; W_g y_g].
 
-    Columns that are zero in all rows of a group (a joint does not feel the links before it) cost nothing.
+    Columns that are zero in all rows of a group cost no time (the torque of a joint does not depend on the links before
+    it).
 
     Args:
         data: triangles of the previous rows.
         matrix: (r, p) rows of W.
         target: (r,) rows of y.
-        group: (r,) group index of each row, or one integer for all.
+        group: (r,) group index of each row, or one integer for all rows.
+
+    Raises:
+        CalibError: for a group index outside 0 … g - 1, or a wrong shape.
     """
     matrix = shaped(matrix, (None, data.parameters), "observation matrix W")
     target = shaped(target, (len(matrix),), "target y")
@@ -124,7 +134,15 @@ def collect(
     names: Sequence[str] | None = None,
     units: Sequence[str] | None = None,
 ) -> Triangles:
-    """Return the R factors of a whole problem; names None: the columns are called x1, x2, …"""
+    """Return the R factors of a whole problem.
+
+    Args:
+        matrix: (r, p) W, the observation matrix.
+        target: (r,) y, the measured values.
+        group: (r,) group index of each row; None: all rows form one group.
+        names: names of the p columns; None: x1, x2, …
+        units: units of the parameters; None: unknown.
+    """
     matrix = shaped(matrix, (None, None), "observation matrix W")
     if names is None:
         names = [f"x{k + 1}" for k in range(matrix.shape[1])]
@@ -135,7 +153,15 @@ def collect(
 
 
 def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
-    """Return the R factor (p + 1, p + 1) of all rows together, rows of group g divided by std[g]; None: undivided."""
+    """Return the R factor (p + 1, p + 1) of all rows together, with the rows of group g divided by std[g].
+
+    Args:
+        data: R factors of the groups.
+        std: (g,) noise standard deviation of each group of rows, in units of y; None: rows are not divided.
+
+    Raises:
+        CalibError: for a standard deviation that is not positive.
+    """
     scale = np.ones(data.groups)
     if std is not None:
         scale = shaped(std, (data.groups,), "standard deviation per group")
@@ -147,7 +173,12 @@ def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
 
 
 def retriangulate(stacked: np.ndarray, overwrite: bool = False) -> np.ndarray:
-    """Return the R factor of any matrix as a square upper triangular matrix, padded with zero rows."""
+    """Return the R factor of a matrix (N, k) as an upper triangular matrix (k, k), with zero rows if N < k.
+
+    Args:
+        stacked: the matrix (N, k).
+        overwrite: whether the matrix may be overwritten, which saves a copy.
+    """
     size = stacked.shape[1]
     result = np.zeros((size, size))
     if stacked.size:
@@ -158,9 +189,10 @@ def retriangulate(stacked: np.ndarray, overwrite: bool = False) -> np.ndarray:
 
 
 def continued(upper: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the R factor (k, k) of a triangle `upper` (k, k) with more rows (N, k) below; both may be overwritten.
+    """Return the R factor (k, k) of [upper; rows], for a triangle `upper` (k, k) and more rows (N, k).
 
-    By Householder reflections as in `retriangulate`, in half the time, since the panels are narrow.
+    Householder reflections, as in `retriangulate`, in half the time thanks to narrow panels. Both arguments may be
+    overwritten.
     """
     panel = min(PANEL, len(upper))
     triangle = np.array(upper, order="F")
@@ -173,9 +205,13 @@ def _upper(size: int) -> np.ndarray:
 
 
 def condition_numbers(factor: np.ndarray) -> tuple[float, float]:
-    """Return cond(W) and cond(W with unit-norm columns) from W or any R factor of it; zero columns are ignored.
+    """Return two condition numbers of W: as it is, and with columns scaled to unit norm. Zero columns are ignored.
 
-    Zero columns belong to parameters without rows, e.g. of a joint at rest. Both are infinite if all columns are zero.
+    Zero columns are those of parameters without effect, e.g. of a joint at rest. Both numbers are infinite if all
+    columns are zero.
+
+    Args:
+        factor: W (rows, p), or any triangular factor of it.
     """
     norms = np.linalg.norm(factor, axis=0)
     excited = norms > 0.0
@@ -188,10 +224,16 @@ def condition_numbers(factor: np.ndarray) -> tuple[float, float]:
 
 
 def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, tuple[float, float]]:
-    """Solve R x = z from the R factor [R z; 0 ρ] of [W y]; return x, R⁻¹ and the condition numbers of W.
+    """Return x, R⁻¹ and the condition numbers of W, from the R factor [R z; 0 ρ] of [W y], by solving R x = z.
+
+    The two condition numbers are those of W as it is and of W with unit-norm columns.
+
+    Args:
+        factor: (p + 1, p + 1) R factor of [W y], observation matrix and measured values.
+        names: names of the p columns, for the error message.
 
     Raises:
-        Unidentifiable: naming the columns that take part in a dependence.
+        Unidentifiable: if columns are linearly dependent; the message names them.
     """
     p = len(names)
     upper = factor[:p, :p]
@@ -205,10 +247,16 @@ def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray
 
 
 def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE) -> np.ndarray:
-    """Return the singular values of a matrix whose columns have comparable norms; columns must be independent.
+    """Return the singular values of a matrix with columns of comparable norms, if its columns are independent.
+
+    Args:
+        scaled: (rows, p) matrix, or its R factor.
+        names: names of the p columns.
+        advice: end of the error message: what the user can do.
 
     Raises:
-        Unidentifiable: naming every column with a part in a null direction.
+        Unidentifiable: if columns are linearly dependent; the message names the columns with a part in a null
+            direction.
     """
     values = np.linalg.svd(scaled, compute_uv=False)
     weak = np.ones(len(values), dtype=bool)
@@ -224,7 +272,12 @@ def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE)
 
 
 def _update(factor: np.ndarray, matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the R factor of [factor; matrix target]; only non-zero columns are factorised."""
+    """Return the R factor of [factor; matrix target]; columns that are zero in both are skipped.
+
+    Args:
+        factor: (p + 1, p + 1) R factor of the rows absorbed so far.
+        matrix, target: (r, p) and (r,), further rows of W and y.
+    """
     top = factor[factor.any(axis=1)]
     in_matrix = np.append(matrix.any(axis=0), True)
     live = np.flatnonzero(in_matrix | top.any(axis=0))
@@ -239,7 +292,7 @@ def _update(factor: np.ndarray, matrix: np.ndarray, target: np.ndarray) -> np.nd
 
 
 def _ratio(values: np.ndarray) -> float:
-    """Return the condition number by singular values; infinite for a singular matrix."""
+    """Return the condition number from singular values in descending order; infinite for a singular matrix."""
     if values[-1] > 0.0:
         return float(values[0] / values[-1])
     return float("inf")

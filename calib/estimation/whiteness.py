@@ -1,4 +1,4 @@
-"""Tests of residuals: autocorrelation, departure from the normal distribution, and share explained (R²)."""
+"""Tests of residuals: autocorrelation, departure from the normal distribution, and explained share (R²)."""
 
 from dataclasses import dataclass
 
@@ -16,10 +16,10 @@ class Whiteness:
     Attributes:
         acf, pacf: (lags,) autocorrelation and partial autocorrelation at lags 1, 2, …
         bound: 1.96 / sqrt(N); 95 % of a white series' autocorrelations are within ± this bound.
-        outside: share of the autocorrelations beyond the bound; 0.05 for a white series.
-        ljung_box_p: probability that a white series has a larger Ljung–Box statistic.
+        outside: share of the autocorrelations beyond the bound; about 0.05 for a white series.
+        ljung_box_p: p-value of the Ljung–Box test, the probability that a white series has a larger statistic.
         kurtosis: excess kurtosis, 0 for normal residuals.
-        normal_p: p-value of the hypothesis of normal residuals, D'Agostino & Pearson (1973); assumes them independent.
+        normal_p: p-value of the hypothesis that the residuals are normal and independent, D'Agostino & Pearson (1973).
     """
 
     acf: Array
@@ -32,11 +32,14 @@ class Whiteness:
 
 
 def examine(residual: np.ndarray, lags: int = 30) -> Whiteness:
-    """Return the whiteness tests of evenly sampled residuals (N,) of one joint in one recording.
+    """Return the whiteness tests of the residuals (N,) of one joint in one recording, sampled at a constant rate.
 
     Args:
-        residual: (N,) with N > lags and N >= 20.
+        residual: (N,) in order of time, of any unit, with N > lags and N >= 20.
         lags: number of autocorrelations.
+
+    Raises:
+        CalibError: for too few residuals.
     """
     x = shaped(residual, (None,), "residuals")
     min_count = max(lags + 1, 20)
@@ -58,7 +61,7 @@ def examine(residual: np.ndarray, lags: int = 30) -> Whiteness:
 
 
 def _shape(x: np.ndarray) -> tuple[float, float]:
-    """Return skewness and excess kurtosis of a series (N,), from its central moments; NaN for a constant series."""
+    """Return skewness and excess kurtosis of a series (N,); NaN for a constant series."""
     mean = x.mean()
     centred = x - mean
     square = centred**2
@@ -71,10 +74,11 @@ def _shape(x: np.ndarray) -> tuple[float, float]:
 
 
 def _normality(skewness: float, kurtosis: float, n: int) -> float:
-    """Return the probability of at least this skewness and excess kurtosis in n >= 20 normal values.
+    """Return the p-value of the hypothesis that n >= 20 values with this skewness and excess kurtosis are normal.
 
-    Both are turned into normal variables, whose squares add up (D'Agostino & Pearson 1973; D'Agostino 1970;
-    Anscombe & Glynn 1983). Equal to `scipy.stats.normaltest`, which takes half a second to load.
+    Skewness and kurtosis are each transformed into a standard normal variable, and the sum of both squares is tested
+    (D'Agostino & Pearson 1973; D'Agostino 1970; Anscombe & Glynn 1983). The result equals that of
+    `scipy.stats.normaltest`, whose import takes half a second.
     """
     # skewness (D'Agostino 1970)
     y = skewness * np.sqrt((n + 1) * (n + 3) / (6.0 * (n - 2)))
@@ -95,9 +99,13 @@ def _normality(skewness: float, kurtosis: float, n: int) -> float:
 
 
 def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
-    """Return ρ_k = Σ_t x_t x_{t+k} / Σ_t x_t² for k = 1 … lags (by FFT), means removed.
+    """Return the autocorrelations ρ_k = Σ_t x_t x_{t+k} / Σ_t x_t² for k = 1 … lags (by FFT), with means removed.
 
-    For a residual (N, columns) both sums run over the columns, too.
+    For residuals (N, columns) both sums also run over the columns. A constant series gives zeros.
+
+    Args:
+        residual: (N,) or (N, columns), in order of time.
+        lags: number of autocorrelations.
     """
     columns = np.asarray(residual, dtype=float).reshape(len(residual), -1).T
     size = 1 << (2 * len(residual) - 1).bit_length()
@@ -111,7 +119,7 @@ def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
 
 
 def partial_autocorrelation(acf: np.ndarray) -> np.ndarray:
-    """Return the partial autocorrelations of lags 1 … k from the autocorrelations (Durbin–Levinson)."""
+    """Return the partial autocorrelations of lags 1 … k from the autocorrelations `acf` (k,) (Durbin–Levinson)."""
     result = np.empty(len(acf))
     phi = np.zeros(0)
     for k, rho in enumerate(acf):
@@ -125,10 +133,14 @@ def partial_autocorrelation(acf: np.ndarray) -> np.ndarray:
 
 
 def ljung_box(acf: np.ndarray, count: int) -> tuple[float, float]:
-    """Return Q = N (N + 2) Σ ρ_k² / (N - k) and P(χ²(lags) > Q) (Ljung & Box 1978).
+    """Return the Ljung–Box statistic Q = N (N + 2) Σ ρ_k² / (N - k) and its p-value P(χ²(lags) > Q) (Ljung & Box 1978).
 
-    No degrees of freedom are subtracted, as is right for residuals of a regression on given columns, not of an ARMA
-    model.
+    No degrees of freedom are subtracted: this is correct for residuals of a regression on given columns, but not for
+    residuals of an ARMA model.
+
+    Args:
+        acf: (lags,) autocorrelations ρ_k.
+        count: N, the length of the series.
     """
     lags = np.arange(1, len(acf) + 1)
     statistic = count * (count + 2.0) * np.sum(acf**2 / (count - lags))
@@ -138,11 +150,12 @@ def ljung_box(acf: np.ndarray, count: int) -> tuple[float, float]:
 def inflation(residual: np.ndarray) -> float:
     """Return the integrated autocorrelation τ = 1 + 2 Σ_{k<=m} ρ_k >= 1: N residuals count as N / τ independent ones.
 
-    The window is the smallest m >= 5 τ(m) (Sokal 1997): longer sums only add noise. It is at most N / 4.
+    The window m is the smallest with m >= 5 τ(m) (Sokal 1997), since longer sums only add noise; it is at most N / 4.
+    Fewer than 8 residuals give τ = 1.
 
     Args:
-        residual: (N,) residuals, or (N, 1 + p) with the columns W C^(1/2) of the fit appended, which account for the
-            part of the errors that the fit absorbed.
+        residual: (N,) residuals, or (N, 1 + p) residuals with the columns W C^(1/2) appended (W the fitted columns, C
+            the covariance of the fit), which account for the part of the errors that the fit absorbed.
     """
     x = np.asarray(residual, dtype=float)
     if len(x) < 8:
@@ -154,7 +167,12 @@ def inflation(residual: np.ndarray) -> float:
 
 
 def r_squared(target: np.ndarray, residual: np.ndarray) -> float:
-    """Return R² = 1 - Σ ρ² / Σ (y - mean y)²; negative if the mean predicts better."""
+    """Return R² = 1 - Σ ρ² / Σ (y - mean y)²; NaN for a constant y, negative if the mean of y predicts y better.
+
+    Args:
+        target: y (N,), the measured values.
+        residual: ρ (N,), measured minus predicted values.
+    """
     total = float(np.sum((target - np.mean(target)) ** 2))
     if not total > 0.0:
         return float("nan")

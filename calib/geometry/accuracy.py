@@ -1,13 +1,15 @@
-"""Errors of predicted against measured positions, orientations and distances, as printed on a certificate.
+"""Differences between predicted and measured positions, orientations and distances, as printed on a certificate.
+
+For predicted positions p and measured positions y:
 
     position      |y - p| where positions are measured; |mean of the socket's points - p| for sockets; distance from the
                   plane for planes; for an image the rms over its corners of the distance between seen and predicted
                   corner, measured across the line of sight at the corner's distance [m]
-    orientation   angle of R_y Rᵀ [rad]
+    orientation   angle of R_y Rᵀ [rad], R_y measured, R predicted
     distance      | |p_a - p_b| - known | for distances, bars and sockets a known distance apart; for sockets without
                   one, the deviation of |m_a - m_b| from its mean over the fixture's positions [m]
 
-``rms`` is sqrt(mean |e|²) of the vector's norm, not per axis.
+``rms`` is sqrt(mean |e|²) of the error vector's norm, not per axis.
 """
 
 from collections.abc import Sequence
@@ -36,7 +38,7 @@ _NONE = np.array([], dtype=int)
 
 @dataclass(frozen=True)
 class ErrorStatistics:
-    """Statistics of error magnitudes [mm or deg]."""
+    """Mean, rms, 95 % quantile and maximum of error magnitudes [mm or deg]."""
 
     mean: float
     rms: float
@@ -46,7 +48,7 @@ class ErrorStatistics:
 
 @dataclass(frozen=True)
 class ArmErrors:
-    """Error statistics of one arm, by kind of error; None for a kind that was not measured."""
+    """Error statistics of one arm by kind of error; None for a kind that was not measured."""
 
     position_mm: ErrorStatistics | None = None
     orientation_deg: ErrorStatistics | None = None
@@ -54,13 +56,16 @@ class ArmErrors:
 
     @property
     def main(self) -> ErrorStatistics | None:
-        """Statistics of the errors that decide the verdict, positions before distances [mm]; None without either."""
+        """Statistics of the errors that decide the verdict: of positions or, without positions, of distances [mm].
+
+        None where neither was measured.
+        """
         return self.position_mm or self.distance_mm
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Error magnitudes by kind, one per measured row (or pair); None for a kind that was not measured.
+    """Error magnitudes by kind, one number per measured row (or pair of rows); None for a kind that was not measured.
 
     Attributes:
         position: [m].
@@ -74,7 +79,7 @@ class Errors:
 
     @property
     def main(self) -> np.ndarray:
-        """Return the errors that decide the verdict, positions before distances [m]; empty without either."""
+        """Errors that decide the verdict: of positions or, without positions, of distances [m]; empty without both."""
         if self.position is not None:
             return self.position
         if self.distance is not None:
@@ -102,7 +107,8 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements]) -> Errors:
     """Return the magnitudes of the prediction errors of all measured rows.
 
     Args:
-        cell: the installation whose predictions are compared; it has the stations and tools named in the measurements.
+        cell: the installation whose predictions are compared; it must have the stations and tools named in the
+            measurements.
         measured: blocks of measurements, of any kinds.
     """
     sizes: dict[str, list[np.ndarray]] = {"position": [], "orientation": [], "distance": []}
@@ -118,13 +124,22 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements]) -> Errors:
 
 
 def _concatenated(sizes: list[np.ndarray]) -> np.ndarray | None:
-    """Return the error magnitudes of all blocks in one array; None for an empty list."""
+    """Return the error magnitudes of all blocks in one array; None for an empty list.
+
+    Args:
+        sizes: error magnitudes of each block.
+    """
     result = np.concatenate([np.zeros(0), *sizes])
     return result if len(result) else None
 
 
 def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> ErrorStatistics | None:
-    """Return mean, rms, 95 % quantile and maximum of error magnitudes times `factor`; None for empty input."""
+    """Return mean, rms, 95 % quantile and maximum of `factor` times the error magnitudes.
+
+    Args:
+        sizes: (N,) error magnitudes [m or rad]; None where they were not measured.
+        factor: factor by which they are converted to mm or deg.
+    """
     if sizes is None:
         return None
     scaled = factor * sizes
@@ -135,13 +150,13 @@ def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> ErrorStatistics
 
 
 def rms_sigma(sizes: np.ndarray) -> float:
-    """Return the standard error of the rms of independent errors: sd(e²) / (2 rms sqrt(N)), by the delta method.
+    """Return the standard error of the rms of independent errors e: sd(e²) / (2 rms sqrt(N)), by the delta method.
 
     Args:
-        sizes: (N,), N > 1.
+        sizes: (N,) error magnitudes.
 
     Returns:
-        In the sizes' unit; NaN for fewer than two sizes.
+        The standard error, in the unit of `sizes`; NaN for fewer than two errors.
     """
     if len(sizes) < 2:
         return np.nan
@@ -155,9 +170,15 @@ def rms_sigma(sizes: np.ndarray) -> float:
 def pair_errors(
     cell: Installation, measured: Sequence[PoseMeasurements], limit: int = 20000, seed: int = 0
 ) -> np.ndarray:
-    """Return the error of the distance between each pair of positions [m], | |p_i - p_j| - |y_i - y_j| |.
+    """Return the errors of the distances between pairs of positions [m], | |p_i - p_j| - |y_i - y_j| |.
 
-    Pairs are taken within a block; where there are more than `limit`, that many are drawn by seed.
+    p are predicted and y measured positions.
+
+    Args:
+        cell: the installation that predicts the positions.
+        measured: blocks of measurements; the positions of a pair are taken from the same block.
+        limit: largest number of pairs; if there are more, so many are drawn at random.
+        seed: seed of the draw.
     """
     generator = np.random.default_rng(seed)
     result = [np.zeros(0)]
@@ -186,11 +207,12 @@ def _pairs(m: int, limit: int, generator: np.random.Generator) -> tuple[np.ndarr
 def _socket_spread(point: np.ndarray, measured: Sockets) -> np.ndarray:
     """Return how much the distance of each socket pair deviates from its mean over all fixture positions [m].
 
-    A group's name is ``<fixture position>/<socket>``. Empty where no pair of sockets occurs in two fixture positions.
+    The name of a group of rows is ``<fixture position>/<socket>``. The result is empty where no pair of sockets was
+    measured in two fixture positions.
 
     Args:
         point: (3, m) predicted target positions [m].
-        measured: the block of m rows.
+        measured: the block of m rows, in which the target rested in sockets.
     """
     sockets: dict[str, dict[str, np.ndarray]] = {}
     for number in np.unique(measured.group):

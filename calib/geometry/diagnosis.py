@@ -1,8 +1,8 @@
 """Checks of measurements against the model: changed set-up, systematic residuals, changed columns, a scale factor.
 
-Changed columns (joint signs, exchanged joints, mirrored axes, angles of another convention): the nominal arm, base and
-tool placement free, is fitted to the rows as measured and with each change; the change is reported where it reduces the
-error far below that.
+Changed columns are wrong joint signs, exchanged joints, mirrored axes, or angles of another convention. The nominal
+arm, with free placements of base and tool, is fitted to the rows as measured, and with each of these changes. A change
+is reported where it makes the error much smaller.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,35 +31,40 @@ from calib.geometry.weighing import GeometricFit, Settings
 from calib.records import evenly
 from calib.robot.chain import Chain, element_length
 
-# [m]: shorter lengths, and growth that moves targets by less per unit, say nothing of a factor
+# smallest length of the arm [m], and smallest motion of targets per unit growth [m], that determine a scale factor
 MIN_LENGTH = 0.01
-# rows below which no pattern is looked for (our choice)
+# smallest number of rows in which patterns are searched (our choice)
 MIN_ROWS = 30
-# probability that the same rows in another order show such a change of set-up (our choice)
+# largest probability of such a difference by chance, for rows in any order, to report a changed set-up (our choice)
 MAX_CHANCE = 1e-3
-# a set-up's errors over those of the other rows from which on it is worth a finding (our choice)
+# smallest ratio of the errors before and after a change of set-up that is reported (our choice)
 MIN_RATIO = 1.6
-# what neighbouring poses differ by, over the residuals, below which these are systematic (our choice)
+# residuals are systematic if those of neighbouring poses differ by less than this share of them (our choice)
 MAX_NEIGHBOUR_SHARE = 0.6
-# factor between residuals and a stated uncertainty from which on it is worth a finding (our choice)
+# ratio of residuals to stated uncertainty, or the inverse, above which a finding is reported (our choice)
 MAX_TIMES = 5.0
-# angles beyond a convention's range were lost
+# a robust fit, since orientations with angles beyond the range of a convention were lost
 ROBUST = Settings(loss="cauchy", limit=40, passes=4)
-# of the makers' angles; others are rare (our choice)
+# conventions for orientation angles that robot makers use; others are rare (our choice)
 CONVENTIONS = ("vector", "xyz fixed", "xyz moving", "zyx fixed", "zyx moving", "zyz moving", "zxz moving")
-# share of the error that may remain where no second change goes with it, and of a joint's sign (our choice)
+# largest share of the error that may remain after a change made alone, and after reversing a joint's sign (our choice)
 MAX_LEFT = 1.0 / 3.0
 MAX_LEFT_SIGN = 0.8
-# rows of each block by which changes are compared (our choice)
+# number of rows of each block by which changes are compared (our choice)
 FEW = 200
-# other zeros of a joint that are tried [rad]
+# offsets of a joint's zero that are tried [rad]
 QUARTERS = (np.pi / 2.0, -np.pi / 2.0, np.pi)
 # signs of the axes of a frame of opposite handedness
 FLIP = np.array([1.0, -1.0, 1.0])
 
 
 def diagnose(fit: GeometricFit, with_changes: bool = True) -> list[Finding]:
-    """Return findings on each block: systematic residuals; if `with_changes`, also a set-up changed while measuring."""
+    """Return findings on systematic residuals of each block and, if `with_changes`, on a set-up changed in between.
+
+    Args:
+        fit: the fit to examine.
+        with_changes: whether a changed set-up is searched.
+    """
     findings: list[Finding] = []
     for block, part in _lengths(fit):
         # pairs of rows count once
@@ -72,13 +77,18 @@ def diagnose(fit: GeometricFit, with_changes: bool = True) -> list[Finding]:
 
 
 def _lengths(fit: GeometricFit) -> list[tuple[Block, ResidualPart]]:
-    """Return each block with its first residual part, which is in metres for every kind of measurement."""
+    """Return each block of `fit` with its first residual part, which is in metres for every kind of measurement."""
     first = {piece.block: piece.part.per_row() for piece in reversed(fit.pieces)}
     return [(block, first[number]) for number, block in enumerate(fit.blocks)]
 
 
 def _setup_change(block: Block, part: ResidualPart) -> list[Finding]:
-    """Return a finding if the set-up changed: the residuals before and after one row differ in size and rank."""
+    """Return a finding if the residuals before and after some row differ significantly in size.
+
+    Args:
+        block: the prepared measurements of m rows.
+        part: their residuals [m].
+    """
     size = np.linalg.norm(part.value, axis=0)
     # a few gross rows are not a set-up
     size = np.minimum(size, 4.0 * np.median(size))
@@ -112,7 +122,15 @@ def _setup_change(block: Block, part: ResidualPart) -> list[Finding]:
 
 
 def _systematic(block: Block, part: ResidualPart) -> list[Finding]:
-    """Return findings on systematic residuals: noise differs between neighbouring poses, a missing effect does not."""
+    """Return findings on systematic residuals, and on stated standard deviations that contradict the residuals.
+
+    Residuals are systematic where they are similar at neighbouring poses: noise would differ there, a missing effect
+    would not.
+
+    Args:
+        block: the prepared measurements of m rows.
+        part: their residuals [m].
+    """
     findings = []
     name = _name(block)
     rms = _rms_norm(part.value)
@@ -129,7 +147,7 @@ def _systematic(block: Block, part: ResidualPart) -> list[Finding]:
 
 
 def _rms_norm(values: np.ndarray) -> float:
-    """Return the rms of the norms of columns (rows, m)."""
+    """Return the rms of the column norms of `values` (rows, m)."""
     return float(np.sqrt(np.mean(np.sum(values**2, axis=0))))
 
 
@@ -138,10 +156,15 @@ def _name(block: Block) -> str:
 
 
 def neighbour_floor(q: np.ndarray, part: ResidualPart) -> float | None:
-    """Return the rms of residual differences between nearest neighbours in q, over √2 [m]: an estimate of the noise.
+    """Return an estimate of the noise [m]: the rms of residual differences between nearest neighbours in q, over √2.
 
-    (von Neumann's mean square successive difference, 1941, with neighbours in joint space in place of time.) None where
-    neighbours are further apart than a third of the joints' spread: their systematic errors are unrelated.
+    This is von Neumann's mean square successive difference (1941), with neighbours in joint space in place of time.
+    None where neighbours are further apart than a third of the joints' spread, since their systematic errors are then
+    unrelated.
+
+    Args:
+        q: (m, n) joint values of the rows [rad or m].
+        part: residuals of the m rows.
     """
     spread = q.std(axis=0)
     moving = spread > 1e-9
@@ -174,16 +197,18 @@ class Scale:
 
 
 def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale | None:
-    """Return the instrument's scale factor and its sigma from measured positions; None without positions.
+    """Return the scale factor of the instrument and its sigma from measured positions.
 
-    y - p = (s - 1) (p - mean p), with p the predicted positions, up to what placements explain.
-
-    None, too, where placements alone explain a growth of all lengths: beyond them it moves the targets by less than
-    `MIN_LENGTH` per unit (rms).
+    The model is y - p = (s - 1) (p - mean p), with y measured and p predicted positions, up to changes of the
+    placements.
 
     Args:
-        nominal: the arm with base and tool placement fitted for it.
+        nominal: the nominal arm with base and tool placement fitted.
         blocks: measurements; only blocks with positions are used.
+
+    Returns:
+        The scale. None without positions, and where placements alone can explain a growth of all lengths: where, beyond
+            them, a growth moves the targets by less than `MIN_LENGTH` per unit (rms).
     """
     frames = layout(nominal).frame_index
     residuals, columns = [], []
@@ -218,10 +243,13 @@ def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale
 
 
 def length_factor(fit: GeometricFit) -> Scale | None:
-    """Return the common factor of fitted over nominal arm lengths; None for fewer than two fitted lengths.
+    """Return the common factor of fitted over nominal arm lengths; None where fewer than two lengths were fitted.
 
-    The factor's sigma follows from the measurements; `explained` shows whether one factor accounts for the lengths'
-    changes.
+    The factor's sigma is computed from the fit's covariance. `explained` is the share of the changes of the lengths
+    that one common factor explains.
+
+    Args:
+        fit: a fit of the arm's lengths.
     """
     chain = fit.start.chain
     if fit.split is None:
@@ -260,7 +288,7 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
     Args:
         nominal: the nominal arm, with stations and tools placed.
         blocks: the measurements.
-        mirrored: whether to try an instrument with left-handed axes, too.
+        mirrored: True: also try an instrument with left-handed axes.
     """
     chain = nominal.chain
     n = chain.n
@@ -298,7 +326,9 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
 
 
 def wrong_angles(nominal: Installation, blocks: Blocks) -> Explanation | None:
-    """Return the convention of the orientations' angles that reduces the nominal arm's error most; None if none does.
+    """Return the angle convention of the measured orientations that reduces the nominal arm's error most.
+
+    None if no other convention reduces it much.
 
     Args:
         nominal: the nominal arm, with stations and tools placed.
@@ -319,7 +349,12 @@ def wrong_angles(nominal: Installation, blocks: Blocks) -> Explanation | None:
 def _median_angle(nominal: Installation, blocks: Blocks) -> np.ndarray:
     """Return the median squared orientation error [rad²] (1,) with base and tool placement fitted.
 
-    The median, since angles beyond the range of the stated convention were lost when the file was read.
+    The median is robust to angles beyond the range of the stated convention, whose orientations were lost when the file
+    was read.
+
+    Args:
+        nominal: the nominal arm.
+        blocks: the measurements; only full poses are used.
     """
     try:
         placed = polish_frames(install(nominal.chain, blocks, nominal.known), blocks, ROBUST).cell
@@ -332,20 +367,21 @@ def _median_angle(nominal: Installation, blocks: Blocks) -> np.ndarray:
 
 
 def _few(blocks: Blocks) -> Blocks:
-    """Return at most `FEW` rows of each block."""
+    """Return each block reduced to at most `FEW` rows."""
     return [take(block, evenly(len(block), FEW)) for block in blocks]
 
 
 def _turned(joint: int, angle: float, blocks: Blocks) -> Blocks:
-    """Return the blocks with `angle` [rad] added to the values of one joint."""
+    """Return the blocks with `angle` [rad] added to the values of the joint with index `joint`."""
     turn = np.zeros(blocks[0].q.shape[1])
     turn[joint] = angle
     return [replace(block, q=block.q + turn) for block in blocks]
 
 
 def _end_without(chain: Chain, joint: int) -> str | None:
-    """Return the option of a command that ends a URDF's chain before its last joint or begins it behind its first; or
-    None.
+    """Return the command option that excludes the joint with index `joint` from a URDF's chain.
+
+    The option begins the chain after its first joint or ends it before its last joint; None for other joints.
     """
     if not chain.links or chain.n == 1:
         return None
@@ -354,12 +390,12 @@ def _end_without(chain: Chain, joint: int) -> str | None:
 
 
 def _of_joints(matrix: np.ndarray) -> Callable[[Blocks], Blocks]:
-    """Return the change that multiplies all joint values by a matrix (n, n)."""
+    """Return a function that multiplies all joint values of blocks by a matrix (n, n)."""
     return lambda blocks: [replace(block, q=block.q @ matrix.T) for block in blocks]
 
 
 def _mirrored(blocks: Blocks) -> Blocks:
-    """Return blocks in a frame of opposite handedness: y changes its sign, a rotation R becomes F R F."""
+    """Return the blocks in a frame of opposite handedness: y changes its sign, a rotation R becomes F R F."""
     result = []
     for block in blocks:
         if isinstance(block, Positions):
@@ -371,7 +407,7 @@ def _mirrored(blocks: Blocks) -> Blocks:
 
 
 def _read_as(euler: str, blocks: Blocks) -> Blocks:
-    """Return blocks with the angles of orientations read by another convention."""
+    """Return the blocks with the angles of orientations read by the convention `euler`."""
     result = []
     for block in blocks:
         if isinstance(block, Poses) and block.euler:
@@ -385,7 +421,11 @@ def _read_as(euler: str, blocks: Blocks) -> Blocks:
 def _mean_square(nominal: Installation, blocks: Blocks) -> np.ndarray:
     """Return the mean squared error of the nominal arm [m²] after fitting base and tool placement.
 
-    Where the fitted placement is worse than the one in `nominal`, the latter is used.
+    The placements in `nominal` are used where they give a smaller error than the fitted ones.
+
+    Args:
+        nominal: the nominal arm, with stations and tools placed.
+        blocks: the measurements.
     """
     squares = [np.inf]
     # a second target has no placement yet

@@ -1,16 +1,18 @@
-"""Expected position error of a fitted arm at any pose: from its parameters' covariance and from the model's errors.
+"""Expected position error of a fitted arm at any pose, from its parameters' covariance and from the model's errors.
 
     E |e(q)|² = κ trace J Σ Jᵀ + s(q) v_0 + v_1 d(q)² + v_2 g(q)²
 
-with Σ the parameters' covariance, d the distance of q from the nearest pose of the fit and g the distance of q from the
-ranges of single joints in that fit, every joint multiplied by its lever [m/rad]. s is the factor of variance by which
-errors are larger at q than elsewhere (`calib.geometry.left_out`). κ and v are the most probable values given the errors
-on held-out rows: rows held out at random (near), and by regions or stations or the ends of every joint's range (far);
-near and far errors have equal weight. The radius that contains 95 % of the errors is a quantile of the same rows'
-errors in units of sigma (`calib.geometry.left_out`), without an assumed distribution. It changes from the near rows'
-quantile to the far rows' quantile as d² + g² goes from the median of the near rows to that of the far rows. Outside the
-range of a joint it is larger, by the factor observed when that end of the range was held out. Sigmas are stated in
-units of the larger radius.
+Σ is the parameters' covariance. d is the distance of q from the nearest fitted pose, and g the distance of q from the
+fitted ranges of the single joints; joint differences are multiplied by the joint's lever [m/rad]. s is the factor by
+which the error variance at q is larger than on average (`calib.geometry.left_out`). κ and v are the most probable
+values given the errors on held-out rows. Near rows were held out at random; far rows were held out by region or
+station, or at the ends of a joint's range. Near and far errors have equal weight.
+
+The radius is the number of standard deviations that contains 95 % of the errors. It is a quantile of the errors on
+held-out rows in units of sigma (`calib.geometry.left_out`), without an assumed distribution. It changes from the near
+rows' quantile to the far rows' quantile as d² + g² increases from the median of the near rows to that of the far rows.
+Outside the range of a joint the radius is larger, by the factor observed when that end of the range was held out.
+Stated sigmas are scaled so that the larger of the two radii contains 95 % of the errors.
 """
 
 from collections.abc import Iterator, Sequence
@@ -37,17 +39,17 @@ from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 
-# share of the poses at each end of a joint's range that is left out (our choice)
+# share of the poses that is held out at each end of a joint's range (our choice)
 END_SHARE = 0.2
-# share of the poses within the distance from a joint's range (our choice)
+# share of the fitted poses that define a joint's range near a pose (our choice)
 NEAR_SHARE = 0.02
-# poses from which errors on held-out rows are worth a model (our choice)
+# smallest number of poses for an error model (our choice)
 MIN_POSES = 20
-# poses that folds are judged by (our choice)
+# largest number of poses by which folds are evaluated (our choice)
 MAX_POSES = 1500
-# what is known beforehand of a parameter that a fold does not tell [m, rad] (our choice)
+# prior standard deviation of a parameter without prior, for folds that do not determine it [m, rad] (our choice)
 PRIOR_SIGMA = 1.0
-# poses and step [rad or m] by which a joint's lever is measured, and the least lever [m/rad or 1]
+# number of poses and step [rad or m] by which a joint's lever is computed, and the smallest lever [m/rad or 1]
 LEVER_POSES = 50
 LEVER_STEP = 1e-4
 MIN_LEVER = 0.05
@@ -62,12 +64,12 @@ class Discrepancy:
         floor: v_0 [m²], error variance at the fitted poses for s = 1, with the instrument's noise.
         far: v_1 [m²/m²], error variance per squared distance from the nearest fitted pose.
         beyond: v_2 [m²/m²], error variance per squared distance from the fitted ranges of the joints.
-        radii: number of sigmas that contained 95 % of the errors on held-out rows, near and far.
+        radii: number of sigmas that contained 95 % of the errors, for the near and for the far held-out rows.
         reach: median of d² + g² over the near rows, and over the far rows [m²].
         levers: (n,) motion of the tool per unit of each joint [m/rad or 1], rms over the poses.
-        profile: log s by joint; empty for equal errors everywhere.
-        placed: `radii` for rows to which base and tool are fitted; None if equal to `radii`.
-        wider: widening factors of the interval below and above each joint's range; empty if unknown.
+        profile: log s as one function per joint; empty for s = 1 everywhere.
+        placed: radii for rows on which base and tool placement are fitted; None if equal to `radii`.
+        wider: factors by which the 95 % interval widens below and above each joint's range; empty if unknown.
     """
 
     parameters: float
@@ -83,7 +85,7 @@ class Discrepancy:
 
     @property
     def radius(self) -> float:
-        """Half-width of the 95 % interval, in standard deviations."""
+        """Half-width of the 95 % interval in standard deviations, the larger of the near and the far radius."""
         return max(self.radii)
 
 
@@ -93,10 +95,10 @@ class ErrorModel:
 
     Attributes:
         cell: the installation.
-        free, covariance: positions of the fitted parameters in the full vector, and their covariance
-            (`calib.geometry.observation`).
-        learnt: (m, n) poses of the fit [rad or m].
-        discrepancy: see `Discrepancy`.
+        free, covariance: indices of the fitted parameters in the full vector (`calib.geometry.observation`), and their
+            covariance.
+        learnt: (m, n) fitted poses [rad or m].
+        discrepancy: parameters of the error model.
     """
 
     cell: Installation
@@ -109,7 +111,7 @@ class ErrorModel:
         """Return the expected tool position error (m,) [m] at poses: the standard deviation, all axes together.
 
         Args:
-            rows: joint values (m, n), and gravity torques for compliance terms.
+            rows: joint values (m, n), and gravity torques if the model has compliance terms.
             station: index of the station of reference; -1 for the arm's base.
             tool: index of the tool, one or (m,).
         """
@@ -118,13 +120,13 @@ class ErrorModel:
         return sigma * (radius * self._widening(rows.q)) / self.discrepancy.radius
 
     def sigma_on(self, cell: Installation, block: Positions, placed_anew: bool = False) -> np.ndarray:
-        """Return `position_sigma` at the poses of measured rows (m,) [m].
+        """Return the expected position error (m,) [m] at the poses of measured rows, as `position_sigma` does.
 
         Args:
-            cell: the installation whose predictions are judged: that of the fit, or one placed anew.
+            cell: the installation whose predictions are judged: that of the fit, or the same arm with new placements.
             block: the block of m rows.
-            placed_anew: whether base and tool were placed on these very rows; then errors that a placement can
-                compensate are excluded.
+            placed_anew: True where base and tool placement were fitted to these rows; errors that a placement can
+                compensate are then excluded.
         """
         ready = prepare(cell, [block])[0]
         if not placed_anew:
@@ -154,7 +156,8 @@ class ErrorModel:
     def _sigma_and_radius(
         self, parameter_variance: np.ndarray, q: np.ndarray, radii: tuple[float, float]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the standard deviation (m,) [m] of each error, and how many of them (m,) contain 95 % of the errors.
+        """Return the standard deviation (m,) [m] of each error, and the multiple of it (m,) that contains 95 % of
+        errors.
 
         Args:
             parameter_variance: (m,) error variance [m²] due to the parameters, trace J Σ Jᵀ.
@@ -170,7 +173,11 @@ class ErrorModel:
         return sigma, np.interp(from_poses + from_ranges, model.reach, radii)
 
     def _widening(self, q: np.ndarray) -> np.ndarray:
-        """Return the factors (m,) by which intervals widen outside the joints' ranges."""
+        """Return the factors (m,) by which the 95 % intervals widen outside the fitted joint ranges; 1 inside.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+        """
         result = np.ones(len(q))
         for joint, (below, above) in enumerate(self.discrepancy.wider):
             levels = [0.0, END_SHARE, 1.0 - END_SHARE, 1.0]
@@ -184,12 +191,20 @@ class ErrorModel:
 
 
 def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
-    """Return a mask (m, n) of the joint values q (m, n) outside the range of the fitted poses (k, n)."""
+    """Return a mask (m, n) of the joint values q (m, n) that are outside the range of the poses `learnt` (k, n)."""
     return np.asarray((q < learnt.min(axis=0)) | (q > learnt.max(axis=0)))
 
 
 def _widened(distance: np.ndarray, width: float, factor: float) -> np.ndarray:
-    """Return the widening (m,) at `distance` beyond the end of a range: `factor` from half of `width` on."""
+    """Return the widening (m,) at a distance (m,) beyond the end of a range.
+
+    It rises linearly from 1 at the end to `factor` at half of `width` beyond, and then stays constant.
+
+    Args:
+        distance: (m,) distance beyond the end [rad or m].
+        width: the range's width [rad or m].
+        factor: widening at half of `width` beyond.
+    """
     share = np.clip(2.0 * distance / max(width, 1e-9), 0.0, 1.0)
     return 1.0 + (factor - 1.0) * share
 
@@ -199,7 +214,7 @@ def _position_part(parts: Sequence[ResidualPart]) -> ResidualPart:
 
 
 def _variances(precision: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the diagonal (k,) of Jᵀ P⁻¹ J for columns J (p, k), from a precision matrix P with unit diagonal."""
+    """Return the diagonal (k,) of Jᵀ P⁻¹ J for columns J (p, k) and a precision matrix P with unit diagonal."""
     try:
         factor = np.linalg.cholesky(precision + 1e-12 * np.eye(len(precision)))
     except np.linalg.LinAlgError:
@@ -213,10 +228,15 @@ def _variances(precision: np.ndarray, columns: np.ndarray) -> np.ndarray:
 
 
 def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the squared distances (m,) [m²] of poses from the nearest fitted pose, and from each joint's range.
+    """Return squared distances (m,) [m²] of poses: from the nearest fitted pose, and from the joints' fitted ranges.
 
-    The distance from a joint's range is that within which `NEAR_SHARE` of the fitted poses are: a few poses far from
-    the others do not determine the error of a joint there.
+    For each joint, the second distance is the smallest one within which a share `NEAR_SHARE` of the fitted poses lie. A
+    few poses far from the others therefore do not extend the fitted range.
+
+    Args:
+        q: (m, n) joint values [rad or m].
+        learnt: (k, n) joint values of the fitted poses.
+        levers: (n,) motion of the tool per unit of each joint [m/rad or 1], by which joint differences are multiplied.
     """
     nearest = KDTree(learnt * levers).query(q * levers)[0]
     count = len(learnt)
@@ -238,7 +258,12 @@ def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[n
 
 
 def _joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return how far the tip moves per unit of each joint (n,) [m/rad or 1], rms over poses."""
+    """Return the motion of the tip per unit of each joint (n,) [m/rad or 1], rms over poses.
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values of the poses [rad or m].
+    """
     poses = q[evenly(len(q), LEVER_POSES)]
     result = np.zeros(chain.n)
     for joint in range(chain.n):
@@ -252,14 +277,15 @@ def _joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def learn_errors(selection: ModelSelection, measured: Sequence[PoseMeasurements], seed: int = 0) -> ErrorModel | None:
-    """Return the error model, estimated from the errors on held-out rows; None if too few positions were measured.
+    """Return the error model, estimated from the errors on held-out rows; None where too few positions were measured.
 
-    For every fold the geometry and the ridges of all chosen effects are estimated anew: ridges from all rows would
-    depend on the held-out rows. With a robust loss, rows beyond `MAX_RESIDUAL` robust sigmas are ignored.
+    For every fold, the geometry and the ridges (prior standard deviations) of all chosen effects are estimated again,
+    since ridges from all rows would depend on the held-out rows. With a robust loss, rows beyond `MAX_RESIDUAL` robust
+    sigmas are ignored.
 
     Args:
         selection: the model and its fit of all rows.
-        measured: the blocks it was fitted to.
+        measured: the blocks to which it was fitted.
         seed: seed of the random folds.
     """
     fit = selection.fit
@@ -297,7 +323,13 @@ def learn_errors(selection: ModelSelection, measured: Sequence[PoseMeasurements]
 
 
 def _range_folds(measured: Sequence[PoseMeasurements]) -> list[tuple[int, Folds]]:
-    """Return, for each joint, its index and the two folds that hold out the ends of its range."""
+    """Return, for each joint that moves, its index and two folds.
+
+    The folds hold out the lower and the upper end of the joint's range.
+
+    Args:
+        measured: the blocks of measurements.
+    """
     q = np.concatenate([block.q for block in measured])
     edges = np.cumsum([len(block) for block in measured])[:-1]
     result = []
@@ -317,17 +349,17 @@ class _Rows:
     """Residuals and Jacobians of a fit's rows at the rigid geometry, from which folds are evaluated.
 
     Attributes:
-        chosen: per block, the numbers of the rows by which folds are judged.
-        measured: per block, the measurements of the chosen rows.
-        pose: per block, (m,) number of each row's pose.
+        chosen: for each block, the numbers of the rows used to evaluate the folds.
+        measured: for each block, the measurements of the chosen rows.
+        pose: for each block, (m,) number of each row's pose.
         poses: (p, n) joint values of all poses.
-        counts: per block, (m,) mask of the rows that are not gross.
-        free: positions of the fit's parameters without its corrections, then of all offered terms.
-        station: positions of the stations' placements among `free`.
+        counts: for each block, (m,) mask of the rows that are not gross outliers.
+        free: indices of the fit's parameters without its corrections, then of all terms of the chosen effects.
+        station: positions of the station placements in `free`.
         prior: standard deviations about the optimum, for parameters that a fold does not determine.
         coordinates: coordinates of the columns in which the statistics are expressed.
-        whitened: per block and residual part, residual and Jacobian.
-        metric: per block, residual and Jacobian of positions [m].
+        whitened: for each block and residual part, residual and Jacobian.
+        metric: for each block, residual and Jacobian of positions [m].
         total: statistics of all rows.
     """
 
@@ -366,7 +398,11 @@ class _Rows:
         self._condense()
 
     def _choose(self, measured: Sequence[PoseMeasurements]) -> None:
-        """Choose rows by which folds are judged: every k-th of very many."""
+        """Choose the rows used to evaluate the folds: of very many rows, every k-th.
+
+        Args:
+            measured: the blocks of measurements.
+        """
         stride = max(1, -(-sum(map(len, measured)) // MAX_POSES))
         self.chosen = [np.arange(0, len(block), stride) for block in measured]
         self.measured = [take(block, rows) for block, rows in zip(measured, self.chosen)]
@@ -383,7 +419,12 @@ class _Rows:
         self.poses = np.concatenate(poses)
 
     def _observe(self, fit: GeometricFit, cell: Installation) -> None:
-        """Evaluate residuals and Jacobians, whitened and in metres."""
+        """Compute residuals and Jacobians of all rows, whitened and in metres.
+
+        Args:
+            fit: the fit of all rows, whose sigmas and weights whiten them.
+            cell: the rigid installation at which derivatives are computed.
+        """
         sigmas = fit.used_sigmas()
         weights = fit.row_weights()
         self.whitened: list[list[tuple[np.ndarray, np.ndarray]]] = []
@@ -414,7 +455,16 @@ class _Rows:
         return sum(statistics[1:], statistics[0])
 
     def left_out(self, folds: Folds, levers: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield an array (rows, 5) per fold: |e|², trace J Σ Jᵀ, two squared distances to other rows, pose number."""
+        """Yield the errors on the held-out rows of each fold, as an array (rows, 5).
+
+        The columns are |e|² [m²] of the position error e, its variance trace J Σ Jᵀ [m²] due to the parameters (J
+        Jacobian, Σ their covariance), squared distances from the fitted poses and from the joints' ranges [m²] (as of
+        `_distances`), and the index of the pose.
+
+        Args:
+            folds: the partition of the rows.
+            levers: (n,) motion of the tool per unit of each joint [m/rad or 1].
+        """
         space = self.coordinates
         diagonal = np.arange(len(self.prior))
         sizes = space.sizes

@@ -1,20 +1,22 @@
-"""First guess of the instrument's and the target's placement, in closed form from the measurements.
+"""First guess of the placements of instrument and target, in closed form from the measurements.
 
 With the arm's poses A_i = (R_i, a_i) from the nominal chain:
 
 * full pose  B_i = S A_i X: rotations by Shah (2013, "Solving the robot-world/hand-eye calibration problem using the
-  Kronecker product"), then the two translations linearly; or, where the orientations differ too little for that, from
-  rotations and displacements together;
-* position   S⁻¹ y_i = R_i t + a_i: linear in S's rotation (9 numbers), its offset and t; the 9 are projected on SO(3);
+  Kronecker product"), then the two translations linearly. Where the orientations differ too little for this, rotations
+  and displacements together are used;
+* position   S⁻¹ y_i = R_i t + a_i: linear in the rotation of S (9 numbers), its offset and t; the 9 numbers are
+  projected on SO(3);
 * sockets    R_i t + a_i constant within each group: linear in t;
 * images     `calib.geometry.camera.camera_guess`.
 
-Each guess then gets a few robust Gauss–Newton steps on the frames alone (`calib.geometry.fit`).
+Each guess is then improved by a few robust Gauss–Newton steps on the placements alone (`calib.geometry.fit`).
 
-The nominal arm also reveals wrong units and orientations. A quaternion read in another order is still a
-quaternion, and of two rows the angle |log R_iᵀ R_j| = 2 acos |q_i · q_j| does not depend on the order. But to move the
-w is an odd permutation, a reflection of the quaternions' sphere, so that what is read is P R_iᵀ Q with constant P, Q:
-an inverse, which no placement S, X brings to the arm's S A_i X.
+The nominal arm also reveals wrong units and orientations. A quaternion read with its components in another order is
+still a quaternion, and for two rows the angle |log R_iᵀ R_j| = 2 acos |q_i · q_j| does not depend on the order. But
+moving the component w is an odd permutation, a reflection of the sphere of unit quaternions. The orientations read are
+then P R_iᵀ Q with constant P, Q. This contains the inverse of R_i, which no placements S, X can make agree with the
+arm's S A_i X.
 """
 
 import math
@@ -43,21 +45,22 @@ OPTICS: "Point[Callable[[Sequence[object]], Optics]]" = Point(
     "optics", "optics of kinds that are not the core's; loading it registers guesses and residuals"
 )
 
-# what a turn counts as [m/rad] (our choice)
+# length by which rotations are multiplied to compare them with displacements [m/rad] (our choice)
 LEVER = 0.3
-# rounds of rotation and offset, and of placement and offset
+# number of alternations between rotation and offset, and between placement and offset
 PLACING_ROUNDS = 5
-# rms turn of the target [rad] below which it tells no offset
+# smallest rms rotation of the target [rad] that determines its offset
 MIN_TURN = 0.01
-# rows by which orientations are checked, and fewest of them (our choice)
+# largest and smallest number of rows by which orientations are checked (our choice)
 CHECKED_ROWS = 200
 MIN_CHECKED_ROWS = 4
-# median misfit [deg] from which on a file's orientations are not what they are said to be (our choice)
+# smallest median misfit of orientations [deg] that contradicts their stated convention (our choice)
 MIN_ANGLE = 20.0
-# median misfits of another reading that explains them: an angle [deg], and a share of the positions' spread
+# largest median misfits of the reading that explains the orientations: an angle [deg], and a share of the
+# positions' spread
 MAX_ANGLE = 5.0
 MAX_MISFIT = 0.1
-# readings of orientations that are tried: what to tell the user, and order and signs of the quaternions as read
+# readings of orientations that are tried: text for the user, and order and signs of the quaternions as read
 READINGS = (
     (
         "read as w x y z they agree. If w comes first, name the columns in that order: qw, qx, qy, qz",
@@ -70,7 +73,7 @@ READINGS = (
         [-1, -1, -1, 1],
     ),
 )
-# questions about units by the factor of measured over predicted lengths
+# for each ratio of measured to predicted lengths, the question about units for the user
 UNITS = {
     1e3: "are they mm, although the header states m",
     1e-3: "are they m, although the header states mm",
@@ -80,18 +83,19 @@ UNITS = {
     25.4: "are they mm, although the header states in",
     0.03937: "are they inches, although the header states mm",
 }
-# no joint goes further: they may be rad read as deg (our choice)
+# largest joint angle for which values in rad may have been read as deg (our choice)
 MAX_TURN = 2.1 * math.pi * DEG
-# measured over predicted spread of the positions (our choice)
+# largest ratio of measured to predicted spread of positions, or of the inverse (our choice)
 MAX_RATIO = 15.0
-# spread of predicted positions from which they are held against the measured ones [m] (our choice)
+# smallest spread of predicted positions for which it is compared with that of the measured ones [m] (our choice)
 MIN_SPREAD = 1e-3
-# steps in which the turning of poses counts, and turning from which a tool is told well anyway [rad] (our choice)
+# steps in which rotations of poses are compared, and rotation that determines a tool well in any case [rad]
+# (our choice)
 TURN = 0.05
 TURNED = 6.0
-# rows of a block that a guess is made from (our choice)
+# largest number of rows of a block from which a guess is made (our choice)
 MAX_GUESS_ROWS = 300
-# share of the points of an alignment that are trusted, and how many at least
+# share of the points that an alignment uses, and their smallest number
 TRUSTED_SHARE = 0.8
 MIN_TRUSTED = 4
 
@@ -101,20 +105,20 @@ Guess = tuple[np.ndarray | None, np.ndarray]
 
 
 def misfit(arm: np.ndarray, measured: np.ndarray, station: np.ndarray, tool: np.ndarray, lever: float) -> np.ndarray:
-    """Return the distances (m,) [m] between measured poses B_i and predicted poses S A_i X of the target.
+    """Return the distances (m,) [m] between measured poses B_i and predicted poses S A_i X, angles included.
 
     Args:
         arm: (m, 4, 4) A_i, poses of the tip in the base.
         measured: (m, 4, 4) B_i, poses of the target in the station's frame.
         station, tool: S and X (4, 4).
-        lever: length by which angles [rad] are multiplied [m].
+        lever: length [m] by which angles [rad] are multiplied.
     """
     distance, turn = _differences(station @ arm @ tool, measured)
     return np.hypot(distance, lever * turn)
 
 
 def _differences(predicted: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distance (m,) [m] and the angle (m,) [rad] between poses (m, 4, 4)."""
+    """Return the distances (m,) [m] and the angles (m,) [rad] between predicted and measured poses (m, 4, 4)."""
     predicted_transposed = np.swapaxes(predicted[:, :3, :3], 1, 2)
     rotation = Rotation.from_matrix(predicted_transposed @ measured[:, :3, :3])
     displacement = predicted[:, :3, 3] - measured[:, :3, 3]
@@ -129,14 +133,17 @@ def average_pose(poses: np.ndarray) -> np.ndarray:
 
 
 def place_pose(arm: np.ndarray, measured: np.ndarray) -> Placements:
-    """Solve B_i = S A_i X for S and X: by orientations (Shah 2013) or rotations and displacements; the better of both.
+    """Return the placements S and X that solve B_i = S A_i X.
+
+    They are computed by orientations (Shah 2013) and by rotations and displacements together; the better solution is
+    returned.
 
     Args:
         arm: (m, 4, 4) poses A_i of the tip in the base.
         measured: (m, 4, 4) poses B_i of the target in the station's frame.
 
     Returns:
-        station (4, 4) and tool (4, 4).
+        S, the station (4, 4), and X, the tool (4, 4).
     """
     by_shah = by_orientations(arm, measured)
     by_motions = _by_displacements(arm, measured)
@@ -146,7 +153,14 @@ def place_pose(arm: np.ndarray, measured: np.ndarray) -> Placements:
 
 
 def by_orientations(arm: np.ndarray, measured: np.ndarray) -> Placements:
-    """Return S and X by Shah's method: accurate if the poses rotate about two axes by much more than their errors."""
+    """Return station S and tool X (4, 4) by Shah's method from the orientations of the poses.
+
+    The result is accurate if the poses rotate about two axes by much more than the errors of the orientations.
+
+    Args:
+        arm: (m, 4, 4) poses A_i of the tip in the base.
+        measured: (m, 4, 4) poses B_i of the target in the station's frame.
+    """
     # vec(R_S R_A R_X) = vec(R_B): the sum of R_B ⊗ R_A has vec(R_S) and vec(R_X) as its first singular pair
     kernel = np.einsum("mij,mkl->ikjl", measured[:, :3, :3], arm[:, :3, :3]).reshape(9, 9)
     u, _, vt = np.linalg.svd(kernel)
@@ -159,11 +173,16 @@ def by_orientations(arm: np.ndarray, measured: np.ndarray) -> Placements:
 
 
 def _by_displacements(arm: np.ndarray, measured: np.ndarray) -> Placements:
-    """Return S and X (4, 4) from rotations and displacements about the mean: accurate even for nearly one orientation.
+    """Return S and X (4, 4) from rotations and displacements about the mean; also accurate for nearly equal
+    orientations.
 
-    log(R_B,i R̄_Bᵀ) = R_S log(R_A,i R̄_Aᵀ), the chordal means being turned in the same way, and
-    y_i - ȳ = R_S (a_i - ā + (R_i - R̄) t): R_S by Kabsch on both, rotations multiplied by `LEVER` [m], alternating with
-    the linear solution for t.
+    log(R_B,i R̄_Bᵀ) = R_S log(R_A,i R̄_Aᵀ), where R̄ is the chordal mean of the rotations, and y_i - ȳ = R_S (a_i - ā +
+    (R_i - R̄) t). R_S is computed by Kabsch's method from both equations, with rotations multiplied by `LEVER` [m], in
+    alternation with the linear solution for t.
+
+    Args:
+        arm: (m, 4, 4) poses A_i = (R_A,i, a_i) of the tip in the base; R_i is R_A,i.
+        measured: (m, 4, 4) poses B_i = (R_B,i, y_i) of the target in the station's frame.
     """
     arm_mean, arm_turns = chordal_turns(arm[:, :3, :3])
     measured_mean, measured_turns = chordal_turns(measured[:, :3, :3])
@@ -179,13 +198,21 @@ def _by_displacements(arm: np.ndarray, measured: np.ndarray) -> Placements:
 
 
 def chordal_turns(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the chordal mean (3, 3) of rotations (m, 3, 3), and their rotation vectors (m, 3) from it."""
+    """Return the chordal mean (3, 3) of rotations (m, 3, 3), and the rotation vectors (m, 3) from this mean to each."""
     mean = orthonormal(rotations.mean(axis=0))
     return mean, Rotation.from_matrix(rotations @ mean.T).as_rotvec()
 
 
 def _translations(arm: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return p_S (3,) and t (3,) of  y_i - R_S a_i = R_S R_i t + p_S; poorly identifiable components of t are 0."""
+    """Return the positions p_S (3,) of the station and t (3,) of the target on the tool [m].
+
+    They solve y_i - R_S a_i = R_S R_i t + p_S; components of t that are poorly identifiable are 0.
+
+    Args:
+        arm: (m, 4, 4) poses (R_i, a_i) of the tip in the base.
+        position: (m, 3) measured positions y_i [m].
+        rotation: (3, 3) R_S, rotation of the station.
+    """
     turned = rotation @ arm[:, :3, :3]
     target = position - arm[:, :3, 3] @ rotation.T
     turned_from_mean = turned - turned.mean(axis=0)
@@ -198,14 +225,14 @@ def _translations(arm: np.ndarray, position: np.ndarray, rotation: np.ndarray) -
 
 
 def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
-    """Raise an error for quaternions in another order than the header's, and for inverted orientations.
+    """Raise an error where quaternions have another component order than stated, or orientations are inverted.
 
     Args:
         chain: the nominal arm.
         block: measurements of any kind; only full poses are checked.
 
     Raises:
-        MeasurementError: if the orientations contradict the arm as read, and agree in another reading.
+        MeasurementError: the orientations as read contradict the arm, and agree with it in another reading.
     """
     if not isinstance(block, Poses):
         return
@@ -238,7 +265,7 @@ def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tu
         quaternion: (m, 4) measured orientations, x y z w.
 
     Returns:
-        The median angle [deg], and the median distance divided by the positions' spread.
+        The median angle [deg], and the median distance divided by the positions' standard deviation.
     """
     measured = from_quaternion(position, quaternion)
     station, tool = place_pose(arm, measured)
@@ -248,14 +275,19 @@ def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tu
 
 
 def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflection | None = None) -> Installation:
-    """Return the nominal arm with its stations and tools placed by a first guess from the measurements.
+    """Return the nominal arm with stations and tools placed by a first guess from the measurements.
 
-    A tool seen in several blocks takes its guess from the block that constrains most (poses before positions before
-    other kinds, then the block whose poses rotate most, then the one with most rows); a station likewise. Tools that no
-    block can place start at the tip.
+    The guess for a tool measured in several blocks is taken from the block that determines it best: poses before
+    positions before other kinds, then the block whose poses rotate most, then the block with most rows. Stations are
+    treated in the same way. Tools that no block can place start at the tip.
+
+    Args:
+        chain: the nominal arm.
+        measured: blocks of measurements.
+        known: deflections of an earlier fit, kept fixed; None without such deflections.
 
     Raises:
-        MeasurementError: if there are too few rows to place an instrument.
+        MeasurementError: there are too few rows to place an instrument.
     """
     foreign = [block for block in measured if block.kind not in KINDS]
     optics = NoOptics()
@@ -297,15 +329,15 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
 
 
 def check_scale(block: PoseMeasurements, chain: Chain) -> None:
-    """Raise an error if the measured positions spread far more or far less than the predicted ones.
+    """Raise an error if the measured positions spread much more or much less than the predicted ones.
 
     Args:
-        block: measurements; those without positions pass.
+        block: measurements; blocks without positions are accepted.
         chain: the nominal arm, which predicts the positions.
 
     Raises:
-        MeasurementError: for a ratio beyond `max_ratio`, with the units that would explain it; for positions on a
-            line.
+        MeasurementError: the ratio of the two spreads, or its inverse, is above `MAX_RATIO` (the message names the
+            units that would explain it), or the positions lie on a line.
     """
     if not isinstance(block, Positions) or len(block) < 3:
         return
@@ -333,14 +365,20 @@ def check_scale(block: PoseMeasurements, chain: Chain) -> None:
 
 
 def _spread(positions: np.ndarray) -> tuple[float, float]:
-    """Return the standard deviation of positions (m, 3), over all axes and across their principal line [m]."""
+    """Return the standard deviation of positions (m, 3) [m], over all axes, and across their principal line."""
     centred = positions - positions.mean(axis=0)
     sizes = np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(positions))
     return float(np.linalg.norm(sizes)), float(sizes[1])
 
 
 def _likely_units(block: Positions, chain: Chain, measured: float, predicted: float) -> tuple[str, str]:
-    """Return a question about the units that would explain the spread, and the column header to write."""
+    """Return a question about the units that would explain the spread, and a column header that states these units.
+
+    Args:
+        block: measured positions.
+        chain: the nominal arm.
+        measured, predicted: spreads of the measured and of the predicted positions [m].
+    """
     # what to ask about the joints, the spread that follows, and the header that states the unit
     guesses = [("", predicted, "'x [mm]'")]
     if np.abs(block.q).max() < MAX_TURN:
@@ -358,7 +396,12 @@ def _likely_units(block: Positions, chain: Chain, measured: float, predicted: fl
 
 
 def _turning(chain: Chain, block: PoseMeasurements) -> float:
-    """Return how much a block's poses rotate about their second principal axis, in steps of `TURN` [rad]."""
+    """Return the size of a block's rotations about their second principal axis, in steps of `TURN` [rad].
+
+    Args:
+        chain: the nominal arm, which predicts the rotations.
+        block: measurements of any kind.
+    """
     rows = evenly(len(block), MAX_GUESS_ROWS)
     if len(rows) < 3:
         return 0.0
@@ -372,13 +415,13 @@ def _turning(chain: Chain, block: PoseMeasurements) -> float:
 def guess(
     block: PoseMeasurements, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
-    """Return the placements of station and tool for one target; a placement that is given is kept.
+    """Return the placements of station and tool for one target; given placements are kept.
 
     Args:
         block: measurements.
         arm: poses (4, 4) of the tip in the base, one per row.
         rows: the target's rows in the block.
-        station, tool: (4, 4) placements known already; None for those to guess.
+        station, tool: (4, 4) placements that are already known; None for those to guess.
     """
     arm = arm[rows]
     if isinstance(block, Positions):
@@ -408,14 +451,16 @@ def guess(
 def _place_position(
     arm: np.ndarray, measured: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Solve y_i = S (R_i t + a_i) linearly for S and t, or for one of them if the other is given.
+    """Return station S and target position t that solve y_i = S (R_i t + a_i); a placement that is given is kept.
 
-    Of the linear solution and two plainer ones (target at the tip; target at the tip with the mean offset) the one with
-    the smallest median error is taken, since a small workspace ruins the linear one.
+    If both are unknown, they are computed alternately: S by Kabsch's method, t as the median offset. The iteration
+    starts from t = 0 and from the linear solution, which is inaccurate in a small workspace. The result with the
+    smallest median error is returned.
 
     Args:
         arm: (m, 4, 4) poses A_i of the tip in the base.
         measured: (m, 3) measured positions y_i [m].
+        station, tool: (4, 4) placements that are already known; None for those to guess.
     """
     rotation = arm[:, :3, :3]
     position = arm[:, :3, 3]
@@ -442,12 +487,19 @@ def _place_position(
 
 
 def _median_offset(rotation: np.ndarray, lever: np.ndarray) -> np.ndarray:
-    """Return the median of the levers (m, 3) in the frames of rotations (m, 3, 3)."""
+    """Return the median (3,) [m] of vectors R_iᵀ l_i, with R = `rotation` (m, 3, 3) and l = `lever` (m, 3) [m]."""
     return np.median(np.einsum("mji,mj->mi", rotation, lever), axis=0)
 
 
 def _linear_offset(rotation: np.ndarray, position: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return the offset t (3,) [m] that solves R_Sᵀ y - c - R t = a, linear in the nine numbers of R_Sᵀ, c and t."""
+    """Return the target's offset t (3,) [m] in the tip that solves R_Sᵀ y - c - R t = a by linear least squares.
+
+    The unknowns are the nine numbers of the station's rotation R_Sᵀ, its offset c, and t.
+
+    Args:
+        rotation, position: (m, 3, 3) R and (m, 3) a, poses of the tip in the base.
+        measured: (m, 3) y, measured positions [m].
+    """
     m = len(measured)
     centre = measured.mean(axis=0)
     rows = np.zeros((m, 3, 15))
@@ -460,7 +512,10 @@ def _linear_offset(rotation: np.ndarray, position: np.ndarray, measured: np.ndar
 
 
 def _align(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return the pose S with measured ≈ S points (Kabsch 1976); the worst fifth is trimmed once."""
+    """Return the pose S (4, 4) with measured ≈ S points (Kabsch 1976), for points (m, 3) and measured (m, 3) [m].
+
+    It is computed twice, the second time without the fifth of the points that fits worst.
+    """
     trusted = np.ones(len(points), dtype=bool)
     placement = np.eye(4)
     for _ in range(2):
@@ -477,7 +532,12 @@ def _align(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
 
 def _place_sockets(arm: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Return the offset t (3,) for which R_i t + a_i varies least within each group."""
+    """Return the offset t (3,) [m] for which R_i t + a_i varies least within each group of rows at one socket.
+
+    Args:
+        arm: (m, 4, 4) poses (R_i, a_i) of the tip in the base.
+        group: (m,) number of the socket of each row.
+    """
     rotation, position = arm[:, :3, :3].copy(), arm[:, :3, 3].copy()
     for number in np.unique(group):
         rows = group == number

@@ -1,4 +1,8 @@
-"""Fit of the geometry: Levenberg–Marquardt on the whitened residuals of all kinds of measurements together."""
+"""Fit of the geometry: Levenberg–Marquardt on the whitened residuals of all kinds of measurements together.
+
+The prior of making of a parameter is a normal distribution about its nominal value; its width is a plausible
+manufacturing deviation.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -29,29 +33,29 @@ from calib.geometry.weighing import GeometricFit, Settings, Weigher
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain, element_length
 
-# How far a parameter of a real arm may be from its nominal by making: one standard deviation (our choice)
+# standard deviation of a manufactured arm's parameter from its nominal value, by unit (our choice)
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}
-# widths of making of a usual arm: what one more parameter would say (our choice)
+# the same for a typical arm; it enters the estimate of the widths as one more parameter (our choice)
 TYPICAL = {"m": 3e-3, "rad": 5e-3}
-# measured numbers per unknown at least (our choice)
+# smallest number of measured numbers per unknown (our choice)
 MIN_NUMBERS = 1.5
-# fits with new widths of making, which then change by less than their uncertainty
+# number of fits with new widths of making; afterwards the widths change by less than their uncertainty
 WIDTH_UPDATES = 2
-# of WᵀW with its diagonal scaled to 1; its root of columns
+# relative rounding error of WᵀW with its diagonal scaled to 1; for columns of W its square root
 ROUNDING = 1e-12
-# of the fixed point of the widths between two fits
+# largest number of fixed-point iterations of the widths between two fits
 WIDTH_ROUNDS = 30
-# share of its largest coefficient from which a parameter counts as merged with another
+# a parameter depends on another if its coefficient is at least this share of its largest coefficient
 MERGED = 0.1
 # relative deviation of a column's coefficients from those of a common scale (our choice)
 SCALE_DEVIATION = 0.2
-# poses with which the fit of many more begins, and that widths are estimated from (our choice)
+# number of poses with which a fit of many more poses begins, and from which widths are estimated (our choice)
 WARM_POSES = 2000
-# passes at most until the noise of images settles (our choice)
+# largest number of passes until the noise of images converges (our choice)
 IMAGE_PASSES = 20
-# linearisations after which a placement that has not settled does not tell itself (our choice)
+# number of linearisations after which a placement that has not converged is poorly determined (our choice)
 CRAWLS = 60
-# relative size of a column of a placement that a block hardly tells (our choice)
+# relative size of a placement's column below which a block hardly determines the direction (our choice)
 MIN_COLUMN = 1e-3
 
 
@@ -66,24 +70,27 @@ def fit(
 ) -> GeometricFit:
     """Return the most probable geometry: all candidate parameters of the arm, each with a prior of making.
 
-    Minimises Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / w)². No parameter of the arm is selected: parameters that merge
-    share the effect that the measurements determine, and undetermined ones stay near nominal. The widths w of making,
-    one for joint offsets, one for other angles and one for lengths, maximise the evidence (MacKay 1992). Placements
-    have no prior: only their base columns are fitted, and arm parameters that merely displace base or tool stay at
-    nominal. The identifiable parameters are computed afterwards (`GeometricFit.split`, `GeometricFit.base_sigma`).
+    A prior of making is a normal distribution about the nominal value, as wide as plausible manufacturing deviations.
+    The fit minimises Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / w)². No parameters of the arm are selected. Parameters
+    that cannot be distinguished share the effect that the measurements determine, and undetermined parameters stay near
+    nominal. There are three widths w of making: for joint offsets, for other angles and for lengths. They are chosen to
+    maximise the evidence (MacKay 1992). x are the parameters, y the measured and f(x) the predicted numbers, σ their
+    standard deviations. Placements of stations and tools have no prior: only their base parameters are fitted, and arm
+    parameters that merely displace base or tool stay at nominal. The identifiable parameters are computed afterwards
+    (`GeometricFit.split`, `GeometricFit.base_sigma`).
 
     Args:
-        cell: installation to start from, with frames placed (`calib.geometry.first_guess`).
+        cell: installation to start from, with stations and tools placed (`calib.geometry.first_guess`).
         measured: blocks of measurements.
-        candidates: (c,) positions in the parameter vector; None for all.
-        settings: see `Settings`.
-        prior: standard deviations of the whole parameter vector about its present values; infinite where the prior of
-            making applies; None for making everywhere.
-        widths: whether to estimate the widths of making; False to use `PLAUSIBLE`.
+        candidates: (c,) indices in the parameter vector; None for all parameters.
+        settings: settings of the fit; None for the defaults.
+        prior: standard deviations of the whole parameter vector about its present values [m or rad], infinite where the
+            prior of making applies; None for the prior of making everywhere.
+        widths: True estimates the widths of making; False uses `PLAUSIBLE`.
 
     Raises:
-        MeasurementError: if there are fewer rows than identifiable parameters.
-        Unidentifiable: if the rows determine no parameter.
+        MeasurementError: there are fewer rows than identifiable parameters.
+        Unidentifiable: the rows determine no parameter.
     """
     settings = settings or Settings()
     table = layout(cell)
@@ -116,7 +123,14 @@ def fit(
 
 
 def _require_enough(cell: Installation, blocks: list[Block], unknowns: int) -> None:
-    """Raise an error for fewer than `MIN_NUMBERS` measured numbers per unknown: such a fit could not be checked."""
+    """Raise MeasurementError for fewer than `MIN_NUMBERS` measured numbers per unknown, since a fit could not be
+    checked.
+
+    Args:
+        cell: the installation.
+        blocks: the prepared measurements.
+        unknowns: number of parameters to estimate.
+    """
     numbers = 0
     poses = 0
     for block in blocks:
@@ -134,14 +148,17 @@ def _require_enough(cell: Installation, blocks: list[Block], unknowns: int) -> N
 
 
 def plain_fit(cell: Installation, measured: Sequence[PoseMeasurements]) -> GeometricFit | None:
-    """Return the plain reference: all parameters, the widest priors of making, every row with the same weight.
+    """Return the plain reference: all parameters, the widest priors of making, and equal weight for every row.
 
-    Only the parameters and the noise are estimated, and nothing is selected, as a short script on SciPy would do. Other
-    results are compared with it. None if there are too few rows.
+    Only the parameters and the noise are estimated, and nothing is selected, as in a short script with SciPy. Other
+    results are compared with it.
 
     Args:
-        cell: the nominal arm, with frames placed.
+        cell: the nominal arm, with stations and tools placed.
         measured: blocks of measurements.
+
+    Returns:
+        The fit; None if there are too few rows.
     """
     try:
         return fit(cell, measured, layout(cell).rigid_index, widths=False)
@@ -150,9 +167,15 @@ def plain_fit(cell: Installation, measured: Sequence[PoseMeasurements]) -> Geome
 
 
 def _estimated(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
-    """Return the parameters to estimate: those of the arm that have an effect, and the base columns of all others.
+    """Return the parameters to estimate: arm parameters that have an effect, and base parameters of all other kinds.
 
-    Parameters of the arm that only displace base or tool stay at nominal: those frames account for them.
+    Arm parameters that only displace base or tool are excluded: the placements of base and tool represent the same
+    effect.
+
+    Args:
+        cell: the installation.
+        split: the candidates, split into base parameters and dependent ones.
+        candidates: (c,) indices in the parameter vector.
     """
     arm = layout(cell).index("arm")
     in_arm = np.isin(candidates[split.kept], arm)
@@ -165,10 +188,15 @@ def _estimated(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -
 
 
 def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
-    """Return the arm's longest length and the parameters that merge with it; empty for an arm without lengths.
+    """Return the arm's longest length and the parameters that cannot be distinguished from it; empty without lengths.
 
-    A smaller arm explains sockets and planes as well, so that the scale has to come from the nominal arm: the longest
-    length keeps its nominal value, as do the parameters that could replace it.
+    Sockets and planes are explained equally well by a smaller arm, so that the scale must be taken from the nominal
+    arm: the longest length keeps its nominal value, as do the parameters that could replace it.
+
+    Args:
+        cell: the installation.
+        split: the candidates, split into base parameters and dependent ones.
+        candidates: (c,) indices in the parameter vector.
     """
     lengths = np.zeros(len(candidates))
     for column, parameter in enumerate(candidates):
@@ -193,12 +221,12 @@ def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndar
 
 
 def _depend_by_scale(lengths: np.ndarray, split: ColumnSplit) -> np.ndarray:
-    """Return a mask (p - b,) of the dropped columns that depend on the kept ones as under a common factor on all
+    """Return a mask (p - b,) of the dropped columns that depend on the kept ones as under a scale common to all
     lengths.
 
     Args:
         lengths: (p,) values of the candidate columns that are lengths [m]; zero for others.
-        split: the split of the candidate columns into b base columns and dropped ones.
+        split: the split of the p candidate columns into b base columns and dropped ones.
     """
     base_lengths = lengths[split.kept]
     lengths_kept = base_lengths != 0.0
@@ -222,15 +250,15 @@ def _making(
     has_stated_prior: np.ndarray,
     settings: Settings,
 ) -> tuple[Installation, np.ndarray]:
-    """Return a first fit and the prior (f,) with the most probable widths of making, from a sample of many poses.
+    """Return a first fit, and the prior (f,) with the most probable widths of making, from a sample of many poses.
 
     Args:
         cell: the nominal installation.
         blocks: measurements prepared for it.
-        free: (f,) positions in the parameter vector.
-        prior: (f,) standard deviations to begin with; infinite for none.
-        has_stated_prior: (f,) mask of the parameters whose prior was stated and stays.
-        settings: see `Settings`.
+        free: (f,) indices in the parameter vector.
+        prior: (f,) initial standard deviations of the prior [m or rad]; infinite for no prior.
+        has_stated_prior: (f,) mask of the parameters whose prior was given by the user and is kept.
+        settings: settings of the fit.
     """
     sample = _sample(cell, blocks, _sampled_rows(blocks, len(free)))
     family = _making_families(cell, free, has_stated_prior)
@@ -250,7 +278,14 @@ def _making(
 
 
 def _sampled_rows(blocks: list[Block], parameters: int) -> list[np.ndarray]:
-    """Return random rows of each block, `WARM_POSES` or four per parameter; all where there are not as many."""
+    """Return numbers of random rows of each block: `WARM_POSES` in all, or four per parameter if this is more.
+
+    All rows are returned where there are not so many.
+
+    Args:
+        blocks: the prepared measurements.
+        parameters: number of fitted parameters.
+    """
     return sampled([block.measured for block in blocks], max(WARM_POSES, 4 * parameters))
 
 
@@ -261,15 +296,16 @@ def _sample(cell: Installation, blocks: list[Block], block_rows: list[np.ndarray
 def _most_probable_widths(
     data: Gram, family: np.ndarray, prior: np.ndarray, widest: np.ndarray, typical: np.ndarray
 ) -> np.ndarray:
-    """Return the prior (f,) with the most probable width of each family, by MacKay's fixed point (1992).
+    """Return the prior (f,) with the most probable width of each family, by MacKay's fixed-point iteration (1992).
 
-    w² = (Σ x² + w_0²) / (Σ γ + 1), with γ = 1 - σ² / w² the share that the data determine of a parameter: `typical`
-    counts as one more parameter of the family, and decides where the data do not determine w (our choice).
+    w² = (Σ x² + w_0²) / (Σ γ + 1), with γ = 1 - σ² / w² the share of a parameter that is determined by the data. The
+    width w_0 of `typical` enters as one more parameter of the family, and determines w where the data do not (our
+    choice).
 
     Args:
-        data: whitened statistics (f, f) of the rows, parameters counted from nominal.
-        family: (f,) family of each parameter; -1 for a width that stays.
-        prior: (f,) widths to begin with; infinite for none.
+        data: whitened statistics (f, f) of the rows, for the parameters' differences from nominal.
+        family: (f,) family of each parameter; -1 for a width that is not changed.
+        prior: (f,) initial widths; infinite for no prior.
         widest: (f,) upper bounds of the widths.
         typical: (f,) widths w_0 of a typical arm.
     """
@@ -293,7 +329,15 @@ def _most_probable_widths(
 
 
 def _making_families(cell: Installation, free: np.ndarray, has_stated_prior: np.ndarray) -> np.ndarray:
-    """Return each parameter's family (f,): joint offsets, other angles, lengths; -1 for no width of making."""
+    """Return each parameter's family (f,): joint offsets, other angles or lengths.
+
+    -1 is for a parameter without width of making.
+
+    Args:
+        cell: the installation.
+        free: (f,) indices in the parameter vector.
+        has_stated_prior: (f,) mask of the parameters whose prior was given by the user, which have no width of making.
+    """
     kinds = np.where(has_stated_prior, "", families(cell)[free])
     family = np.full(len(free), -1)
     number = 0
@@ -314,19 +358,24 @@ def fit_with_prior(
     nominal: Installation | None = None,
     warm: bool = False,
 ) -> GeometricFit:
-    """Return the fit of exactly the parameters `free`: min Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)².
+    """Return the fit of exactly the parameters `free`, which minimises squared residuals and distances from nominal.
 
-    Sigmas that no file states are estimated, one per file and kind of residual (position, orientation …), and the fit
-    is repeated until sigmas and robust weights settle. With thousands of poses the fit starts from that of a sample.
+    The minimised function is Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)², with x the parameters, y the
+    measured and f(x) the predicted numbers, σ their standard deviations.
+
+    Sigmas that no file states are estimated, one per file and kind of residual (position, orientation …). The fit is
+    repeated until sigmas and robust weights have converged. With thousands of poses the fit starts from the fit to a
+    sample of the rows.
 
     Args:
         cell: installation to start from.
         blocks: measurements prepared for this installation.
-        free: (f,) positions in the parameter vector.
-        prior: (f,) standard deviations; infinite for none.
-        settings: see `Settings`.
+        free: (f,) indices in the parameter vector.
+        prior: (f,) standard deviations of the parameters about nominal [m or rad], infinite for no prior; None for no
+            prior at all.
+        settings: settings of the fit; None for the defaults.
         nominal: mean of the prior; None for `cell`.
-        warm: whether `cell` is fitted already, so that its residuals give the first sigmas.
+        warm: True where `cell` is already fitted, so that the first sigmas can be estimated from its residuals.
     """
     settings = settings or Settings()
     state = cell
@@ -361,12 +410,12 @@ def fit_with_prior(
 def plausible_deviation(
     cell: Installation, columns: np.ndarray, deviations: Mapping[str, float] = PLAUSIBLE
 ) -> np.ndarray:
-    """Return the plausible manufacturing deviation (c,) of each parameter; infinite for frames and deflections.
+    """Return the plausible manufacturing deviation (c,) of each parameter; infinite for placements and deflections.
 
     Args:
         cell: the installation.
-        columns: (c,) positions in the parameter vector.
-        deviations: deviation of an arm's parameter, by unit: `PLAUSIBLE`, or `TYPICAL` of a usual arm.
+        columns: (c,) indices in the parameter vector.
+        deviations: deviation of an arm's parameter by unit: `PLAUSIBLE`, or `TYPICAL` for a usual arm.
     """
     table = layout(cell)
     result = np.full(len(columns), np.inf)
@@ -379,15 +428,27 @@ def plausible_deviation(
 def polish_frames(
     cell: Installation, measured: Sequence[PoseMeasurements], settings: Settings | None = None
 ) -> GeometricFit:
-    """Return the fit of station and tool placements only; the arm stays as it is."""
+    """Return the fit of station and tool placements only; the arm's parameters are not changed.
+
+    Args:
+        cell: the installation to start from.
+        measured: blocks of measurements.
+        settings: settings of the fit; None for the defaults.
+    """
     return fit(cell, measured, layout(cell).frame_index, settings=settings)
 
 
 def placed_on(cell: Installation, block: PoseMeasurements, settings: Settings) -> GeometricFit:
-    """Return the arm with base and tool placement fitted to one block, arm and deflections unchanged.
+    """Return the arm with base and tool placement fitted to one block; arm and deflections are not changed.
 
-    If that fit does not converge because the block hardly identifies some direction (the rotation about a straight line
-    of poses), directions with columns below `MIN_COLUMN` are kept. The solution's status states whether it converged.
+    The block may hardly identify some direction, such as the rotation about a straight line of poses. If the fit does
+    not converge for this reason, such directions (columns below `MIN_COLUMN`) are not changed. The solution's status
+    records whether the fit converged.
+
+    Args:
+        cell: the installation to start from.
+        block: the measurements.
+        settings: settings of the fit.
     """
     start = install(cell.chain, [block], cell.known)
     start = replace(start, deflection=cell.deflection, optics=start.optics.like(cell.optics))
@@ -400,14 +461,17 @@ def placed_on(cell: Installation, block: PoseMeasurements, settings: Settings) -
 def without_corrections(
     cell: Installation, rigid: Chain, blocks: Sequence[PoseMeasurements], settings: Settings
 ) -> Installation | None:
-    """Return the arm without corrections (for a URDF), frames fitted again; None if `cell` has no corrections.
+    """Return the arm without joint corrections (for a URDF), with base and tool placement fitted again.
 
     Args:
         cell: the calibrated installation.
         rigid: the best geometry without corrections; the geometry in `cell` is valid only together with its
             corrections.
-        blocks: the fit's rows.
-        settings: of the fit.
+        blocks: the fitted measurements.
+        settings: settings of the fit.
+
+    Returns:
+        The installation; None if `cell` has no corrections.
     """
     if not (cell.deflection.terms or cell.known.terms):
         return None

@@ -37,7 +37,7 @@ FRAME_AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class NoOptics:
-    """Instrument parameters of an installation without cameras: an empty set."""
+    """Optics of an installation without cameras: an empty set of parameters."""
 
     names: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
@@ -48,17 +48,20 @@ class NoOptics:
         return 0
 
     def like(self, optics: object) -> NoOptics:
-        """Return these instruments with the parameter values of `optics`."""
+        """Return these optics with the parameter values of `optics`; without cameras, the object itself."""
         return self
 
     def view(self, measured: PoseMeasurements, free: np.ndarray) -> View | None:
-        """Return what these instruments add to a block's prediction; here None. `free` counts from the optics' first
-        parameter.
+        """Return what the optics add to the prediction of a block; None without cameras.
+
+        Args:
+            measured: the block of measurements.
+            free: indices of fitted parameters, counted from the first parameter of the optics.
         """
         return None
 
     def tables(self) -> Mapping[str, object]:
-        """Return the tables of ``robot.toml`` with these parameters."""
+        """Return the tables of ``robot.toml`` that contain these parameters; empty without cameras."""
         return {}
 
 
@@ -70,9 +73,9 @@ class Installation:
         chain: the arm, base to tip.
         stations: (S, 4, 4) poses of the arm's base in each instrument's frame.
         tools: (T, 4, 4) poses of each target in the tip's frame.
-        station_names, tool_names: S and T strings.
-        deflection: joint corrections as functions of q (effects of the ladder), to be fitted.
-        known: deflections of an earlier fit, kept fixed.
+        station_names, tool_names: names of the S stations and T tools.
+        deflection: joint corrections as functions of q, to be fitted.
+        known: deflections of an earlier fit, which are not changed.
         optics: parameters of cameras and boards for images, with the interface of `NoOptics`.
     """
 
@@ -91,12 +94,14 @@ class Installation:
 
     @property
     def reach(self) -> float:
-        """Largest distance of a target from the base of the stretched arm [m], at the joints' zero where they slide."""
+        """Largest distance of a target from the base with the arm stretched [m]; prismatic joints are taken at zero."""
         tool_lengths = np.linalg.norm(self.tools[:, :3, 3], axis=1)
         return self.chain.stretched_length() + float(tool_lengths.max(initial=0.0))
 
     def merged(self) -> Installation:
-        """Return the installation with known and fitted deflections merged."""
+        """Return the installation with the known deflections of an earlier fit and the fitted ones in one field,
+        `deflection`.
+        """
         if not self.known.terms:
             return self
         terms = (*self.known.terms, *self.deflection.terms)
@@ -112,13 +117,13 @@ class Installation:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Targets predicted in the instrument's frame, for m rows.
+    """Predicted targets in the instrument's frame, for m rows.
 
     Attributes:
-        walked: the pass along the chain, in the station's frame.
+        walked: frames along the chain, in the station's frame.
         point: (3, m) target positions [m].
         rotation: (3, 3, m) target rotations, ``rotation[c]`` being column c.
-        view: camera and board with which images are predicted; None for other instruments.
+        view: camera and board by which images are predicted; None for other instruments.
     """
 
     walked: Sweep
@@ -139,15 +144,15 @@ def see(
     bases: np.ndarray | None = None,
     displacements: np.ndarray | None = None,
 ) -> Seen:
-    """Return the targets in an instrument's frame at joint values q (m, n).
+    """Return the predicted targets in an instrument's frame at joint values q (m, n).
 
     Args:
         cell: the installation.
         q: (m, n) [rad or m].
-        station: index of the instrument placement; -1 for the arm's base frame.
+        station: index of the station; -1 for the arm's base frame.
         tool: index of the target, one or (m,).
-        bases: (E, m) of the deflection's terms at q; evaluated here where None.
-        displacements: (K, m) of elements by the known deflections; evaluated here where None.
+        bases: (E, m) basis functions of the deflection's E terms at q; None computes them.
+        displacements: (K, m) displacements of the K elements by the known deflections; None computes them.
     """
     fitted = extra_displacements(cell.chain, cell.deflection, q, bases)
     if displacements is None:
@@ -171,7 +176,7 @@ def see(
 
 @dataclass(frozen=True)
 class _Frames:
-    """Tables of stations, tools, cameras and boards; each entry has a name and a placement."""
+    """Tables of stations, tools, cameras and boards in ``robot.toml``; each entry has a name and a placement."""
 
     station: tuple[Mapping[str, object], ...] = ()
     tool: tuple[Mapping[str, object], ...] = ()
@@ -180,30 +185,38 @@ class _Frames:
 
 
 def frame_tables(cell: Installation) -> dict[str, object]:
-    """Return the tables ``station`` and ``tool`` of an installation, and those of its cameras and boards."""
+    """Return the tables ``station`` and ``tool`` of an installation, and the tables of its cameras and boards.
+
+    Args:
+        cell: the installation of arm, stations, tools and optics.
+    """
     stations = [{"name": name, **placement_table(pose)} for name, pose in zip(cell.station_names, cell.stations)]
     tools = [{"name": name, **placement_table(pose)} for name, pose in zip(cell.tool_names, cell.tools)]
     return {**cell.optics.tables(), "station": stations, "tool": tools}
 
 
 def read(path: str | Path) -> Installation:
-    """Read the installation written by a fit, deflections included.
+    """Return the installation written by a fit, deflections included.
 
     Args:
-        path: the folder of a fit, or its ``robot.toml``; any other robot file gives identity frames.
+        path: the folder of a fit, or its ``robot.toml``. In any other robot file, stations and tools are missing and
+            are set to identity.
     """
     robot, extra = calibrated.read_whole(path)
     return _placed(robot.complete, extra, str(path), robot.deflection)
 
 
 def read_arms(path: str | Path) -> tuple[Installation, Installation]:
-    """Return the calibrated arm of a fit (see `read`) and the nominal arm that it started from.
+    """Return the calibrated arm of a fit, as `read` does, and the nominal arm from which the fit started.
 
-    The nominal arm has the frames with which it fits the same measurements best; if the file lacks them (an earlier
-    version's fit that started from another fit) it has no stations and no tools.
+    The nominal arm has the placements with which it fits the same measurements best. It has no stations and no tools if
+    the file does not contain these placements (a file of an earlier version whose fit started from another fit).
+
+    Args:
+        path: the folder of a fit, or its ``robot.toml``.
 
     Raises:
-        RobotError: if the file does not name the nominal arm.
+        RobotError: the file does not name the nominal arm.
     """
     robot, extra = calibrated.read_whole(path)
     provenance = extra.get("provenance", {})
@@ -218,9 +231,13 @@ def read_arms(path: str | Path) -> tuple[Installation, Installation]:
 def _placed(
     chain: Chain, tables: Mapping[str, object], source: str, deflection: Deflection | None = None
 ) -> Installation:
-    """Return a chain with the stations and tools of the tables; identity frames for an empty list.
+    """Return a chain with the stations and tools of the tables; without entries, one station and tool at identity.
 
-    `source`: name of the tables' file, with which messages begin.
+    Args:
+        chain: the arm.
+        tables: tables of ``robot.toml``.
+        source: name of the file, for messages.
+        deflection: deflections of the arm; None for a rigid arm.
     """
     with refused_as(RobotError, ValueError, f"{source}: {{}}; expected [[...]] tables, each with a name, xyz and rpy"):
         frames = read_record(_Frames, tables)
@@ -240,7 +257,14 @@ def _placed(
 
 
 def _placements(entries: tuple[Mapping[str, object], ...], source: str) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return names and placements (k, 4, 4) of a table's k entries; an unnamed entry is named by its number."""
+    """Return the names and placements (k, 4, 4) of the k entries of a table.
+
+    An entry without name is named by its number.
+
+    Args:
+        entries: the tables, each with a placement.
+        source: name of the file, for messages.
+    """
     names = []
     placements = []
     for number, entry in enumerate(entries, 1):

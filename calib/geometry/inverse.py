@@ -1,12 +1,12 @@
-"""Inverse kinematics: joint values that put an arm's tool on its targets, deflections included; all targets at once.
+"""Inverse kinematics of many targets at once: joint values that put the tool on the targets, deflections included.
 
-Damped Gauss–Newton (Levenberg 1944) on  e(q) = [p* - p(q);  L · log(R* R(q)ᵀ)],  one damping per target:
+Damped Gauss–Newton (Levenberg 1944) on  e(q) = [p* - p(q);  L · log(R* R(q)ᵀ)],  with one damping λ per target:
 
     step = Jᵀ (J Jᵀ + λ I)⁻¹ e
 
-J is the Jacobian of the deflected arm without the deflections' derivative ∂δ/∂q, which is about 1e-3: each step still
-gains two to three digits. Steps of least norm keep the configuration; a joint at a limit stays at it while its step
-would exceed it.
+J is the Jacobian of the deflected arm without the deflections' derivative ∂δ/∂q, which is about 1e-3; the error still
+decreases by a factor of 100 to 1000 per step. Steps of least norm keep the arm's configuration. A joint at a limit is
+kept there while its step would exceed the limit.
 """
 
 from collections.abc import Callable
@@ -19,21 +19,21 @@ from calib.geometry.installation import Installation, Seen, see
 from calib.robot.calibrated import evaluate
 from calib.robot.kinematics import joint_jacobian
 
-# error [m] below which a target is met
+# error [m] below which a target is reached
 DONE = 1e-10
-# damping, in mean squared singular values of J
+# first damping, in units of the mean squared singular value of J
 FIRST = 1e-9
 LAST = 1e4
-# step [rad or m] that changes nothing
+# step [rad or m] below which the iteration ends
 MIN_STEP = 1e-12
-# [m]: an orientation counts as its displacement at this distance (our choice, as all constants here)
+# length [m] by which orientations are multiplied to compare them with positions (our choice, as all constants here)
 LEVER = 0.3
-# weights that hold the joints at the start [m/rad], and steps with each
+# weights μ of the joints' distance from the start [m/rad], and number of steps with each
 BACK = np.geomspace(1e-4, 1.0, 13)
 HELD_STEPS = 20
-# passes towards the joint values to stay near
+# largest number of passes towards the nearest joint values
 NEAREST_PASSES = 8
-# targets at once: bounds the memory
+# number of targets computed at once, which limits the memory
 CHUNK = 2000
 
 Torques = Callable[[np.ndarray], np.ndarray] | None
@@ -42,12 +42,12 @@ DOF = (6, 5, 3)
 
 @dataclass(frozen=True, eq=False)
 class Goal:
-    """Arm, joint limits, and number of pose components to reach.
+    """Arm, joint limits, and number of pose components that a target fixes.
 
     Attributes:
-        cell: the arm with one station and one tool; targets are the tool's poses in the station's frame.
-        dof: 6; 5 if the rotation about the tool's z axis is free; 3 for the position only.
-        lower, upper: (n,) limits [rad or m]; infinite for none.
+        cell: the arm with one station and one tool; targets are poses of the tool in the station's frame.
+        dof: 6 for full poses; 5 if the rotation about the tool's z axis is free; 3 for positions only.
+        lower, upper: (n,) joint limits [rad or m]; infinite for no limit.
         torques: function from joint values (m, n) to gravity torques (m, n) [N m], if a deflection needs them.
     """
 
@@ -59,7 +59,12 @@ class Goal:
 
 
 def seen_at(goal: Goal, q: np.ndarray) -> Seen:
-    """Return the tool poses at joint values q (m, n), deflections included, in the station's frame."""
+    """Return the predicted tool poses at joint values q (m, n), deflections included, in the station's frame.
+
+    Args:
+        goal: the arm.
+        q: (m, n) joint values [rad or m].
+    """
     deflection = goal.cell.deflection
     torque = None
     if goal.torques is not None and any(term.basis == "torque" for term in deflection.terms):
@@ -70,8 +75,13 @@ def seen_at(goal: Goal, q: np.ndarray) -> Seen:
 def differences(goal: Goal, q: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Return the differences of targets and tool poses (m, dof): position [m], then orientation [rad].
 
-    dof 6: rotation vector of R* Rᵀ in the station's axes. dof 5: the turn that brings the tool's z axis onto the
-    target's, about the tool's x and y; dof 3: positions only.
+    dof 6: the orientation is the rotation vector of R* Rᵀ in the station's axes. dof 5: the rotation, about the tool's
+    x and y axes, that brings the tool's z axis onto the target's. dof 3: positions only.
+
+    Args:
+        goal: the arm.
+        q: (m, n) joint values [rad or m].
+        targets: (m, 4, 4) target poses in the station's frame.
     """
     return _differences(seen_at(goal, q), targets, goal.dof)
 
@@ -95,7 +105,12 @@ def _differences(seen: Seen, targets: np.ndarray, dof: int) -> np.ndarray:
 
 
 def differences_jacobian(goal: Goal, seen: Seen) -> np.ndarray:
-    """Return the Jacobian (m, dof, n) of the pose components of `differences` with respect to the joints."""
+    """Return the Jacobian (m, dof, n) of the tool's pose components, as in `differences`, by the joint values.
+
+    Args:
+        goal: the arm, and the number of pose components.
+        seen: predicted tool poses at the joint values, from `seen_at`.
+    """
     jacobian = joint_jacobian(goal.cell.chain, seen.walked, seen.point)
     if goal.dof == 3:
         return jacobian[:, :3]
@@ -106,13 +121,14 @@ def differences_jacobian(goal: Goal, seen: Seen) -> np.ndarray:
 
 
 def reach(goal: Goal, targets: np.ndarray, start: np.ndarray, iterations: int = 60) -> np.ndarray:
-    """Return joint values (m, n) that put the tool on the targets, or as close as the search from `start` gets.
+    """Return joint values (m, n) that put the tool on the targets, or as near as the search from `start` comes.
 
     Args:
         goal: the arm.
         targets: (m, 4, 4) poses of the tool in the station's frame.
-        start: (m, n) joint values to start from and to stay near; beyond a limit, the limit.
-        iterations: at most.
+        start: (m, n) joint values to start from; values beyond a joint limit are set to the limit. The result stays
+            near them where the arm is redundant.
+        iterations: largest number of iterations.
     """
     if not len(targets):
         return np.array(start, dtype=float)
@@ -151,7 +167,13 @@ def _reach(goal: Goal, targets: np.ndarray, start: np.ndarray, iterations: int) 
 
 
 def _weighted(goal: Goal, q: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return error (m, dof) and Jacobian (m, dof, n); orientations are multiplied by `LEVER` [m]."""
+    """Return the error (m, dof) and its Jacobian (m, dof, n), with orientations multiplied by `LEVER` [m].
+
+    Args:
+        goal: the arm.
+        q: (m, n) joint values [rad or m].
+        targets: (m, 4, 4) target poses in the station's frame.
+    """
     seen = seen_at(goal, q)
     weight = np.where(np.arange(goal.dof) < 3, 1.0, LEVER)
     error = weight * _differences(seen, targets, goal.dof)
@@ -161,7 +183,16 @@ def _weighted(goal: Goal, q: np.ndarray, targets: np.ndarray) -> tuple[np.ndarra
 def _step_within_limits(
     goal: Goal, q: np.ndarray, error: np.ndarray, jacobian: np.ndarray, damping: np.ndarray
 ) -> np.ndarray:
-    """Return damped joint steps (m, n); a joint that would exceed its limit stops there, and the others compensate."""
+    """Return damped joint steps (m, n) within the joint limits.
+
+    A joint that would exceed its limit stops at it, and the other joints compensate.
+
+    Args:
+        goal: the arm, with its joint limits.
+        q: (m, n) joint values [rad or m].
+        error, jacobian: (m, dof) and (m, dof, n), as of `_weighted` [m].
+        damping: (m,) λ of each target, relative to the mean squared singular value of its Jacobian.
+    """
     step = _damped(jacobian, error, damping)
     for _ in range(q.shape[1]):
         below = (q <= goal.lower) & (step < 0.0)
@@ -175,7 +206,13 @@ def _step_within_limits(
 
 
 def _damped(jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return the damped step Jᵀ (J Jᵀ + λ I)⁻¹ e; λ is relative to the mean squared singular value."""
+    """Return the damped joint steps Jᵀ (J Jᵀ + λ I)⁻¹ e (m, n).
+
+    Args:
+        jacobian: J (m, dof, n).
+        error: e (m, dof).
+        damping: (m,) λ of each target, relative to the mean squared singular value of J.
+    """
     across = np.swapaxes(jacobian, 1, 2)
     square = jacobian @ across
     rows = square.shape[1]
@@ -185,10 +222,17 @@ def _damped(jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray) -> np.
 
 
 def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the joint values (m, n) with the tool poses of `q` that are nearest to `start`, for a redundant arm.
+    """Return the joint values (m, n) nearest to `start` that have the same tool poses as `q`, for a redundant arm.
 
-    Minimises |q - q_start| (radians and metres alike) under e(q) = 0: each pass steps by d + J⁺ (e - J d), d = q_start
-    - q. Where a target would no longer be reached, the result keeps `q`.
+    The function minimises |q - q_start| (radians and metres with equal weight) under e(q) = 0. Each pass steps by d +
+    J⁺ (e - J d) with d = q_start - q, J the Jacobian and e the pose error at q. The given `q` is kept for targets that
+    the result would no longer reach.
+
+    Args:
+        goal: the arm.
+        targets: (m, 4, 4) target poses in the station's frame.
+        start: (m, n) joint values q_start to stay near [rad or m].
+        q: (m, n) joint values that reach the targets, J being the Jacobian and e the pose error there.
     """
     if q.shape[1] <= goal.dof:
         return q
@@ -209,10 +253,17 @@ def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray) -
 
 
 def held_back(goal: Goal, targets: np.ndarray, start: np.ndarray, max_change: float) -> np.ndarray:
-    """Return joint values (m, n) near the targets with no joint more than `max_change` away from `start`.
+    """Return joint values (m, n) near the targets, with no joint more than `max_change` from `start`.
 
-    For targets near a singularity, where a small correction takes a large motion: minimises |e|² + μ² |q - q_start|²
-    with the smallest μ of `BACK` for which the change is at most `max_change` [rad or m].
+    This is for targets near a singularity, where a small correction needs a large motion. With e the pose error, the
+    function minimises |e|² + μ² |q - q_start|² with the smallest μ of `BACK` for which the change is at most
+    `max_change` [rad or m].
+
+    Args:
+        goal: the arm.
+        targets: (m, 4, 4) target poses in the station's frame.
+        start: (m, n) joint values q_start [rad or m].
+        max_change: largest change of a joint value [rad or m].
     """
     best = np.clip(start, goal.lower, goal.upper)
     open_rows = np.arange(len(best))
@@ -235,7 +286,14 @@ def held_back(goal: Goal, targets: np.ndarray, start: np.ndarray, max_change: fl
 
 
 def conditions(goal: Goal, q: np.ndarray) -> np.ndarray:
-    """Return the ratio of smallest to largest singular value of each Jacobian (m,): 0 at a singularity."""
+    """Return the ratio of smallest to largest singular value (m,) of the Jacobian at each pose q (m, n).
+
+    The ratio is 0 at a singularity.
+
+    Args:
+        goal: the arm, and the pose components that form the Jacobian (orientations multiplied by `LEVER` [m]).
+        q: (m, n) joint values [rad or m].
+    """
     no_targets = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     _, jacobian = _weighted(goal, q, no_targets)
     values = np.linalg.svd(jacobian, compute_uv=False)

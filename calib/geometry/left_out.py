@@ -1,20 +1,23 @@
-"""Expected errors at new poses, learnt from errors on held-out rows: variance model and 95 % intervals.
+"""Expected errors at new poses, estimated from errors on held-out rows: variance model and 95 % intervals.
 
-A quantile is taken at the level (n + 1) / n · 95 % of n poses (conformal prediction; Vovk, Gammerman & Shafer 2005). As
-those rows have also chosen the variances, an interval is as much wider as it has to be to hold 95 % of a fold whose
-poses took no part in it. Not where base and tool are placed on the rows: what errors of a fold share is taken up then.
+The 95 % interval is a quantile at the level (n + 1) / n · 95 % over n poses (conformal prediction; Vovk, Gammerman &
+Shafer 2005). The same held-out rows were used to estimate the variances. Intervals are therefore widened until they
+contain 95 % of the errors in a fold whose poses were not used for the variances. They are not widened where base and
+tool are placed on the judged rows, since the placement then compensates errors that the rows of a fold share.
 
-Errors outside a joint's range are one draw per end of it, not one per pose. With z the rms error of an end left out, in
-units of its interval, that beyond the end is exp(m + LASTING (log z - m) + CHANGE ε), m the mean of log z over the
-ends, ε normal: 60 ends of joints that five real recordings were fitted without gave 0.48 ± 0.16 and 0.33, m unbiased.
+Outside a joint's range, the errors beyond one end are similar to each other, so that each end counts as one sample, not
+each pose. z is the rms error at an end that was held out, in units of its interval. The error beyond that end is exp(m
++ LASTING (log z - m) + CHANGE ε), with m the mean of log z over the ends and ε normal. On five real recordings, fitted
+without 60 ends of joint ranges, LASTING was 0.48 ± 0.16 and CHANGE 0.33, and m was unbiased.
 
-Where errors are larger than elsewhere: the logarithm of their variance as a sum of one function per joint.
+The variance of errors depends on the pose. Its logarithm is modelled as a sum of one function per joint,
 
     log s(q) = Σ_j f_j(q_j),    f_j ~ GP(0, a_j² exp(-|Δ| / (CORRELATION_LENGTH · range)))
 
-by regression of the logarithms of squared errors on joint values (Harvey 1976, Econometrica 44: multiplicative
-heteroscedasticity), every a_j at its most probable (`calib.estimation.relevance`): 0 where a joint has no influence.
-Stated is exp(E f + var f / 2), the mean of s: it is larger where few poses, or none, were measured.
+estimated by regression of the logarithms of squared errors on joint values (Harvey 1976, Econometrica 44:
+multiplicative heteroscedasticity). Each a_j has its most probable value (`calib.estimation.relevance`), which is 0
+where a joint has no influence. The stated value is exp(E f + var f / 2), the mean of s; it is larger where few or no
+poses were measured.
 """
 
 from __future__ import annotations
@@ -28,41 +31,49 @@ from scipy.special import ndtri
 from calib.estimation.relevance import SETTLED, Gram, gram, relevance
 from calib.estimation.robust import ROUNDS, variance_weights
 
-# values per joint, linear in between (our choice)
+# number of values of a joint's function, which is linear between them (our choice)
 KNOTS = 9
-# how far one value speaks for others, of the range (our choice)
+# correlation length of a joint's function, as a share of the joint's range (our choice)
 CORRELATION_LENGTH = 0.5
-# how far the function is stated outside the range, of it (our choice)
+# extension of the function beyond each end of the range, as a share of the range (our choice)
 KNOT_MARGIN = 0.2
-# of the median squared error: smaller ones count as that (our choice)
+# squared errors are raised to this share of their median (our choice)
 MIN_SQUARE = 0.02
-# variance of a logarithm that is known best: copies of few poses would be fitted without any error
+# smallest variance of a logarithm: without it, copies of few poses would be fitted without any error
 MIN_VARIANCE = 1e-4
-# a joint that moves by less tells nothing [rad or m]
+# smallest motion of a joint for which its function is estimated [rad or m]
 MIN_MOTION = 1e-3
-# a_j that the search begins with, and its rounds
+# initial a_j of the search, and largest number of its iterations
 FIRST_SIZE = 0.5
 SEARCH_ROUNDS = 30
-# share of the errors that an interval holds
+# share of the errors that an interval has to contain
 COVERED = 0.95
-# share of an end's excess that lasts beyond it, and standard deviation of the rest, of logarithms (see above)
+# LASTING and CHANGE of the module's docstring: share of an end's excess that persists beyond it, and standard
+# deviation of the remaining change, both of logarithms
 LASTING = 0.5
 CHANGE = 0.33
-# rows of a kind that the poses outside a fold must have to tell an interval (our choice)
+# smallest number of rows of each kind outside a fold to estimate an interval (our choice)
 MIN_ROWS = 5
-# ends of ranges that tell what is common to them (our choice)
+# smallest number of held-out ends of ranges to estimate their mean (our choice)
 MIN_ENDS = 3
-# rounds of the search for variances without a fold's poses
+# largest number of iterations of the search for variances without a fold's poses
 FOLD_ROUNDS = 100
-# [m²] of an expected squared error, at least
+# smallest expected squared error [m²]
 SMALLEST_VARIANCE = 1e-30
 
-# per joint: its values, log s there
+# for each joint: joint values, and log s at these values
 Profile = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
 
 
 def unevenness(profile: Profile, q: np.ndarray) -> np.ndarray:
-    """Return the factor s (m,) of the error variance at poses q (m, n) [rad or m]; 1 for an empty profile."""
+    """Return the factor s (m,) by which the error variance at poses q (m, n) is larger than on average.
+
+    1 for an empty profile.
+
+    Args:
+        profile: log s as one function per joint; s is the exponential of their sum.
+        q: (m, n) joint values [rad or m].
+    """
     log_factor = np.zeros(len(q))
     for joint, (knots, values) in enumerate(profile):
         log_factor = log_factor + np.interp(q[:, joint], knots, values)
@@ -70,11 +81,11 @@ def unevenness(profile: Profile, q: np.ndarray) -> np.ndarray:
 
 
 class Unevenness:
-    """Estimate of the factor s from squared errors.
+    """Estimate of the factor s(q), by which the error variance at q is larger than on average, from squared errors.
 
     Args:
         q: (m, n) poses [rad or m].
-        squares: (m,) squared errors there, in units of those expected of an even arm.
+        squares: (m,) squared errors at these poses, divided by the variance expected for s = 1.
     """
 
     def __init__(self, q: np.ndarray, squares: np.ndarray):
@@ -103,7 +114,9 @@ class Unevenness:
         self.data = gram(self.logs, self.columns)
 
     def profile(self, left_out: np.ndarray | None = None) -> Profile:
-        """Return log s as one function per joint, from all poses or without those of a mask (m,)."""
+        """Return log s as one function per joint, estimated from all poses or without those in the mask `left_out`
+        (m,).
+        """
         data = self.data
         if left_out is not None:
             data = data - gram(self.logs[left_out], self.columns[left_out])
@@ -114,7 +127,11 @@ class Unevenness:
         return tuple(result)
 
     def _values(self, data: Gram) -> list[np.ndarray]:
-        """Return E f + var f / 2 at the knots of each moving joint."""
+        """Return E f + var f / 2 at the knots of each joint that moves, f being the joint's function in log s.
+
+        Args:
+            data: statistics of the squared errors for the values of all functions at their knots.
+        """
         data = replace(data, total=data.total + MIN_VARIANCE * data.rows)
         sizes = np.full(len(self.groups), FIRST_SIZE)
         estimate = relevance(data, self.groups, sizes, SEARCH_ROUNDS, SETTLED)
@@ -137,12 +154,13 @@ class LeftOut:
 
     Attributes:
         squares: (m,) |e|² [m²].
-        shapes: (m, 4) quantities on which the variance depends: trace J Σ Jᵀ, 1, squared distances to the other rows.
-        away: (m,) the sum of these distances [m²].
-        pose: (m,) which pose.
-        fold: (m,) which fold.
-        near: (m,) whether the row is from a random fold.
-        joint: (m,) joint whose range end was held out; -1 for none.
+        shapes: (m, 4) quantities on which the variance depends linearly: trace J Σ Jᵀ, the factor s (at first 1), and
+            the squared distances from the fitted poses and from the joints' fitted ranges.
+        away: (m,) sum of the two squared distances [m²].
+        pose: (m,) number of the pose.
+        fold: (m,) number of the fold.
+        near: (m,) True where the row was held out at random.
+        joint: (m,) joint of which an end of the range was held out; -1 for none.
     """
 
     squares: np.ndarray
@@ -155,10 +173,15 @@ class LeftOut:
 
     @classmethod
     def of(cls, near: Sequence[np.ndarray], far: Sequence[np.ndarray], joints: Sequence[int]) -> LeftOut:
-        """Return the errors from arrays (rows, 5) by fold: |e|², trace J Σ Jᵀ, two squared distances, pose number.
+        """Return the errors from one array (rows, 5) per fold, with the columns of `calib.geometry.error_model`.
+
+        The columns are |e|² [m²] of the position error e, its variance due to the parameters [m²], squared distances
+        from the fitted poses and from the joints' fitted ranges [m²], and the index of the pose.
 
         Args:
-            joints: joint whose range end was held out, for each of `far`; -1 for none.
+            near: arrays of the folds held out at random.
+            far: arrays of the other folds.
+            joints: for each fold of `far`, the joint of which an end of the range was held out; -1 for none.
         """
         folds = [*near, *far]
         rows = np.concatenate(folds)
@@ -177,7 +200,11 @@ class LeftOut:
         )
 
     def without(self, poses: np.ndarray) -> LeftOut:
-        """Return the rows without those of the given poses."""
+        """Return the errors without the rows of the given poses.
+
+        Args:
+            poses: numbers of the poses.
+        """
         rows = ~np.isin(self.pose, poses)
         return LeftOut(
             squares=self.squares[rows],
@@ -190,7 +217,9 @@ class LeftOut:
         )
 
     def scaled(self, q: np.ndarray) -> tuple[LeftOut, Profile]:
-        """Return the errors with their variance terms scaled by s (for each fold from the other poses), and s itself.
+        """Return the errors with the variance term of `shapes` replaced by s(q), and the estimate of log s itself.
+
+        For each fold, s is estimated from the poses of the other folds.
 
         Args:
             q: (poses, n) [rad or m].
@@ -208,7 +237,14 @@ class LeftOut:
         return replace(self, shapes=shapes), estimate.profile()
 
     def learnt(self, start: Sequence[float] = ()) -> tuple[list[float], tuple[float, float]]:
-        """Return κ, v_0, v_1, v_2 of  |e|² ~ variance · χ²_3 / 3,  and the 95 % radii of near and far errors."""
+        """Return κ, v_0, v_1, v_2, estimated from |e|² ~ variance · χ²_3 / 3, and the near and far 95 % radii.
+
+        κ, v_0, v_1, v_2 are the weights of the columns of `shapes` in the variance of the error e; a radius is a number
+        of standard deviations.
+
+        Args:
+            start: values from which the search starts; empty for values from the errors' median.
+        """
         rounds = FOLD_ROUNDS
         if not start:
             rounds = ROUNDS
@@ -223,11 +259,17 @@ class LeftOut:
         return weights.tolist(), self.quantiles(sizes)
 
     def _variances(self, weights: np.ndarray | Sequence[float]) -> np.ndarray:
-        """Return the expected variance (m,) [m²] of each error."""
+        """Return the expected variance (m,) [m²] of each error, for weights κ, v_0, v_1, v_2 of the `shapes`."""
         return np.maximum(self.shapes @ np.asarray(weights), SMALLEST_VARIANCE)
 
     def quantiles(self, sizes: np.ndarray) -> tuple[float, float]:
-        """Return the bounds that 95 % of future errors keep, near and far, from error magnitudes (m,) (conformal)."""
+        """Return the bounds below which 95 % of future errors lie, for near and far rows, from error magnitudes (m,).
+
+        They are conformal quantiles, as in the module's docstring.
+
+        Args:
+            sizes: (m,) error magnitudes, divided by the standard deviations expected for them.
+        """
         poses = len(np.unique(self.pose))
         level = min(1.0, COVERED * (poses + 1) / poses)
         near_bound = float(np.quantile(sizes[self.near], level))
@@ -235,7 +277,14 @@ class LeftOut:
         return near_bound, far_bound
 
     def surprise(self, weights: Sequence[float], reach: tuple[float, float]) -> tuple[float, float]:
-        """Return the factors (near, far) by which intervals must widen to contain 95 % of a held-out fold's errors."""
+        """Return the factors (near, far), at least 1, by which intervals must widen to contain 95 % of a fold's errors.
+
+        The intervals of a fold are estimated without its poses.
+
+        Args:
+            weights: κ, v_0, v_1, v_2 from which the search starts.
+            reach: median of `away` over the near rows, and over the far rows [m²].
+        """
         ratio = np.ones(len(self.squares))
         for fold in np.unique(self.fold):
             rows = self.fold == fold
@@ -255,8 +304,11 @@ class LeftOut:
         """Return the factors by which intervals widen beyond the lower and the upper end of each joint's range.
 
         Args:
-            weights, radii, reach: of the interval, as in `calib.geometry.error_model.Discrepancy`.
+            weights, radii, reach: parameters of the interval, as in `calib.geometry.error_model.Discrepancy`.
             q: (poses, n) [rad or m].
+
+        Returns:
+            (below, above) for each joint; empty where too few ends of ranges were held out.
         """
         sigma = np.sqrt(self._variances(weights))
         sizes = np.sqrt(self.squares) / (sigma * np.interp(self.away, reach, radii))

@@ -1,7 +1,8 @@
-"""Sufficient statistics WᵀW, Wᵀr, rᵀr of measured rows, and variances of positions, with many joint corrections.
+"""Statistics WᵀW, Wᵀr, rᵀr of measured rows, and variances of positions, for models with many joint corrections.
 
-The column of a correction is that of the element it moves, times the correction's basis. With the columns of two
-elements multiplied row by row first, a pose counts as one row, not as three, and takes a third of the time.
+A joint correction adds a function of q (its basis) times a coefficient to the value of one chain element. The Jacobian
+column of a correction is the column of this element times the basis. The products of two elements' columns are summed
+over the three coordinates first; a pose then enters as one row instead of three, which takes a third of the time.
 """
 
 from __future__ import annotations
@@ -18,25 +19,27 @@ from calib.geometry.observation import Block, layout_counts, observe, pieces, pr
 from calib.geometry.residuals import ResidualPart
 from calib.robot.calibrated import target_elements
 
-# corrections of one element from which on it pays to multiply elements first (our choice)
+# number of corrections of one element above which multiplying elements first is faster (our choice)
 MANY = 30
-# poses at once: their bases stay in the processor's cache
+# number of poses computed at once, so that their basis functions fit into the processor's cache
 CHUNK = 500
 
 
 def separable(measured: PoseMeasurements) -> bool:
-    """Return whether rows are positions or poses without errors that all of them share."""
+    """Return whether the rows of `measured` are positions or poses without errors that all rows share."""
     return isinstance(measured, Positions) and measured.late is None
 
 
 def row_statistics(
     cell: Installation, block: Block, free: np.ndarray, scales: Iterable[np.ndarray]
 ) -> Iterator[tuple[ResidualPart, Gram]]:
-    """Yield the residual parts of a `separable` block, piece by piece, with their rows' statistics.
+    """Yield the residual parts of a `separable` block, piece by piece, with the statistics of their rows.
 
     Args:
-        cell, block, free: as of `calib.geometry.observation.observe`.
-        scales: for each of its parts, the divisor (rows, m) of its residuals.
+        cell: the installation.
+        block: the prepared measurements.
+        free: (f,) indices of the fitted parameters.
+        scales: for each residual part of the block, the numbers (rows, m) by which its residuals are divided.
     """
     grouping = _grouped(cell, free)
     single = len(grouping.single)
@@ -78,7 +81,16 @@ def position_variances(
     station: int,
     tool: np.ndarray | int,
 ) -> np.ndarray:
-    """Return the variance (m,) [m²] of a tool's position, trace J Σ Jᵀ; arguments: `observation.pose_sigmas`."""
+    """Return the variance (m,) [m²] of a tool's position, trace J Σ Jᵀ.
+
+    Args:
+        cell: the fitted installation.
+        measured: joint values (m, n), and gravity torques if the model has compliance terms.
+        free: (f,) indices in the parameter vector.
+        covariance: (f, f) covariance Σ of these parameters; J are the derivatives of the position by them.
+        station: index of the station of reference; -1 for the arm's base.
+        tool: index of the tool, one or (m,).
+    """
     grouping = _grouped(cell, free)
     single = grouping.single
     poses = Block(measured, station, np.broadcast_to(tool, len(measured)))
@@ -109,13 +121,14 @@ def position_variances(
 
 @dataclass(frozen=True, eq=False)
 class Grouping:
-    """Parameters (f,) divided into corrections of elements that many of them move, and all others.
+    """Parameters (f,), divided into the corrections of elements with many corrections, and all others (single ones).
 
     Attributes:
-        observed: parameters whose columns are observed: the single ones, then the elements that many corrections move.
+        observed: parameters whose Jacobian columns are computed: the single ones, then the elements with many
+            corrections.
         single: positions of the single parameters among the f.
-        groups: for each such element, positions of its corrections among the f.
-        numbers: for each such element, numbers of its corrections among the deflection's terms.
+        groups: for each element with many corrections, positions of its corrections among the f.
+        numbers: for each element with many corrections, numbers of its corrections among the deflection's terms.
     """
 
     observed: np.ndarray
@@ -125,7 +138,12 @@ class Grouping:
 
 
 def _grouped(cell: Installation, free: np.ndarray) -> Grouping:
-    """Return the parameters `free` (f,) grouped by the element that corrections move."""
+    """Return the parameters `free` (f,) grouped by the chain element that their corrections change.
+
+    Args:
+        cell: the installation.
+        free: (f,) indices in the parameter vector.
+    """
     # numbers of corrections; negative for all other parameters
     numbers = free - sum(layout_counts(cell)[:4])
     is_correction = numbers >= 0

@@ -1,8 +1,8 @@
 """Identifiable geometric parameters of a set of poses, and observation Jacobians of candidate poses.
 
-Findings on the others: rank, parameters that merge with others or stay at their nominal, placements that are hardly
-determined. The Jacobians are callables for pose selection (package `poses`); they pickle, so that it can run on several
-processes.
+Findings are made on parameters that are not identifiable: the rank, parameters that cannot be distinguished from others
+or stay at their nominal value, and placements that are poorly determined. The observation Jacobians are callables for
+the selection of poses (package `poses`). They can be pickled, so that the selection can run in several processes.
 """
 
 from collections.abc import Sequence
@@ -15,39 +15,39 @@ from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.errors import Finding, Unidentifiable, UsageError, finding, one_of, require
 from calib.estimation.base_columns import ColumnSplit, split_columns
 from calib.estimation.nonlinear import MOST_NUMBERS
-from calib.geometry.installation import Installation, see
+from calib.geometry.installation import Installation, Seen, see
 from calib.geometry.observation import Block, families, layout, observe, prepare, target_jacobian, whitened
 from calib.geometry.weighing import GeometricFit
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, twist_product
 from calib.transforms import pose, to_quaternion
 
-# ratio of a parameter's σ to that of its prior from which the data say little of it (our choice)
+# ratio of a parameter's σ to that of its prior above which the data hardly determine it (our choice)
 NEAR_PRIOR = 0.7
-# share of its largest coefficient from which a parameter counts as merged with another (our choice)
+# a parameter depends on another if its coefficient is at least this share of its largest coefficient (our choice)
 MIN_SHARE = 0.1
-# parameters by which families of merged ones are distinguished
+# largest number of parameters named to distinguish groups of dependent parameters
 MAX_NAMED = 4
-# [m] a placement known no better than this is worth a finding (our choice)
+# standard deviation of a tool's position above which a finding is reported [m] (our choice)
 MAX_PLACEMENT_SIGMA = 2e-3
-# [deg] below it "the wrist is held still" is the likely reason (our choice)
+# range of orientations [deg] below which a still wrist is the likely reason (our choice)
 MIN_ORIENTATION_RANGE = 45.0
-# canonical correlation of a tool's and a station's placement from which they are confused (our choice)
+# canonical correlation of a tool's and a station's placement above which they cannot be separated (our choice)
 MAX_CORRELATION = 0.95
-# [m] of an arm, at least
+# smallest typical length of an arm [m]
 MIN_REACH = 0.1
-# kinds of measurement that poses are selected for
+# kinds of measurement for which poses can be selected
 KINDS = (Poses.kind, Positions.kind)
-# random postures that decide what is identifiable
+# number of random postures by which identifiable parameters are determined
 SAMPLES = 300
-# [m], [rad]: our choice where none is stated
+# default standard deviations of a position [m] and of an orientation [rad] (our choice)
 SIGMA_POSITION = 1e-4
 SIGMA_ORIENTATION = 1e-4
 PLACES = {"station": "the placement of the instrument", "tool": "the mounting of the tool"}
 
 
 def unidentified(fit: GeometricFit) -> list[Finding]:
-    """Return findings on the parameters and placements that a fit's poses do not identify, and on the rank."""
+    """Return findings on the rank, and on the parameters and placements that the poses of `fit` do not identify."""
     split = fit.split
     if split is None:
         return _loose(fit)
@@ -62,7 +62,12 @@ def unidentified(fit: GeometricFit) -> list[Finding]:
 
 
 def _merged(fit: GeometricFit, split: ColumnSplit) -> list[Finding]:
-    """Return findings on arm parameters that depend linearly on others, grouped by these others."""
+    """Return findings on arm parameters that depend linearly on other parameters, grouped by these other parameters.
+
+    Args:
+        fit: the fit.
+        split: its candidate parameters, split into base parameters and dependent ones.
+    """
     table = layout(fit.start)
     # per group: what they merge with, and their names
     groups: dict[object, tuple[list[str], list[str]]] = {}
@@ -91,7 +96,7 @@ def _merged(fit: GeometricFit, split: ColumnSplit) -> list[Finding]:
 
 
 def _at_nominal(fit: GeometricFit) -> list[Finding]:
-    """Return a finding on base parameters of the arm that the data determine hardly better than the prior does."""
+    """Return a finding on base parameters of the arm in `fit` that the data determine hardly better than the prior."""
     if fit.prior is None:
         return []
     table = layout(fit.start)
@@ -110,7 +115,11 @@ def _at_nominal(fit: GeometricFit) -> list[Finding]:
 
 
 def _loose(fit: GeometricFit) -> list[Finding]:
-    """Return findings on tools with a poorly determined placement, with the station correlated with it."""
+    """Return findings on tools whose placement is poorly determined, with the station with which it is correlated.
+
+    Args:
+        fit: the fit, whose covariance is examined.
+    """
     estimate = fit.estimate
     index = {name: k for k, name in enumerate(estimate.names)}
     findings: list[Finding] = []
@@ -129,12 +138,12 @@ def _loose(fit: GeometricFit) -> list[Finding]:
 
 
 def _confused(fit: GeometricFit, position: list[int], index: dict[str, int]) -> str:
-    """Return the station whose estimate is correlated with the tool's position; '' without one.
+    """Return the name of the station whose estimate is correlated with the tool's position; empty if there is none.
 
     Args:
         fit: the fit.
         position: indices of the tool's position among the estimates.
-        index: of every estimate, by name.
+        index: index of every estimate, by name.
     """
     covariance = fit.estimate.covariance
     for station in fit.cell.station_names:
@@ -151,7 +160,13 @@ def _confused(fit: GeometricFit, position: list[int], index: dict[str, int]) -> 
 
 
 def _orientation_range(fit: GeometricFit) -> float | None:
-    """Return the range that holds 95 % of the flange's orientations [deg]; None without an instrument's poses."""
+    """Return the range that contains 95 % of the flange's orientations [deg].
+
+    None where no poses were measured by an instrument.
+
+    Args:
+        fit: the fit, whose blocks contain the measured poses.
+    """
     q = [block.measured.q for block in fit.blocks if block.measured.has_instrument]
     if not q:
         return None
@@ -161,11 +176,16 @@ def _orientation_range(fit: GeometricFit) -> float | None:
 
 
 def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.ndarray) -> np.ndarray:
-    """Return the observation matrix W (rows, c) of all blocks, scaled by stated sigmas; else by the arm's reach.
+    """Return the observation matrix W (rows, c) of all blocks for the parameters `columns` (c,).
 
-    Of more than `MOST_NUMBERS` numbers its R factor instead, whose columns have the same dependences.
+    Rows are divided by their stated sigmas relative to the sigmas' median. Orientation rows are multiplied by a typical
+    length of the arm, which makes them comparable with position rows. If W has more than `MOST_NUMBERS` numbers, the R
+    factor of its QR decomposition is returned instead, whose columns have the same linear dependences.
 
-    The reach (rms distance of targets from the arm's base) makes orientation rows comparable with position rows.
+    Args:
+        cell: the installation of arm, stations and tools.
+        blocks: the prepared measurements.
+        columns: (c,) indices in the full parameter vector.
     """
     rows: list[np.ndarray] = []
     for block in blocks:
@@ -188,7 +208,7 @@ def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.
 
 
 def _reach(cell: Installation) -> float:
-    """Return a typical length of the arm [m]: the sum of its constant offsets."""
+    """Return a typical length of the arm in `cell` [m]: the sum of the constant lengths along its chain."""
     lengths = 0.0
     offsets = 0.0
     for element in cell.chain.elements:
@@ -200,11 +220,16 @@ def _reach(cell: Installation) -> float:
 
 
 def _preference(cell: Installation, columns: np.ndarray) -> list[np.ndarray]:
-    """Return groups of columns in order of preference: frames, joint offsets, rotations, translations, deflections.
+    """Return groups of columns in the order in which they are preferred as base parameters.
 
-    Frames come first, so that what cannot be distinguished from the installation (the first joint's placement, the last
-    joint's offset) stays with the installation and the arm keeps its nominal there. Rotations before translations make
-    Hayati's β win over an offset along parallel axes.
+    The order is placements, joint offsets, rotations, translations, deflections. Placements are first. Parameters that
+    cannot be distinguished from the placements (those before the first joint, the last joint's offset) are then
+    represented by the placements, and the arm keeps its nominal values. Rotations are before translations so that, at
+    parallel axes, Hayati's β is preferred to an offset along the axes.
+
+    Args:
+        cell: the installation.
+        columns: indices in the full parameter vector; the groups are positions in this array.
     """
     order = (("station", "tool", "optics"), ("offset",), ("rad",), ("m",), ("deflection",))
     return [np.flatnonzero(np.isin(families(cell)[columns], group)) for group in order]
@@ -213,44 +238,81 @@ def _preference(cell: Installation, columns: np.ndarray) -> list[np.ndarray]:
 def base_columns(
     cell: Installation, blocks: Sequence[Block], columns: np.ndarray, tolerance: float = 1e-5
 ) -> ColumnSplit:
-    """Split candidate parameters into identifiable ones and those that depend on them; indices into `columns`."""
+    """Return the split of the parameters `columns` into base (identifiable) ones and ones that depend on them.
+
+    The split's indices refer to `columns`.
+
+    Args:
+        cell: the installation.
+        blocks: prepared measurements.
+        columns: (c,) indices of the candidate parameters.
+        tolerance: norm of a column's independent part, relative to the column, below which it counts as dependent.
+    """
     return split_columns(observation_matrix(cell, blocks, columns), _preference(cell, columns), tolerance)
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """Whitened observation Jacobian in base columns: q (m, n) -> (m, rows, p).
+    """Whitened observation Jacobian by the base parameters: q (m, n) -> (m, rows, p).
 
     Attributes:
-        cell: the nominal arm, its base at the instrument's origin, with its targets; rigid.
-        full: whether orientations are measured, too: six rows per target instead of three.
+        cell: the rigid nominal arm with its targets; its base is at the instrument's origin.
+        full: True: positions and orientations are measured (six rows per target); False: positions only (three rows).
         free: (p,) indices of the identifiable parameters in the full vector.
-        sigmas: of a position [m] and of an orientation [rad].
+        sigmas: standard deviations of a position [m] and of an orientation [rad].
+        reference: whether a frame at the arm's base is measured beside the target, with the same sigmas, so that the
+            noise of both counts.
     """
 
     cell: Installation
     full: bool
     free: np.ndarray
     sigmas: tuple[float, float] = (SIGMA_POSITION, SIGMA_ORIENTATION)
+    reference: bool = False
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
-        sigma_position, sigma_orientation = self.sigmas
         rows = []
         for number in range(len(self.cell.tools)):
             seen = see(self.cell, q, 0, number)
             jacobian = target_jacobian(self.cell, seen, self.free, 0, np.full(len(q), number))
-            rows.append(jacobian[:, :3] / sigma_position)
+            sigma = self._sigma(seen.point)
+            rows.append(jacobian[:, :3] / sigma[:3])
             if self.full:
-                rows.append(jacobian[:, 3:] / sigma_orientation)
+                rows.append(jacobian[:, 3:] / sigma[3:])
         return np.concatenate(rows, axis=1).transpose(2, 1, 0)
 
+    def _sigma(self, point: np.ndarray) -> np.ndarray:
+        """Return the standard deviations (6, m) of positions [m] and orientations [rad] of a target.
+
+        With a reference frame, σ_x² = 2 σ_p² + σ_r² (l_y² + l_z²) and so on, l the target seen from the arm's base.
+
+        Args:
+            point: (3, m) positions of the target [m].
+        """
+        sigma = np.repeat(self.sigmas, 3)[:, None] * np.ones(point.shape[1])
+        if not self.reference:
+            return sigma
+        squares = 2.0 * sigma**2
+        squares[:3] += self.sigmas[1] ** 2 * (np.sum(point**2, axis=0) - point**2)
+        return np.sqrt(squares)
+
     def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the position of the first target (m, 3) [m] and its unwhitened Jacobian (m, 3, p)."""
-        point = see(self.cell, q).point.T
-        return point, self(q)[:, :3] * self.sigmas[0]
+        """Return the position of the first target (m, 3) [m] and its unwhitened Jacobian (m, 3, p).
+
+        Args:
+            q: (m, n) joint values [rad or m].
+        """
+        point = see(self.cell, q).point
+        sigma = self._sigma(point)[:3]
+        return point.T, self(q)[:, :3] * sigma.T[:, :, None]
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian; exact."""
+        """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian J, in closed form.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+            G: (m, rows, p) weights of the entries of J.
+        """
         chain = self.cell.chain
         count = len(chain.elements)
         # element of each parameter; -1 for the station, behind the last element for tools
@@ -264,13 +326,30 @@ class Observation:
         for number in range(len(self.cell.tools)):
             seen = see(self.cell, q, 0, number)
             columns = target_jacobian(self.cell, seen, self.free, 0, np.full(len(q), number))
+            sigma = self._sigma(seen.point)[:rows]
             weight = np.zeros(columns.shape)
-            for start, sigma in zip(range(0, rows, 3), self.sigmas):
-                row = rows * number + start
-                weight[:, start : start + 3] = weights[:, row : row + 3] / sigma
+            weight[:, :rows] = weights[:, rows * number : rows * (number + 1)] / sigma
             elements = element_jacobian(chain, seen.walked, seen.point)
             result += twist_product(chain, elements, columns, places, weight)
+            if self.reference:
+                result -= self._noise_product(seen, columns, weight, sigma)
         return result.T
+
+    def _noise_product(self, seen: Seen, columns: np.ndarray, weight: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+        """Return the part (n, m) of `product` from the growth of noise with the distance to the reference frame.
+
+        Args:
+            seen: the target at the m postures.
+            columns: (p, 6, m) Jacobian.
+            weight: (p, 6, m) weights of the Jacobian, divided by the sigmas.
+            sigma: (rows, m) standard deviations.
+        """
+        # of a relative change of σ_x, σ_y, σ_z
+        share = np.sum(weight[:, :3] * columns[:, :3], axis=0) / sigma[:3] ** 2
+        # σ_x dσ_x = σ_r² (l_y dl_y + l_z dl_z)
+        pull = self.sigmas[1] ** 2 * seen.point * (share.sum(axis=0) - share)
+        velocities = joint_jacobian(self.cell.chain, seen.walked, seen.point)[:, :3]
+        return np.einsum("mxn,xm->nm", velocities, pull)
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,7 +366,7 @@ class TargetPose:
 
 @dataclass(frozen=True, eq=False)
 class TargetJacobian:
-    """Velocity and angular velocity of a target per joint velocity: q (m, n) -> (m, 6, n)."""
+    """Jacobian of a target in the arm's base: q (m, n) -> (m, 6, n), [v; ω] per joint velocity."""
 
     cell: Installation
     number: int = 0
@@ -298,7 +377,13 @@ class TargetJacobian:
 
 
 def targets_of(chain: Chain, tools: Sequence[Sequence[float]] = ()) -> Installation:
-    """Return the arm with targets at positions (3,) [m] in the tip's frame; one at the tip if none are given."""
+    """Return the arm with targets at the positions `tools` (3,) [m] in the tip's frame; empty for one target at the
+    tip.
+
+    Args:
+        chain: the arm.
+        tools: positions of the targets.
+    """
     positions = [np.asarray(tool, dtype=float) for tool in tools] or [np.zeros(3)]
     names = ("tool",)
     if len(positions) > 1:
@@ -308,15 +393,24 @@ def targets_of(chain: Chain, tools: Sequence[Sequence[float]] = ()) -> Installat
 
 
 def observation(
-    cell: Installation, kind: str = "pose", sigmas: tuple[float, float] | None = None, seed: int = 0
+    cell: Installation,
+    kind: str = "pose",
+    sigmas: tuple[float, float] | None = None,
+    seed: int = 0,
+    reference: bool = False,
 ) -> Observation:
     """Return the observation Jacobian of a nominal arm, for the parameters that random postures can identify.
 
     Args:
-        cell: see `targets_of`.
-        kind: ``pose`` or ``position``.
-        sigmas: of a position [m] and an orientation [rad].
-        seed: of the postures.
+        cell: the arm with its targets, as returned by `targets_of`.
+        kind: kind of measurement, ``pose`` or ``position``.
+        sigmas: standard deviations of a position [m] and an orientation [rad]; None for the defaults.
+        seed: seed of the postures.
+        reference: whether a frame at the arm's base is measured beside the target.
+
+    Raises:
+        UsageError: an unknown kind.
+        Unidentifiable: no parameter affects the measured quantities.
     """
     one_of(kind, KINDS, "kind", UsageError)
     full = kind == Poses.kind
@@ -330,11 +424,20 @@ def observation(
         columns = np.setdiff1d(columns, turns)
     split = base_columns(cell, blocks, columns)
     require(split.rank, f"robot '{cell.chain.name}': no parameter affects the measured quantities", Unidentifiable)
-    return Observation(cell, full, columns[split.kept], sigmas or (SIGMA_POSITION, SIGMA_ORIENTATION))
+    return Observation(cell, full, columns[split.kept], sigmas or (SIGMA_POSITION, SIGMA_ORIENTATION), reference)
 
 
 def _measured(q: np.ndarray, cell: Installation, number: int, full: bool) -> Positions:
-    """Return noise-free measurements of one target at joint values q (m, n)."""
+    """Return noise-free measurements of target `number` at joint values q (m, n).
+
+    Orientations are included if `full`.
+
+    Args:
+        q: (m, n) joint values [rad or m].
+        cell: the installation, whose predictions are the measurements.
+        number: index of the target.
+        full: whether orientations are measured, too.
+    """
     poses = see(cell, q, 0, np.full(len(q), number)).poses()
     quaternion = None
     if full:

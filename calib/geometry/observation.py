@@ -1,10 +1,10 @@
-"""Observation matrix of an installation: residual parts of each block, and their Jacobian in the fit's parameters.
+"""Observation matrix of an installation: residual parts of each block, and their Jacobian by the fitted parameters.
 
-With it the covariance of a fit's parameters is propagated to the tool's pose.
+The Jacobian also propagates the covariance of a fit's parameters to the pose of the tool.
 
-The vector of all parameters has the order: arm elements (K), six per station (x y z rx ry rz, in the station-to-base
-placement's own axes), six per tool (in the target's own axes), of images the lenses' values and the boards' shapes,
-deflection coefficients (E).
+The vector of all parameters has the order: arm elements (K), six per station (x y z rx ry rz, in the axes of the
+station-to-base placement itself), six per tool (in the axes of the target itself), for images the lenses' values and
+the boards' shapes, deflection coefficients (E).
 """
 
 from collections.abc import Iterator, Sequence
@@ -25,20 +25,20 @@ from calib.transforms import displace
 TERM_UNITS = {"torque": "/(N m)", "joint": "/rad"}
 FRAME_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 KINDS = ("arm", "station", "tool", "optics", "deflection")
-# rows observed at once: the Jacobian of so many has 50 MB at 500 parameters (our choice)
+# number of rows evaluated at once: their Jacobian has 50 MB at 500 parameters (our choice)
 PIECE = 2000
-# poses whose sigmas are computed at once: the Jacobian has a column per parameter
+# number of poses whose sigmas are computed at once: the Jacobian has a column per parameter
 CHUNK = 500
 
 
 @dataclass(frozen=True)
 class ParameterLayout:
-    """Layout of the full parameter vector by kind of parameter.
+    """Names, units and kinds of the parameters in the full parameter vector.
 
     Attributes:
-        names, units: one per parameter.
-        kinds: one of `KINDS` per parameter.
-        moving: positions of the optics that may be fitted.
+        names, units: name and unit of each parameter.
+        kinds: kind of each parameter, one of `KINDS`.
+        moving: indices of the parameters of cameras and boards that may be fitted.
     """
 
     names: tuple[str, ...]
@@ -47,12 +47,14 @@ class ParameterLayout:
     moving: tuple[int, ...] = ()
 
     def index(self, *kinds: str) -> np.ndarray:
-        """Return the indices of all parameters of the given kinds (see `KINDS`)."""
+        """Return the indices of all parameters of the given kinds, out of `KINDS`."""
         return np.flatnonzero(np.isin(self.kinds, kinds))
 
     @property
     def frame_index(self) -> np.ndarray:
-        """Indices of placements and of fitted camera and board parameters: all but the robot's."""
+        """Indices of station and tool placements, and of fitted camera and board parameters: all but those of the
+        robot.
+        """
         return np.concatenate([self.index("station", "tool"), np.array(self.moving, dtype=int)])
 
     @property
@@ -64,7 +66,7 @@ class ParameterLayout:
         """Return the indices of named parameters.
 
         Raises:
-            UsageError: for a name that does not exist.
+            UsageError: a name does not exist.
         """
         index = {name: k for k, name in enumerate(self.names)}
         for name in names:
@@ -73,7 +75,11 @@ class ParameterLayout:
 
 
 def layout(cell: Installation) -> ParameterLayout:
-    """Return the layout of an installation's parameters."""
+    """Return names, units and kinds of all parameters of an installation.
+
+    Args:
+        cell: installation of arm, stations, tools, optics and deflection.
+    """
     chain = cell.chain
     frame_names, frame_units = [], []
     for frame in (*cell.station_names, *cell.tool_names):
@@ -90,7 +96,13 @@ def layout(cell: Installation) -> ParameterLayout:
 
 
 def families(cell: Installation) -> np.ndarray:
-    """Return the family of each parameter (p,): ``offset`` or unit of an arm element, else its kind."""
+    """Return the family of each parameter (p,).
+
+    It is ``offset`` for joint offsets, the unit for other arm elements, and the kind for all other parameters.
+
+    Args:
+        cell: the installation, with p parameters.
+    """
     table = layout(cell)
     result = list(table.kinds)
     for number, element in enumerate(cell.chain.elements):
@@ -99,7 +111,15 @@ def families(cell: Installation) -> np.ndarray:
 
 
 def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installation:
-    """Return the installation with `change` (f,) added to the parameters `free` (f,); frames move on the manifold."""
+    """Return the installation with `change` (f,) added to the parameters `free` (f,).
+
+    Placements are displaced by rigid motions, so that they remain valid transforms.
+
+    Args:
+        cell: the installation.
+        free: (f,) indices in the full parameter vector.
+        change: (f,) changes [m or rad, or the unit of the parameter].
+    """
     counts = layout_counts(cell)
     full = np.zeros(sum(counts))
     full[free] = change
@@ -121,7 +141,7 @@ def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installati
 
 
 def _displaced(placements: np.ndarray, displacements: np.ndarray) -> np.ndarray:
-    """Return placements (k, 4, 4) displaced by (k, 6) along and about their axes."""
+    """Return placements (k, 4, 4) displaced by `displacements` (k, 6): along [m] and about [rad] their axes."""
     result = np.array(placements)
     for number, displacement in enumerate(displacements):
         if displacement.any():
@@ -130,14 +150,20 @@ def _displaced(placements: np.ndarray, displacements: np.ndarray) -> np.ndarray:
 
 
 def layout_counts(cell: Installation) -> tuple[int, int, int, int, int]:
-    """Return the number of parameters of each of `KINDS`."""
+    """Return the number of parameters of each kind in the installation `cell`, in the order of `KINDS`."""
     stations = 6 * len(cell.stations)
     tools = 6 * len(cell.tools)
     return len(cell.chain.elements), stations, tools, len(cell.optics), len(cell.deflection.terms)
 
 
 def parameter_values(cell: Installation) -> np.ndarray:
-    """Return the full parameter vector; frames have zeros: displacements from their present placement."""
+    """Return the full parameter vector.
+
+    The six parameters of a placement are zero, since they are displacements from the present placement.
+
+    Args:
+        cell: the installation.
+    """
     _, stations, tools, _, _ = layout_counts(cell)
     terms = np.asarray(cell.deflection.coefficients)
     return np.concatenate([cell.chain.values, np.zeros(stations + tools), cell.optics.values, terms])
@@ -146,7 +172,11 @@ def parameter_values(cell: Installation) -> np.ndarray:
 def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
     """Return the indices of parameters fixed at their nominal values: those in ``fix``, or all but those in ``free``.
 
-    ``free`` speaks of the arm; frames are always fitted.
+    The option ``free`` refers to the arm only; placements are always fitted.
+
+    Args:
+        start: the installation from which the fit starts.
+        options: options of the fit, with the names in ``fix`` or ``free``.
     """
     table = layout(start)
     fixed = table.find(options.fix)
@@ -157,7 +187,14 @@ def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
 
 
 def stated_prior(start: Installation, options: FitOptions) -> np.ndarray | None:
-    """Return the prior standard deviations of the options for the full vector; infinite without a prior."""
+    """Return the prior standard deviations in the options for the full parameter vector; infinite where none is stated.
+
+    None if the options state no prior.
+
+    Args:
+        start: the installation from which the fit starts.
+        options: options of the fit, with standard deviations by parameter name.
+    """
     if not options.prior:
         return None
     table = layout(start)
@@ -171,11 +208,13 @@ class Block:
     """Measurements prepared for evaluation with an installation (arm, stations, tools).
 
     Attributes:
-        measured: m rows.
-        station: index of their station; -1 for kinds without an instrument, which refer to the arm's base.
+        measured: measurements of m rows.
+        station: index of the measurements' station; -1 for kinds without an instrument, which refer to the arm's base.
         tool: (m,) index of each row's target among the installation's tools.
-        bases: (E, m) the deflection's bases, evaluated once; None for a block that `pieces` divides.
-        displacements: (K, m) of elements by the known deflections, or None.
+        bases: (E, m) basis functions of the deflection's terms, evaluated once; None for a long block that `pieces`
+            divides.
+        displacements: (K, m) displacements of the chain's elements by the known deflections; None without such
+            deflections.
     """
 
     measured: PoseMeasurements
@@ -186,10 +225,16 @@ class Block:
 
 
 def prepare(cell: Installation, measured: Sequence[PoseMeasurements]) -> list[Block]:
-    """Return the blocks with the indices of their stations and tools (by name) and their deflection bases.
+    """Return the blocks with the indices of their stations and tools, and the basis functions of their deflections.
+
+    Stations and tools are found by name.
+
+    Args:
+        cell: the installation.
+        measured: blocks of measurements, one per file, station and kind.
 
     Raises:
-        UsageError: for a station or tool the installation does not have.
+        UsageError: the installation does not have a station or tool of that name.
     """
     blocks = []
     for measurements in measured:
@@ -205,7 +250,13 @@ def prepare(cell: Installation, measured: Sequence[PoseMeasurements]) -> list[Bl
 
 
 def rows_of(cell: Installation, block: Block, rows: np.ndarray) -> Block:
-    """Return some rows of a block, their deflection bases evaluated."""
+    """Return the block with only the given rows, and with the deflection's basis functions evaluated at these rows.
+
+    Args:
+        cell: the installation, which defines the basis functions.
+        block: the prepared measurements.
+        rows: row numbers, or a mask (m,).
+    """
     measured = take(block.measured, rows)
     bases = None
     if cell.deflection.terms:
@@ -218,12 +269,21 @@ def rows_of(cell: Installation, block: Block, rows: np.ndarray) -> Block:
 
 
 def _divided(measured: PoseMeasurements) -> bool:
-    """Return whether a block is observed in pieces: it is long, and its rows do not depend on each other."""
+    """Return whether a block is evaluated in pieces: it is long, and its rows do not depend on each other.
+
+    Args:
+        measured: the block of measurements.
+    """
     return len(measured) > PIECE and isinstance(measured, Positions)
 
 
 def pieces(cell: Installation, block: Block) -> Iterator[Block]:
-    """Yield a long block of positions or poses in pieces of at most `PIECE` rows, in their order; others whole."""
+    """Yield a block in pieces: a long block of positions or poses in pieces of at most `PIECE` rows, others whole.
+
+    Args:
+        cell: the installation, which defines the basis functions of the deflection.
+        block: the prepared measurements.
+    """
     if not _divided(block.measured):
         yield block
         return
@@ -238,9 +298,12 @@ def _index(names: tuple[str, ...], name: str, kind: str) -> int:
 
 
 def sampled(measured: Sequence[PoseMeasurements], poses: int, seed: int = 0) -> list[np.ndarray]:
-    """Return random rows of long blocks of positions or poses, all rows of the others.
+    """Return numbers of random rows: for long blocks of positions or poses a sample, for other blocks all rows.
 
-    `poses`: of all blocks, about; a block keeps at least a tenth of that.
+    Args:
+        measured: blocks of measurements.
+        poses: approximate number of poses of all samples together; each block keeps at least a tenth of it.
+        seed: seed of the sample.
     """
     generator = np.random.default_rng(seed)
     total = max(sum(map(len, measured)), 1)
@@ -255,17 +318,33 @@ def sampled(measured: Sequence[PoseMeasurements], poses: int, seed: int = 0) -> 
 
 
 def positions(cell: Installation, block: Block) -> np.ndarray:
-    """Return the predicted target positions (3, m) [m] of a block's rows, in the instrument's frame."""
+    """Return the predicted target positions (3, m) [m] of a block's rows, in the instrument's frame.
+
+    Args:
+        cell: the installation.
+        block: the prepared measurements of m rows.
+    """
     return np.concatenate([predict(cell, piece).point for piece in pieces(cell, block)], axis=1)
 
 
 def predict(cell: Installation, block: Block) -> Seen:
-    """Return the predicted targets of a block's rows, or of a piece's, in the instrument's frame."""
+    """Return the predicted targets of the rows of a block, or of a piece of a block, in the instrument's frame.
+
+    Args:
+        cell: the installation.
+        block: the prepared measurements.
+    """
     return see(cell, block.measured.q, block.station, block.tool, block.bases, block.displacements)
 
 
 def observe(cell: Installation, block: Block, free: np.ndarray) -> list[ResidualPart]:
-    """Return the residual parts of a block with their Jacobian with respect to the parameters `free` (f,)."""
+    """Return the residual parts of a block with their Jacobian with respect to the parameters `free` (f,).
+
+    Args:
+        cell: the installation.
+        block: the prepared measurements.
+        free: (f,) indices in the full parameter vector.
+    """
     observed = [_observe(cell, piece, free) for piece in pieces(cell, block)]
     if len(observed) == 1:
         return observed[0]
@@ -291,9 +370,9 @@ def whitened(
     """Yield residuals and Jacobians of a block piece by piece, whitened.
 
     Args:
-        cell, block, free: as of `observe`.
-        scales: for each of its parts, the divisor (rows, m) of its residuals.
-        noises: for each of its parts, the noise that its rows share, or None.
+        cell, block, free: arguments of `observe`.
+        scales: for each residual part of the block, the numbers (rows, m) by which its residuals are divided.
+        noises: for each residual part, the noise that its rows share; None for a part without shared noise.
     """
     start = 0
     for piece in pieces(cell, block):
@@ -307,7 +386,14 @@ def whitened(
 def target_jacobian(
     cell: Installation, seen: Seen, free: np.ndarray, station: int, tool: np.ndarray, bases: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return [v; ω] of the targets per unit of each free parameter, (f, 6, m); last three arguments: see `Block`."""
+    """Return velocity and angular velocity [v; ω] of the targets per unit of each fitted parameter, (f, 6, m).
+
+    Args:
+        cell: the installation.
+        seen: its predicted targets.
+        free: (f,) indices of the fitted parameters.
+        station, tool, bases: station index, tool indices and basis functions of the rows, as in `Block`.
+    """
     arm, stations, tools, optics, _ = layout_counts(cell)
     jacobian = np.zeros((len(free), 6, seen.point.shape[1]))
     section = np.searchsorted(np.cumsum([arm, stations, tools, optics]), free, side="right")
@@ -340,7 +426,14 @@ def target_jacobian(
 
 
 def _station_column(column: np.ndarray, placement: np.ndarray, seen: Seen, axis: int) -> None:
-    """Fill the column (6, m) for a unit displacement of a station along or about one of its axes."""
+    """Fill `column` (6, m) with the targets' [v; ω] per unit displacement of a station.
+
+    Args:
+        column: (6, m) array to fill.
+        placement: (4, 4) pose of the arm's base in the station's frame.
+        seen: the predicted targets.
+        axis: 0 to 2 for a displacement along, 3 to 5 for a rotation about x, y, z of the placement.
+    """
     direction = placement[:3, axis % 3]
     if axis < 3:
         column[:3] = direction[:, None]
@@ -358,15 +451,17 @@ def pose_sigmas(
     station: int = 0,
     tool: np.ndarray | int = 0,
 ) -> np.ndarray:
-    """Return sigmas (m, 2) of a tool's position [m] and orientation [rad]: sqrt(trace J Σ Jᵀ) of each.
+    """Return standard deviations (m, 2) of a tool's position [m] and orientation [rad]: sqrt(trace J Σ Jᵀ) of each.
+
+    J are the derivatives of position or orientation by the parameters.
 
     Args:
         cell: the fitted installation.
-        measured: joint values (m, n), and gravity torques for compliance terms.
-        free: (f,) positions in the parameter vector.
-        covariance: (f, f) of steps along them.
+        measured: joint values (m, n), and gravity torques if the model has compliance terms.
+        free: (f,) indices in the parameter vector.
+        covariance: (f, f) covariance Σ of these parameters.
         station: index of the station of reference; -1 for the arm's base.
-        tool: which of its tools, one or (m,).
+        tool: index of the tool, one or (m,).
     """
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.clip(values, 0.0, None))

@@ -1,17 +1,18 @@
 """Pose accuracy and repeatability after ISO 9283:1998, from poses measured several times.
 
-For the n cycles of one commanded pose, p_j measured, p̄ their mean (the barycentre), p_c the command:
+For the n cycles of one commanded pose, with measured positions p_j, their mean p̄ (the barycentre) and the command p_c:
 
     AP  = |p̄ - p_c|,   AP_x = x̄ - x_c, …                  pose accuracy (7.2.1)
     RP  = l̄ + 3 S_l,   l_j = |p_j - p̄|                    pose repeatability (7.2.2), S_l with n - 1
     AP_a, AP_b, AP_c; RP_a = 3 S_a, …                      of orientations, as rotation vectors about the base's axes
-    vAP = the largest distance between the barycentres of cycles that came from different directions (7.2.3)
+    vAP = the largest distance between the barycentres of cycles approached from different directions (7.2.3)
 
-The command is what an arm's model says of the mean joints of the cycles, so that nominal and calibrated arm each have
-an accuracy of their own, while repeatability is the robot's (and the instrument's). Rotation vectors in place of the
-norm's Euler angles are our choice; for the small angles at hand they differ by nothing that counts.
+The command is the pose that an arm's model predicts for the mean joint values of the cycles. Nominal and calibrated arm
+therefore each have an accuracy of their own, while repeatability is a property of the robot (and the instrument).
+Rotation vectors in place of the norm's Euler angles are our choice; for small angles the difference is negligible.
 
-Rows that stand twice in what was measured: copied, or a file given twice. They count twice, and prove nothing.
+The module also finds rows that occur twice in the measurements because they were copied, or a file was given twice.
+Such rows would be weighted twice, and are useless for validation.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,13 +30,13 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, prepare, rows_of
 from calib.records import stored
 
-# joints of one commanded pose, as read back, differ by less [rad or m] (our choice)
+# largest difference of joint values read back at one commanded pose [rad or m] (our choice)
 SAME = 1e-3
-# directions of approach that differ by more are different ones (our choice)
+# smallest angle between directions of approach that are treated as different (our choice)
 APART = np.radians(30.0)
-# cycles that make a repeated pose
+# smallest number of cycles of a repeated pose
 MIN_CYCLES = 3
-# of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
+# largest share of a validation file's rows that may be rows of the fit, for the file to be used (our choice)
 MAX_COPIED_SHARE = 0.5
 ARMS = ("nominal", "calibrated")
 MeanAndMax = Mapping[str, float]
@@ -43,7 +44,7 @@ MeanAndMax = Mapping[str, float]
 
 @dataclass(frozen=True)
 class RepeatedPose:
-    """One pose measured several times: its rows, AP of both arms per axis in the arm's base, RP, vAP; mm and deg."""
+    """One pose measured several times: its rows, AP of both arms along the base's axes, RP and vAP [mm, deg]."""
 
     rows: tuple[int, ...]
     repeatability_mm: float
@@ -87,12 +88,12 @@ class RepeatedPoses:
 
     @stored
     def orientation_repeatability_deg(self) -> MeanAndMax | None:
-        """Orientation repeatability RP, the largest of three axes, mean and maximum [deg]."""
+        """Orientation repeatability RP, the largest of three axes, mean and maximum [deg]; None if not measured."""
         return _sizes([max(pose.repeatability_deg) for pose in self.each if pose.repeatability_deg])
 
     @stored
     def orientation_accuracy_deg(self) -> dict[str, MeanAndMax | None]:
-        """Orientation accuracy AP of each arm, mean and maximum [deg]."""
+        """Orientation accuracy AP of each arm, mean and maximum over the poses [deg]; None if not measured."""
         return {
             "nominal": _sizes([_norm(pose.nominal_deg) for pose in self.each if pose.nominal_deg]),
             "calibrated": _sizes([_norm(pose.calibrated_deg) for pose in self.each if pose.calibrated_deg]),
@@ -100,7 +101,7 @@ class RepeatedPoses:
 
     @stored
     def multidirectional_mm(self) -> MeanAndMax | None:
-        """Multidirectional variation vAP of the position, mean and maximum [mm]."""
+        """Multidirectional variation vAP of the position, mean and maximum [mm]; None if not measured."""
         return _sizes([pose.multidirectional_mm for pose in self.each if pose.multidirectional_mm is not None])
 
 
@@ -113,18 +114,18 @@ def _mean_and_max(values: Sequence[float]) -> MeanAndMax:
 
 
 def _sizes(values: Sequence[float]) -> MeanAndMax | None:
-    """Return mean and maximum; None for no values."""
+    """Return mean and maximum of the values; None for no values."""
     return _mean_and_max(values) if values else None
 
 
 def repeated_poses(
     cells: tuple[Installation, Installation], measured: Sequence[PoseMeasurements]
 ) -> RepeatedPoses | None:
-    """Return accuracy and repeatability of all poses measured at least `MIN_CYCLES` times; None without such poses.
+    """Return accuracy and repeatability of all poses measured at least `MIN_CYCLES` times; None if there are none.
 
     Args:
         cells: the nominal and the calibrated arm, whose predictions are compared.
-        measured: blocks; those without an instrument are ignored.
+        measured: blocks of measurements; those without an instrument are ignored.
     """
     nominal, calibrated = cells
     result = []
@@ -141,9 +142,10 @@ def repeated_poses(
 
 
 def repeated_rows(measured: PoseMeasurements) -> list[np.ndarray]:
-    """Return the row indices of each pose measured at least `MIN_CYCLES` times, in the file's order.
+    """Return the row numbers of each pose measured at least `MIN_CYCLES` times, in the file's order.
 
-    Rows with the very same numbers are copies of one measurement and count once. Empty for kinds without positions.
+    Rows with exactly equal numbers are copies of one measurement and are counted once. The result is empty for kinds of
+    measurement without positions.
     """
     if not isinstance(measured, Positions):
         return []
@@ -177,8 +179,8 @@ class CommandedPose:
 
     Attributes:
         base: (3, 3) orientation of the arm's base in the instrument's frame.
-        position: (3,) [m].
-        rotation: of the target.
+        position: (3,) position of the target in the instrument's frame [m].
+        rotation: rotation of the target in the instrument's frame.
     """
 
     base: np.ndarray
@@ -186,16 +188,22 @@ class CommandedPose:
     rotation: Rotation
 
     def accuracy_mm(self, points: np.ndarray) -> tuple[float, ...]:
-        """Return AP [mm] of points (n, 3) [m] along the axes of the base."""
+        """Return AP [mm] along the axes of the arm's base for measured points (n, 3) [m]."""
         return _numbers(1e3 * self.base.T @ (points.mean(axis=0) - self.position))
 
     def accuracy_deg(self, mean: Rotation) -> tuple[float, ...]:
-        """Return AP [deg] of a mean rotation about the axes of the base."""
+        """Return AP [deg] about the axes of the arm's base for a mean measured rotation."""
         return _numbers(np.degrees(self.base.T @ (mean * self.rotation.inv()).as_rotvec()))
 
 
 def _command(cell: Installation, block: Block, rows: np.ndarray) -> CommandedPose:
-    """Return the pose that an arm predicts for some rows of a block."""
+    """Return the pose that an arm predicts for the mean joint values of some rows of a block.
+
+    Args:
+        cell: the installation of the arm, its station and its tool.
+        block: the prepared measurements.
+        rows: row numbers in the block.
+    """
     seen = predict(cell, rows_of(cell, block, rows))
     rotations = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0))
     return CommandedPose(cell.stations[block.station][:3, :3], seen.point.mean(axis=1), rotations.mean())
@@ -204,7 +212,13 @@ def _command(cell: Installation, block: Block, rows: np.ndarray) -> CommandedPos
 def _repeated_pose(
     measured: Positions, rows: np.ndarray, nominal: CommandedPose, calibrated: CommandedPose
 ) -> RepeatedPose:
-    """Return accuracy and repeatability of one pose from its rows, given the command by both arms."""
+    """Return accuracy and repeatability of one pose from its rows and the pose that each arm predicts.
+
+    Args:
+        measured: the block of measurements.
+        rows: row numbers of the pose's cycles.
+        nominal, calibrated: pose predicted by the nominal and by the calibrated arm.
+    """
     points = measured.position[rows]
     variation = _variation(points, _directions(measured, rows))
     result = RepeatedPose(
@@ -233,9 +247,13 @@ def _numbers(values: np.ndarray) -> tuple[float, ...]:
 
 
 def _directions(measured: Positions, rows: np.ndarray) -> np.ndarray:
-    """Return each row's direction of approach (k, 3), from the previous row of the file; NaN without that row.
+    """Return each row's direction of approach (k, 3), from the previous row of the file; NaN where that row is missing.
 
-    Both as measured: what counts is the direction, not the tenths of a millimetre.
+    Both positions are the measured ones; their errors are small against the distance between the two rows.
+
+    Args:
+        measured: the block of measurements.
+        rows: (k,) row numbers in the block.
     """
     result = np.full((len(rows), 3), np.nan)
     index = {int(number): row for row, number in reversed(list(enumerate(measured.rows)))}
@@ -251,7 +269,14 @@ def _directions(measured: Positions, rows: np.ndarray) -> np.ndarray:
 
 
 def _variation(points: np.ndarray, directions: np.ndarray) -> float:
-    """Return vAP [m] of points (k, 3) approached in directions (k, 3); NaN for fewer than two directions."""
+    """Return the multidirectional variation vAP [m] of points approached from several directions.
+
+    It is the largest distance between the means of points with different directions; NaN for fewer than two directions.
+
+    Args:
+        points: (k, 3) positions [m].
+        directions: (k, 3) direction of approach of each point; NaN where unknown.
+    """
     remaining = np.flatnonzero(~np.isnan(directions[:, 0]))
     centres: list[np.ndarray] = []
     while len(remaining):
@@ -265,9 +290,10 @@ def _variation(points: np.ndarray, directions: np.ndarray) -> float:
 
 
 def without_copies(block: PoseMeasurements) -> tuple[PoseMeasurements, list[str]]:
-    """Return a block without rows whose joint values and readings are those of an earlier row, and notes on them.
+    """Return a block without rows whose joint values and readings are those of an earlier row, and notes on these rows.
 
-    A row that was copied tells nothing new: counted again it makes σ smaller, and held-out rows stand among the fitted.
+    A copied row contains no new information. If it were used, σ would be too small, and held-out rows could be copies
+    of fitted rows.
     """
     marks = set[bytes]()
     copied = np.zeros(len(block), dtype=bool)
@@ -285,11 +311,11 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasureme
     """Return the names of validation files that mostly repeat rows of the fit, and notes on repeated rows.
 
     Args:
-        fit: the fit's blocks.
-        unseen: held-out rows, by name.
+        fit: the fitted blocks.
+        unseen: blocks of held-out rows, by name.
 
     Returns:
-        Names of those in `unseen` that mostly are rows of the fit; and notes for the user.
+        The names of the blocks in `unseen` most of whose rows are rows of the fit, and notes for the user.
     """
     notes = []
     fitted = set[bytes]()
@@ -299,7 +325,7 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasureme
         fitted |= set(marks)
         if before:
             name = Path(block.file).name
-            notes.append(f"{name}: {_rows(before)} identical to rows of another fitted file. Is the file given twice?")
+            notes.append(f"{name}: {_rows(before)} identical to rows of another fitted file. Was the file given twice?")
     proofless = set()
     for name, block in unseen.items():
         copied = np.array([mark in fitted for mark in _marks(block)], dtype=bool)
@@ -314,7 +340,12 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasureme
 
 
 def _measured_again(fit: Sequence[PoseMeasurements], unseen: PoseMeasurements) -> np.ndarray:
-    """Return a mask (m,) of the rows with the joint values of a fitted row."""
+    """Return a mask (m,) of the rows of `unseen` whose joint values are those of a fitted row.
+
+    Args:
+        fit: the fitted blocks.
+        unseen: a block of m held-out rows.
+    """
     fitted = [block.q for block in fit if type(block) is type(unseen) and block.has_instrument]
     if not fitted:
         return np.zeros(len(unseen), dtype=bool)
@@ -323,13 +354,24 @@ def _measured_again(fit: Sequence[PoseMeasurements], unseen: PoseMeasurements) -
 
 
 def _marks(block: PoseMeasurements) -> list[bytes]:
-    """Return a key of each row: its joint values and measured numbers, rounded to 12 decimals."""
+    """Return a key for each row: its joint values and measured numbers, rounded to 12 decimals.
+
+    Equal rows have equal keys.
+
+    Args:
+        block: the measurements.
+    """
     table = np.column_stack([block.q, block.tool.astype(float), block.measured])
     return [row.tobytes() for row in np.round(table, 12) + 0.0]
 
 
 def _row_numbers(block: PoseMeasurements, mask: Sequence[bool] | np.ndarray) -> list[int]:
-    """Return the numbers of the rows of a mask (m,), each once."""
+    """Return the row numbers in the file of the rows in a mask (m,), each once.
+
+    Args:
+        block: the measurements.
+        mask: (m,) the wanted rows.
+    """
     rows = block.rows[np.array(mask, dtype=bool)]
     return [int(row) for row in dict.fromkeys(rows)]
 

@@ -1,9 +1,10 @@
 """Residuals and Jacobians of the geometry for each kind of measurement.
 
-Each function takes what the instrument should see and returns parts; a part is r = measured - predicted with
-∂predicted/∂x. Unknown socket points, planes and bar centres are linear (or nearly so) nuisances: they take their best
-value in closed form and their columns are projected out (variable projection, Golub & Pereyra 1973; for planes and bars
-the Jacobian is Kaufman's 1975, whose gradient is exact).
+Each function takes the predicted targets and returns residual parts; a part is r = measured - predicted with the
+derivative ∂predicted/∂x. Unknown socket points, planes and bar centres are nuisance parameters in which the residuals
+are linear (or nearly so). They are set to their best value in closed form, and their columns are projected out
+(variable projection, Golub & Pereyra 1973; for planes and bars by the Jacobian of Kaufman 1975, whose gradient is
+exact).
 """
 
 from __future__ import annotations
@@ -20,21 +21,28 @@ from calib.data.poses.measurements import Bars, Distances, Planes, PoseMeasureme
 from calib.errors import refuse_data
 from calib.geometry.installation import Seen
 
-# steps of Gauss–Newton for the centre of a bar, and length of the last one [m]
+# largest number of Gauss–Newton steps for the centre of a bar, and length of a step that ends them [m]
 CENTRE_STEPS = 20
 MIN_CHANGE = 1e-13
 
 
 class CommonNoise(Protocol):
-    """Errors that several rows share, see `calib.geometry.camera.pixel_residuals.ImageNoise`."""
+    """Errors that several rows share, such as those of all corners of an image.
+
+    `calib.geometry.camera.pixel_residuals.ImageNoise` implements this interface.
+    """
 
     @property
     def factor(self) -> float:
-        """Factor of the stated sigmas."""
+        """Factor by which the stated sigmas are multiplied."""
         ...
 
     def near(self, noise: Self) -> bool:
-        """Return whether two estimates agree, so that the fit is not repeated."""
+        """Return whether two noise estimates agree, so that the fit need not be repeated.
+
+        Args:
+            noise: noise estimated in another pass.
+        """
         ...
 
     def unweighted(self, images: int) -> Self:
@@ -49,11 +57,12 @@ class ResidualPart:
     Attributes:
         label: ``position``, ``orientation``, ``consistency``, ``distance``, ``plane`` or ``pixel``.
         value: (rows, m) [m] or [rad].
-        jacobian: (f, rows, m) derivative of the prediction.
+        jacobian: (f, rows, m) derivative of the prediction by the f fitted parameters.
         sigma: (rows, m) stated standard deviations; None if they are to be estimated.
-        nuisances: unknowns that were eliminated.
-        index: (m,) the measurement's rows these residuals belong to.
-        noise: common errors of rows, used by `fill` for whitening, see `common_noise`; None without.
+        nuisances: number of nuisance parameters that were eliminated.
+        index: (m,) number of the measured row of each column.
+        noise: errors that rows share, used by `fill` for whitening and estimated by `common_noise`; None for no shared
+            errors.
     """
 
     label: str
@@ -67,16 +76,21 @@ class ResidualPart:
 
     @property
     def height(self) -> int:
-        """Number of rows in a least-squares problem."""
+        """Number of rows in the least-squares problem."""
         return self.value.size
 
     def fill(self, residual: np.ndarray, matrix: np.ndarray, scale: np.ndarray) -> None:
-        """Write residual (height,) and W (f, height), divided by a scale that is broadcast to `value`."""
+        """Write residuals to `residual` (height,) and the Jacobian to `matrix` (f, height), both divided by `scale`.
+
+        Args:
+            residual, matrix: arrays to write.
+            scale: standard deviation of each residual, broadcast to the shape of `value`.
+        """
         residual[:] = (self.value / scale).ravel()
         np.divide(self.jacobian, scale, out=matrix.reshape(self.jacobian.shape))
 
     def whitened(self, scale: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residual (height,) and W (height, f), divided by a scale."""
+        """Return the residuals (height,) and the Jacobian W (height, f), both divided by `scale`."""
         residual = np.empty(self.height)
         matrix = np.empty((len(self.jacobian), self.height))
         self.fill(residual, matrix, scale)
@@ -84,7 +98,10 @@ class ResidualPart:
 
     @property
     def per_length(self) -> np.ndarray | float:
-        """Divisor that converts residuals into metres (for pixels, in pixels per metre); 1 for residuals in metres."""
+        """Numbers by which residuals are divided to convert them to metres.
+
+        1 for residuals in metres; for pixels, the pixels per metre.
+        """
         return 1.0
 
     def sizes(self) -> np.ndarray:
@@ -92,7 +109,7 @@ class ResidualPart:
         return np.linalg.norm(self.value, axis=0)
 
     def row_weights(self, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the measured rows and the weight of each, given weights (m,) per column."""
+        """Return the numbers of the measured rows and the weight of each, from weights (m,) of the columns."""
         return self.index, weight
 
     def per_row(self) -> ResidualPart:
@@ -105,20 +122,24 @@ class ResidualPart:
         """Return the errors that rows share, estimated from the residuals; None for kinds without shared errors.
 
         Args:
-            sigma: (rows, m) standard deviations.
-            unknowns: parameters fitted to the residuals.
-            loss, scale: of a robust fit.
-            start: whether a fit begins here, before residuals show their common errors.
+            sigma: (rows, m) standard deviations of the residuals, in their unit.
+            unknowns: number of parameters fitted to the residuals.
+            loss, scale: robust loss of the fit, and its constant in sigmas (None: its default).
+            start: True at the start of a fit, when the residuals do not yet show their common errors.
         """
         return None
 
     def alone(self, sigma: np.ndarray) -> np.ndarray:
-        """Return the residuals (rows, m) without the common errors of rows."""
+        """Return the residuals (rows, m) without the errors that rows share.
+
+        Args:
+            sigma: (rows, m) standard deviations of the residuals, in their unit.
+        """
         return self.value
 
 
 def joined(pieces: Sequence[ResidualPart]) -> ResidualPart:
-    """Return the part of consecutive pieces of a block, each with its own rows counted from 0."""
+    """Return one residual part from consecutive pieces of a block; the rows of each piece are numbered from 0."""
     values, jacobians, sigmas, indices = [], [], [], []
     nuisances = 0
     start = 0
@@ -142,22 +163,31 @@ def joined(pieces: Sequence[ResidualPart]) -> ResidualPart:
 
 @singledispatch
 def parts(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
-    """Return the residual parts of one block by the function registered for its type.
+    """Return the residual parts of a block, computed by the function registered for its type.
 
     Args:
         measured: the block, m rows.
         seen: the predicted targets.
-        jacobian: (f, 6, m), [v; ω] of the target.
+        jacobian: (f, 6, m), velocity and angular velocity [v; ω] of the targets per unit of each fitted parameter.
 
     Raises:
-        MeasurementError: for a type without one.
+        MeasurementError: no function is registered for the type.
     """
     refuse_data(measured.file, f"no residual is registered for measurements of kind '{measured.kind}'")
 
 
 @parts.register
 def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
-    """Pose residual, measured against predicted: r = [y - p; log(R_y Rᵀ)]; d log = J_r⁻¹(r) ω."""
+    """Return the residuals of poses: y - p of positions, log(R_y Rᵀ) of orientations.
+
+    y, R_y are measured and p, R predicted. The derivative of the logarithm is d log = J_r⁻¹(r) ω
+    (`inverse_right_jacobian`).
+
+    Args:
+        measured: the block, m rows.
+        seen: the predicted targets.
+        jacobian: (f, 6, m), [v; ω] of the targets per unit of each fitted parameter.
+    """
     predicted = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0))
     turn = (Rotation.from_quat(measured.quaternion) * predicted.inv()).as_rotvec().T
     angular = inverse_right_jacobian(turn, jacobian[:, 3:])
@@ -170,7 +200,13 @@ def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[ResidualPar
 
 @parts.register
 def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
-    """Position residual, measured minus predicted: r = y - p, without the errors that all rows share."""
+    """Return the residuals of positions, r = y - p (measured minus predicted), without errors that all rows share.
+
+    Args:
+        measured: the block, m rows.
+        seen: the predicted targets.
+        jacobian: (f, 6, m), [v; ω] of the targets per unit of each fitted parameter.
+    """
     value = measured.position.T - seen.point
     linear = jacobian[:, :3]
     shared = 0
@@ -189,7 +225,13 @@ def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[Res
 
 @parts.register
 def _distance(measured: Distances, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
-    """Distance residual, measured minus predicted: r = L - |p_a - p_b| for the two rows of each pair."""
+    """Return the residuals of distances, r = L - |p_a - p_b|, for the two rows of each pair.
+
+    Args:
+        measured: the block of m rows, with the measured distances L.
+        seen: the predicted targets, p_a and p_b in the two rows of a pair.
+        jacobian: (f, 6, m), [v; ω] of the targets per unit of each fitted parameter.
+    """
     first, second = _pairs(measured)
     gap = seen.point[:, first] - seen.point[:, second]
     length = np.linalg.norm(gap, axis=0)
@@ -203,7 +245,11 @@ def _distance(measured: Distances, seen: Seen, jacobian: np.ndarray) -> list[Res
 
 
 def _pairs(measured: Distances) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row indices of the first and second pose of each pair."""
+    """Return the row indices of the first and second pose of each pair.
+
+    Args:
+        measured: distances, one per pair of rows.
+    """
     order = np.argsort(measured.group, kind="stable")
     groups, counts = np.unique(measured.group, return_counts=True)
     wrong = np.flatnonzero(counts != 2)
@@ -216,7 +262,13 @@ def _pairs(measured: Distances) -> tuple[np.ndarray, np.ndarray]:
 
 @parts.register
 def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
-    """Socket residual: mean of the group minus p, and L - |mean_a - mean_b| for known socket distances L."""
+    """Return the residuals of sockets: group mean minus p, and L - |mean_a - mean_b| for known socket distances L.
+
+    Args:
+        measured: the block of m rows, with the socket of each.
+        seen: the predicted targets p; mean is their mean over the rows at one socket.
+        jacobian: (f, 6, m), [v; ω] of the targets per unit of each fitted parameter.
+    """
     groups, group_of_row, counts = np.unique(measured.group, return_inverse=True, return_counts=True)
     rows = np.arange(len(measured))
     average = np.zeros((len(measured), len(groups)))
@@ -248,9 +300,14 @@ def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[Residu
 @parts.register(Planes)
 @parts.register(Bars)
 def _fitted(measured: Planes | Bars, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
-    """Residual against a plane (normal n) or a ball-bar centre c fitted to each group.
+    """Return the residuals against a plane (normal n) or a ball bar's centre c, fitted to each group of rows.
 
-    Planes: r = -n · (p - mean). Bars: r = L - |p - c|.
+    For planes r = -n · (p - mean); for bars r = L - |p - c|.
+
+    Args:
+        measured: the block of m rows, with the plane or the bar (of length L) of each.
+        seen: the predicted targets p.
+        jacobian: (f, 6, m), [v; ω] of the targets per unit of each fitted parameter.
     """
     value = np.zeros(len(measured))
     slope = np.zeros((len(jacobian), len(measured)))
@@ -285,7 +342,7 @@ def _fitted(measured: Planes | Bars, seen: Seen, jacobian: np.ndarray) -> list[R
 def _sphere_centre(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
     """Return the centre (3,) whose distances to points (3, m) fit the lengths (m,) best, by Gauss–Newton.
 
-    The start is linear: |p|² - L² = 2 p·c - |c|² (algebraic sphere fit).
+    The start value is the linear solution of |p|² - L² = 2 p·c - |c|² (algebraic sphere fit).
     """
     matrix = np.column_stack([2.0 * points.T, -np.ones(points.shape[1])])
     squares = (points**2).sum(axis=0) - lengths**2
@@ -301,7 +358,7 @@ def _sphere_centre(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 
 
 def _project(rows: np.ndarray, nuisance: np.ndarray) -> np.ndarray:
-    """Return rows (f, m) with the nuisance columns (m, k) projected out."""
+    """Return the part of `rows` (f, m) that is orthogonal to the nuisance columns (m, k)."""
     q, _ = np.linalg.qr(nuisance)
     return rows - (rows @ q) @ q.T
 
@@ -309,8 +366,13 @@ def _project(rows: np.ndarray, nuisance: np.ndarray) -> np.ndarray:
 def inverse_right_jacobian(turn: np.ndarray, angular: np.ndarray) -> np.ndarray:
     """Return J_r⁻¹(r) ω for rotation vectors r (3, m) and angular velocities (f, 3, m).
 
-    J_r⁻¹(r) = I + [r]×/2 + (1/θ² - (1 + cos θ)/(2 θ sin θ)) [r]×²  (Chirikjian 2012, vol. 2, eq. 10.86). Here
-    log(R_y (exp(ω) R)ᵀ) = log(exp(r) exp(-ω)), so the prediction's share of the residual changes by J_r⁻¹(r) ω.
+    J_r⁻¹(r) = I + [r]×/2 + (1/θ² - (1 + cos θ)/(2 θ sin θ)) [r]×²  with θ = |r| (Chirikjian 2012, vol. 2, eq. 10.86).
+    Since log(R_y (exp(ω) R)ᵀ) = log(exp(r) exp(-ω)), a rotation ω of the prediction changes the residual by -J_r⁻¹(r)
+    ω.
+
+    Args:
+        turn: r (3, m), rotation vectors [rad].
+        angular: ω (f, 3, m), angular velocities per unit of f parameters.
     """
     theta = np.linalg.norm(turn, axis=0)
     if theta.max(initial=0.0) < 1e-9:

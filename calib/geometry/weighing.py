@@ -22,17 +22,17 @@ from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
 
-# [m, rad, px] of estimated sigmas: no instrument of an arm is more exact, though computed positions are
+# smallest estimated sigma [m, rad, px]: no instrument is more accurate, though simulated positions are
 MIN_SIGMA = 1e-6
-# residuals over their sigmas: computed positions leave less
+# smallest ratio of residuals to their sigmas: those of simulated positions are smaller
 MIN_NOISE = 1e-6
-# [m, rad, px] sigmas that a fit begins with, by label of the residual part
+# initial sigmas of a fit by label of the residual part [m, rad, px]
 START_SIGMA = dict.fromkeys(("position", "orientation", "consistency", "distance", "plane"), 1e-3) | {"pixel": 0.3}
-# [m, rad, px] robust spread by which outliers are measured at least
+# smallest robust spread in units of which outliers are measured [m, rad, px]
 SMALLEST_SPREAD = 1e-15
-# share of the measured numbers that counts as free at least, however many unknowns there are
+# smallest share of degrees of freedom among the measured numbers, for any number of unknowns
 MIN_FREE_SHARE = 0.05
-# change of a weight, and relative change of a sigma, that repeats no fit
+# largest change of a weight, and largest relative change of a sigma, for which the fit is not repeated
 MAX_CHANGE = 0.02
 
 _NONE = np.array([], dtype=int)
@@ -40,12 +40,12 @@ _NONE = np.array([], dtype=int)
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """One residual part of a fit, its block and its weights.
+    """One residual part of a fit, with its block and its weights.
 
     Attributes:
-        block: index into `GeometricFit.blocks`.
+        block: index of the block in `GeometricFit.blocks`.
         part: residuals at the solution.
-        sigma: (rows, m) standard deviations used.
+        sigma: (rows, m) standard deviations used in the fit.
         weight: (m,) robust weights.
     """
 
@@ -61,16 +61,18 @@ class GeometricFit:
 
     Attributes:
         cell: the calibrated installation.
-        start: the installation the fit began with.
-        free: (f,) positions of the fitted parameters in the full vector (`calib.geometry.observation`).
-        estimate: values and covariance of the fitted parameters; stations and tools as displacements from the fitted
-            placement, hence with value 0.
-        split: which candidate columns were kept; None if the caller chose the free parameters.
-        candidates: parameters to which the indices of ``split`` refer.
-        solution: the last Levenberg–Marquardt pass.
+        start: the installation from which the fit started.
+        free: (f,) indices of the fitted parameters in the full vector (`calib.geometry.observation`).
+        estimate: values and covariance of the fitted parameters. Those of stations and tools are displacements from the
+            fitted placement, and have the value 0.
+        split: division of the candidates into base parameters and dependent ones; None if the caller chose the fitted
+            parameters.
+        candidates: indices of the parameters to which ``split`` refers.
+        solution: result of the last Levenberg–Marquardt pass.
         blocks: the prepared measurements.
-        pieces: their residual parts at the solution.
-        prior: (f,) standard deviations about the nominal that the fit was regularised with; infinite for none.
+        pieces: residual parts of the measurements at the solution.
+        prior: (f,) standard deviations of the prior about nominal values; infinite for no prior. None where no
+            parameter has a prior.
     """
 
     cell: Installation
@@ -85,28 +87,31 @@ class GeometricFit:
     prior: np.ndarray | None = None
 
     def data(self) -> Reduced:
-        """Return the whitened rows at the solution, reduced, without the prior."""
+        """Return the whitened rows at the solution, reduced by QR decomposition, without the prior."""
         return reduced(lambda: _rows(self.cell, self.free, self.blocks, self.pieces))
 
     @property
     def base(self) -> np.ndarray:
-        """Positions (b,) of the base parameters in the full vector; all fitted ones where the caller chose them."""
+        """Indices (b,) of the base parameters in the full vector; all fitted ones where the caller chose the
+        parameters.
+        """
         if self.split is None:
             return self.free
         return np.intersect1d(self.candidates[self.split.kept], self.free)
 
     @property
     def identified(self) -> int:
-        """Number of identifiable parameters: base columns of the rigid geometry and frames, and joint corrections."""
+        """Number of identifiable parameters: base parameters of geometry and placements, and joint corrections."""
         if self.split is None:
             return len(self.free)
         corrections = np.setdiff1d(self.free, self.candidates)
         return len(self.base) + len(corrections)
 
     def regrouping(self) -> np.ndarray:
-        """Return the base parameters as combinations (b, f) of the fitted parameters, in the order of `base`.
+        """Return the base parameters as linear combinations (b, f) of the fitted parameters, in the order of `base`.
 
-        A base parameter is its own column and, by the split's coefficients, those that merge with it.
+        A base parameter is the sum of its own column and, with the coefficients of `split`, of the parameters that
+        depend on it.
         """
         if self.split is None:
             return np.eye(len(self.free))
@@ -131,8 +136,11 @@ class GeometricFit:
     def outliers(self, threshold: float = 4.0) -> list[tuple[str, int, str, float, float]]:
         """Return the outlier rows, worst first: file, row, label, size in robust sigmas, size [m or rad].
 
-        Sizes are measured against the robust spread of their own part (1.4826 · median), not against stated sigmas, so
-        that an optimistic instrument does not make every row an outlier.
+        A robust sigma is 1.4826 · median of the sizes in the same residual part. Stated standard deviations are not
+        used, since with too small ones every row would be an outlier.
+
+        Args:
+            threshold: number of robust sigmas above which a row is an outlier.
         """
         result = []
         for piece in self.pieces:
@@ -155,7 +163,7 @@ class GeometricFit:
         return result
 
     def used_noises(self) -> list[CommonNoise | None]:
-        """Return the noise that each block's rows share; None for a block without shared noise."""
+        """Return, for each block, the noise that its rows share; None for a block without shared noise."""
         result: list[CommonNoise | None] = [None] * len(self.blocks)
         for piece in self.pieces:
             if piece.part.noise:
@@ -176,12 +184,13 @@ def calibrated_chain(
     """Return the calibrated robot of one or two fits, with the covariance of its element values.
 
     Args:
-        fit: the fit that predicts best.
+        fit: the fit with the smallest prediction errors.
         rigid: the best fit without joint corrections; None if `fit` has no corrections.
-        nominal: the arm before any calibration; None for the one that the fit began with.
+        nominal: the arm before any calibration; None for the arm from which `fit` started.
 
     Raises:
-        UsageError: for a fit with joint corrections and no rigid one: without them its geometry is no robot's.
+        UsageError: `fit` has joint corrections and `rigid` is None. The geometry of `fit` is not valid without its
+            corrections.
     """
     merged = fit.cell.merged()
     nominal = nominal or fit.start.chain
@@ -204,7 +213,13 @@ def calibrated_chain(
 
 
 def _corrected_covariance(fit: GeometricFit, chain: Chain, merged: Installation) -> np.ndarray:
-    """Return the covariance of a chain's elements and its corrections; zero for those that were not fitted."""
+    """Return the covariance of a chain's elements and its corrections; zero for parameters that were not fitted.
+
+    Args:
+        fit: the fit with joint corrections.
+        chain: the fitted geometry.
+        merged: its installation with earlier and fitted corrections in one field (`Installation.merged`).
+    """
     names = (*chain.names, *merged.deflection.names(chain))
     source, target = [], []
     for number, name in enumerate(fit.estimate.names):
@@ -243,15 +258,17 @@ class Settings:
 
 
 class Weigher:
-    """Sigmas and robust weights of every residual part, updated between passes of a fit.
+    """Sigmas and robust weights of every residual part, updated between the passes of a fit.
 
     Attributes:
-        settings, nominal, blocks, free: of the fit.
+        settings, nominal, blocks, free: settings, installation at the prior's mean, measurements and fitted parameters
+            of the fit.
         prior: (f,) standard deviations about `nominal`; None where all are infinite.
         pieces: residual parts with the sigmas and weights of the next pass.
         pieces_of_pass: residuals at the end of the last pass, with the sigmas, weights and noise that it used.
-        noise: rms of the residuals over their sigmas, by which the prior is weighed against the measurements.
-        noise_of_pass: that of the last pass.
+        noise: rms of the residuals divided by their sigmas, which sets the weight of the prior relative to the
+            measurements.
+        noise_of_pass: value of `noise` in the last pass.
     """
 
     def __init__(
@@ -270,11 +287,17 @@ class Weigher:
 
     @property
     def noises(self) -> list[CommonNoise | None]:
-        """Noise that the rows of each part share; None for a part without."""
+        """Noise that the rows of each residual part share; None for a part without shared noise."""
         return [piece.part.noise for piece in self.pieces]
 
     def update(self, state: Installation, first: bool, resting: float = 0.0) -> None:
-        """Set sigmas and weights from the residuals at a state; `resting`: parameters that rest on the prior."""
+        """Set sigmas and weights from the residuals of an installation.
+
+        Args:
+            state: the installation.
+            first: True before the first pass of a fit.
+            resting: effective number of parameters that are determined by their prior.
+        """
         parts: list[tuple[int, ResidualPart]] = []
         for number, block in enumerate(self.blocks):
             parts += [(number, part) for part in observe(state, block, _NONE)]
@@ -308,9 +331,13 @@ class Weigher:
             self._update_noise(rows, share)
 
     def _update_noise(self, rows: int, share: float) -> None:
-        """Set the noise from the weighted residuals of all parts.
+        """Set `noise` from the weighted residuals of all parts.
 
-        What the rows of an image share has its own noise model, and says nothing of the common factor.
+        Errors shared by the rows of an image have their own noise model, and are excluded.
+
+        Args:
+            rows: number of measured numbers.
+            share: degrees of freedom per measured number.
         """
         squares = 0.0
         for piece in self.pieces:
@@ -321,7 +348,7 @@ class Weigher:
     def settle(self, solution: Solution) -> Solution | None:
         """Return the solution scaled to the sigmas of its residuals; None if new sigmas would change the estimate.
 
-        A common factor on all sigmas changes only the scale, unless the fit has a prior.
+        A factor common to all sigmas changes only the scale of the covariance, unless the fit has a prior.
         """
         before = self.pieces
         noises = self.noises
@@ -344,7 +371,12 @@ class Weigher:
         return replace(solution, factor=solution.factor / common, cost=solution.cost / common**2)
 
     def _steady(self, before: list[Piece], noises: list[CommonNoise | None]) -> bool:
-        """Return whether robust weights, shared noises and the prior's weight are those of the last pass."""
+        """Return whether robust weights, shared noises and the prior's weight are nearly those of the last pass.
+
+        Args:
+            before: residual parts of the last pass, with their robust weights.
+            noises: for each part, the shared noise of the last pass; None for a part without.
+        """
         for piece, earlier in zip(self.pieces, before):
             change = np.abs(piece.weight - earlier.weight).max(initial=0.0)
             if not change < MAX_CHANGE:
@@ -355,30 +387,50 @@ class Weigher:
         return self.prior is None or abs(self.noise / self.noise_of_pass - 1.0) < MAX_CHANGE
 
     def unsettled_result(self, solution: Solution) -> GeometricFit:
-        """Return the fit of the last pass, weighed as that pass was, though new sigmas would change it."""
+        """Return the fit of the last pass with the weights of that pass.
+
+        It is used where new sigmas would still change the estimate after the last pass.
+
+        Args:
+            solution: result of the last pass.
+        """
         self.pieces = self.pieces_of_pass
         self.noise = self.noise_of_pass
         return self.result(solution)
 
     def _resting(self, solution: Solution) -> float:
-        """Return how many parameters rest on their prior: Σ σ² / σ_prior²."""
+        """Return the effective number of parameters that are determined by their prior: Σ σ² / σ_prior².
+
+        Args:
+            solution: result of a pass.
+        """
         if self.prior is None:
             return 0.0
         return float(np.sum(np.diag(covariance(solution.factor)) * self._precision()))
 
     def _precision(self) -> np.ndarray:
-        """Return the prior's precisions (f,), in the measurements' unit of weight; zero where there is none."""
+        """Return the prior's precisions (f,), multiplied by `noise` squared; zero for parameters without a prior."""
         if self.prior is None:
             return np.zeros(len(self.free))
         return (self.noise / self.prior) ** 2
 
     def _pull(self, state: Installation) -> np.ndarray:
-        """Return the prior's residuals (f,) at a state, in the measurements' unit of weight; zero without a prior."""
+        """Return the prior's residuals (f,) for an installation, each multiplied by the root of its precision.
+
+        Zero for parameters without a prior.
+
+        Args:
+            state: the installation.
+        """
         change = parameter_values(self.nominal) - parameter_values(state)
         return change[self.free] * np.sqrt(self._precision())
 
     def linearise(self, state: Installation) -> Reduced:
-        """Return the whitened problem at a state, reduced, with the prior."""
+        """Return the whitened least-squares problem at an installation, with the prior, reduced by QR decomposition.
+
+        Args:
+            state: the installation at which derivatives are computed.
+        """
         prior_rows = list[Rows]()
         statistics = list[Gram]()
         if self.prior is not None:
@@ -397,18 +449,19 @@ class Weigher:
 
     @property
     def _many(self) -> bool:
-        """Whether W is large and its rows are of a kind whose statistics come cheaper than rows."""
+        """Whether W is large, and WᵀW is computed faster than its rows, which is so for positions and poses."""
         count = sum(piece.sigma.size for piece in self.pieces) * len(self.free)
         return count > MOST_NUMBERS and all(separable(block.measured) for block in self.blocks)
 
     def _posterior(self, factor: np.ndarray, variance: float) -> np.ndarray:
         """Return the posterior covariance (f, f): (Wᵀ W / variance + diag(1 / prior²))⁻¹.
 
-        Where measurements are so exact that the prior is below rounding, all is scaled by the variance.
+        Where measurements are so accurate that the prior is lost in rounding errors, it is computed as variance · (Rᵀ
+        R)⁻¹.
 
         Args:
-            factor: (f, f) upper triangular R of measurements and prior.
-            variance: of the residuals, in squares of their sigmas.
+            factor: (f, f) upper triangular factor R of measurements and prior.
+            variance: variance of the residuals, in units of their sigmas squared.
         """
         if self.prior is None:
             return covariance(factor, variance)
@@ -424,13 +477,17 @@ class Weigher:
         return inverse.T @ inverse
 
     def result(self, solution: Solution) -> GeometricFit:
-        """Return the fit at a solution, with the posterior covariance of its parameters."""
+        """Return the fit at a solution, with the posterior covariance of its parameters.
+
+        Raises:
+            Unidentifiable: the rows do not determine some parameters at the solution.
+        """
         state = solution.state
         undetermined = self.free[np.diag(solution.factor) == 0.0]
         if len(undetermined):
             names = [layout(state).names[parameter] for parameter in undetermined]
             raise Unidentifiable(
-                f"{self.blocks[0].measured.file}: these rows no longer determine {', '.join(names)} where the search "
+                f"{self.blocks[0].measured.file}: these rows do not determine {', '.join(names)} where the search "
                 "ended; measure at more different joint values",
                 names,
             )
@@ -468,19 +525,38 @@ class Weigher:
 
 
 def _rows(cell: Installation, free: np.ndarray, blocks: list[Block], pieces: list[Piece]) -> Iterator[Rows]:
-    """Yield the residuals of all blocks and their Jacobians, whitened as in `pieces`."""
+    """Yield the residuals of all blocks and their Jacobians, whitened with the sigmas and weights in `pieces`.
+
+    Args:
+        cell: the installation at which derivatives are computed.
+        free: (f,) indices of the fitted parameters.
+        blocks: the prepared measurements.
+        pieces: residual parts of all blocks, with sigmas and weights.
+    """
     for number, block in enumerate(blocks):
         noises = [piece.part.noise for piece in pieces if piece.block == number]
         yield from whitened(cell, block, free, _scales(pieces, number), noises)
 
 
 def _scales(pieces: list[Piece], number: int) -> list[np.ndarray]:
-    """Return the divisors (rows, m) of a block's residual parts, from sigmas and robust weights."""
+    """Return the divisors (rows, m) of a block's residual parts: sigma over the root of the robust weight.
+
+    Args:
+        pieces: residual parts of all blocks.
+        number: index of the block.
+    """
     return [piece.sigma / np.sqrt(piece.weight) for piece in pieces if piece.block == number]
 
 
 def _sigma(part: ResidualPart, share: float, start: bool, robustly: bool) -> np.ndarray:
-    """Return standard deviations (rows, m) of a part: those of the file, or one estimated from the residuals."""
+    """Return the standard deviations (rows, m) of a part: stated in the file, or estimated from the residuals.
+
+    Args:
+        part: residuals in m or rad.
+        share: degrees of freedom per measured number; the estimated variance is divided by it.
+        start: True before the first pass: a typical value is returned in place of an estimate.
+        robustly: True estimates from the median of the residuals, False from their rms.
+    """
     if part.sigma is not None:
         return part.sigma
     if start:
@@ -493,5 +569,10 @@ def _sigma(part: ResidualPart, share: float, start: bool, robustly: bool) -> np.
 
 
 def _size(part: ResidualPart, sigma: np.ndarray) -> np.ndarray:
-    """Return each row's residual in sigmas (m,), rms over its components, without the noise that rows share."""
+    """Return the size (m,) of each row's residual in sigmas, rms over its components, without noise that rows share.
+
+    Args:
+        part: residuals of m rows.
+        sigma: (rows, m) standard deviations of the residuals, in their unit.
+    """
     return np.sqrt(np.mean((part.alone(sigma) / sigma) ** 2, axis=0))

@@ -1,18 +1,18 @@
 """Drive gains from currents: torque = gain · current, identified from runs without and with a payload of known mass.
 
-A model fitted to currents is known up to a scale per joint; parameters that act on several joints (a link's mass acts
-on all joints before it) relate the scales to each other, and a payload of known mass fixes them (Gautier & Briot 2011,
-2014):
+A model fitted to currents is known up to one scale per joint. Parameters that affect several joints (a link's mass
+affects all joints before it) relate these scales to each other, and a payload of known mass determines them (Gautier &
+Briot 2011, 2014):
 
     K_j i_j = W_j χ  (unloaded),    K_j i_j = W_j χ + P_j χ_L  (loaded),    one entry of χ_L known.
 
-Gautier & Briot solve the homogeneous system by total least squares, for the noise is in the currents. With the noise
-of joint j only in i_j, that is the weighted nonlinear problem
+Gautier & Briot solve the homogeneous system by total least squares (TLS), because the noise is in the currents. If the
+noise of joint j is only in i_j, the problem is the weighted nonlinear one
 
     min Σ_j ‖i_j - [W_j P_j] x / K_j‖² / σ_j²,
 
-which is solved here by Gauss and Newton on triangles, with σ_j settled; total least squares gives the start (our
-choice: the unstructured TLS lets every joint's current be noisy in every row).
+which is solved here by Gauss–Newton on triangles, with σ_j re-estimated in each step. Least squares with the currents
+as columns gives the start (our choice: unstructured TLS assumes noise of every joint's current in every row).
 """
 
 from __future__ import annotations
@@ -49,9 +49,6 @@ MIN_START = 0.05
 """Least start value of a gain, in units of the median of all."""
 
 
-# them alike all along a recording. 13 gains of a UR10e, of four recordings, are rms 1.6 such sigmas from the maker's
-
-
 @dataclass(frozen=True, eq=False)
 class DriveGains:
     """Estimated drive gains with covariance, and the other parameters of the fit.
@@ -62,7 +59,8 @@ class DriveGains:
         names, values: all parameters in torque units: base parameters and the payload's.
         std: (n,) standard deviation of the residual currents [A].
         scale: text on what determines the scale.
-        own: joints, from 0, whose gain the motion does not identify: set to one, so that its torque is in amperes.
+        own: joints, from 0, whose gain the motion does not identify; it is set to 1, so that the joint's torque is in
+            amperes.
     """
 
     gains: np.ndarray
@@ -80,7 +78,7 @@ class DriveGains:
 
     @property
     def told(self) -> tuple[str, ...]:
-        """Status of each gain: identified (``told``), ``reference`` of the others, or unidentified (``not told``)."""
+        """Status of each gain: ``told`` (identified), ``not told``, or ``reference`` (other gains relative to it)."""
         status = []
         for joint, (gain, sigma) in enumerate(zip(self.gains, self.sigma)):
             if joint in self.own:
@@ -97,9 +95,9 @@ class GainRecord:
     """Record of drive gains in files, by joint: torque = gain · current.
 
     Attributes:
-        values: (n,) gains; NaN where the motion does not identify the gain: that joint's torque is in amperes.
-        sigma: (n,) standard deviations; NaN for the reference joint and where the gain is not identified.
-        told: see `DriveGains.told`.
+        values: (n,) gains; NaN if the motion does not identify a gain, so that this joint's torque is in amperes.
+        sigma: (n,) standard deviations; NaN for the reference joint and for gains that are not identified.
+        told: status of each gain, as in `DriveGains.told`.
         covariance: (n, n) covariance of the gains.
         unit, scale: unit of the gains, and what determines their scale.
     """
@@ -113,7 +111,7 @@ class GainRecord:
 
     @classmethod
     def of(cls, gains: DriveGains, unit: str) -> GainRecord:
-        """Return the record of estimated gains; `unit` is the torques' unit."""
+        """Return the record of estimated gains; `unit` is the unit of torques."""
         status = np.array(gains.told)
         values = np.where(status == "not told", np.nan, gains.gains)
         sigma = np.where(status == "told", gains.sigma, np.nan)
@@ -137,17 +135,20 @@ def identify_gains(
 ) -> DriveGains:
     """Return the drive gains estimated from R factors of [W P | i], one group per joint.
 
+    W are the columns of the robot's base parameters, P those of the payload's parameters, i the currents.
+
     Args:
-        currents: columns of the model with the payload, target the currents.
-        payload: parameters whose values are known (a payload's mass, its centre of mass), in SI.
-        inflation: (n,) number of rows that count as one; None: 1.
-        start: (n,) first guess of the gains; None: from least squares on the torques of the known parameters.
-        reference: where nothing is known, the joint whose gain is set to 1: the others follow relative to it, and
-            torques come out in amperes of that joint.
-        own: joints whose gain is fixed at one, so that their torque is in amperes.
+        currents: R factors with the columns of a model with payload, and the currents as target.
+        payload: parameters of known value (a payload's mass, its centre of mass), in SI units.
+        inflation: (n,) variance inflation, i.e. number of rows that count as one; None: 1.
+        start: (n,) first guess of the gains; None: from least squares with the torques of the known parameters.
+        reference: joint whose gain is set to 1 if no parameter is known: other gains are relative to it, and torques
+            are in amperes of that joint. None: `payload` determines the scale.
+        own: joints whose gain is fixed at 1, so that their torque is in amperes.
 
     Raises:
-        Unidentifiable: where a known parameter acts on no joint, neither directly nor through others.
+        Unidentifiable: without a known parameter and reference.
+        NotConverged: if the iteration does not converge, e.g. because the payload does not load every joint.
     """
     n, names = currents.groups, currents.names
     fixed = np.array([names.index(name) for name in payload], dtype=int)
@@ -223,19 +224,24 @@ def identify_gains(
 
 
 def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray, reference: int) -> DriveGains:
-    """Return the gains relative to that of a reference joint; gains that the motion does not identify are set to one.
+    """Return gains relative to the gain of a reference joint; gains that the motion does not identify are set to 1.
 
-    Sigmas are the larger of those from residuals and those of a jackknife over time blocks (Efron & Tibshirani 1993,
-    eq. 11.5), which contain part of the model's errors, times `LEFT`. A gain counts as identified if its sigma is below
-    `MAX_SIGMA` times the gain, and the gain is within a factor `MAX_FACTOR` of the others: at a wrist, torques shared
-    with other joints are small compared with friction, and a fit then mistakes model errors for inertia (our choice).
-    Where the search does not converge, the gain that diverged most is not identified.
+    The standard deviations are the larger of two, times `LEFT`: those from the residuals, and those of a jackknife over
+    time blocks (Efron & Tibshirani 1993, eq. 11.5), which contain part of the model's errors. A gain counts as
+    identified if its standard deviation is below `MAX_SIGMA` times the gain, and the gain is within a factor
+    `MAX_FACTOR` of the median of all gains. At a wrist, torques shared with other joints are small compared with
+    friction, so that a fit mistakes model errors for inertia (our choice). If the search does not converge, the gain
+    that diverged most counts as not identified.
 
     Args:
-        data: triangles of [W i] by block and joint, group = block · joints + joint.
+        data: R factors of [W i] (columns of the base parameters, and currents) by time block and joint, group = block ·
+            joints + joint.
         joints: number of joints.
-        inflation: (joints,) number of rows that count as one.
-        reference: the joint whose gain is one.
+        inflation: (joints,) variance inflation, i.e. number of rows that count as one.
+        reference: joint whose gain is 1, from 0.
+
+    Raises:
+        NotConverged: if the search does not converge with any set of joints.
     """
     rows_of_block = np.asarray(data.rows).reshape(-1, joints).sum(axis=1)
     blocks = np.flatnonzero(rows_of_block).tolist()
@@ -273,7 +279,16 @@ def _jackknife(
     reference: int,
     unidentified: tuple[int, ...],
 ) -> np.ndarray:
-    """Return the jackknife's standard deviations of the log gains (joints,); zero with fewer than three blocks."""
+    """Return jackknife standard deviations of the log gains (joints,); zero with fewer than three time blocks.
+
+    Args:
+        data: R factors by time block and joint.
+        blocks: numbers of the time blocks, each omitted in turn.
+        fit: gains from all blocks, with which each search starts.
+        inflation: (joints,) variance inflation.
+        reference: joint whose gain is 1, from 0.
+        unidentified: joints whose gain is fixed at 1.
+    """
     joints = len(fit.gains)
     if len(blocks) <= 2:
         return np.zeros(joints)
@@ -294,10 +309,15 @@ def _jackknife(
 
 
 def _most_distant(error: NotConverged, reference: int, unidentified: Sequence[int]) -> int:
-    """Return the joint whose gain diverged most (gains not converged): the motion does not identify this gain.
+    """Return the joint whose gain diverged most, which the motion does not identify.
+
+    Args:
+        error: failure of the search, with the last gains.
+        reference: reference joint.
+        unidentified: joints that are excluded already.
 
     Raises:
-        NotConverged: `error` itself, where no joint remains.
+        NotConverged: `error` itself, if no joint remains.
     """
     gains = np.array(error.last, dtype=float)
     log_gains = np.nan_to_num(np.log(gains), nan=np.inf)
@@ -309,7 +329,13 @@ def _most_distant(error: NotConverged, reference: int, unidentified: Sequence[in
 
 
 def _start(columns: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.ndarray:
-    """Return start values of the gains, least squares of [i -W] [K; χ] = P m: biased towards zero."""
+    """Return start values of the gains by least squares of [i -W] [K; χ] = P m, which is biased towards zero.
+
+    Args:
+        columns: (n, rows, p) W, R factor of each joint.
+        load: (n, rows) torques P m of the known parameters.
+        current: (n, rows) currents i.
+    """
     n, size, p = columns.shape
     matrix = np.zeros((n, size, n + p))
     for joint in range(n):
@@ -323,7 +349,14 @@ def _start(columns: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.nda
 
 
 def _parameters(columns: np.ndarray, load: np.ndarray, current: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    """Return the least-squares parameters (p,) at these gains."""
+    """Return the least-squares parameters (p,) for given gains (n,).
+
+    Args:
+        columns: (n, rows, p) W, R factor of each joint.
+        load: (n, rows) torques of the known parameters.
+        current: (n, rows) currents.
+        gains: (n,) torque per current.
+    """
     matrix = columns / gains[:, None, None]
     target = current - load / gains[:, None]
     flat = matrix.reshape(-1, columns.shape[2])

@@ -1,4 +1,4 @@
-"""Identification of a model from cases: base parameters, selected friction, estimate with covariance, prediction."""
+"""Identification of a model from recordings: base parameters, selected friction, and estimate with covariance."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -59,16 +59,16 @@ class Identification(Generic[Model]):
     Attributes:
         dynamics: the model with its parameter values.
         base: base columns selected from the standard model, and their regrouping.
-        fitted: the estimate of base parameters and friction.
-        elimination: the steps to the essential parameters; None if not requested.
-        friction: richer friction selected on held-out time.
+        fitted: the estimate of base parameters and additional friction.
+        elimination: the elimination to the essential parameters; None if not requested.
+        friction: additional friction terms selected on held-out time.
         settings: settings of the identification.
         rows: observation rows of the training data.
         terms: the drive term of each estimated parameter; None for parameters of bodies.
         condition: condition numbers of the base parameters' observation matrix, as it is and with columns of unit norm.
         prior: prior of the base parameters; None if unused.
         ripples: gear ripple above the identification band, by joint; not part of the estimate's covariance.
-        loop: results of simulating the recordings' closed loop, where one is stated.
+        loop: results of simulating the recordings' closed loop; empty if none is stated.
     """
 
     dynamics: Dynamics[Model]
@@ -86,7 +86,7 @@ class Identification(Generic[Model]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the estimate's parameters: base parameters, then richer friction."""
+        """Names of the estimated parameters: base parameters, then additional friction."""
         friction_names = [term.name for term in self.friction.terms]
         return (*self.base.names, *friction_names)
 
@@ -100,11 +100,15 @@ def identify(
     """Return the dynamics of a robot identified from recordings, on its calibrated geometry.
 
     Args:
-        robot: the chain that a geometric fit returns, or a nominal chain. Base columns are chosen on its nominal
-            geometry; joint corrections take part where the cases have the links' motion.
+        robot: the chain of a geometric fit, or a nominal chain. Base columns are chosen on its nominal geometry. Joint
+            corrections are used if the cases contain the motion of the links.
         cases: training recordings.
-        settings: settings of the identification; None: those that suit a serial arm with motor torques.
-        progress: called with a short text at each stage; None: not called.
+        settings: settings of the identification; None: the defaults, for a serial arm with motor torques.
+        progress: function that is called with a short text at each stage; None: not called.
+
+    Raises:
+        UsageError, MeasurementError: for settings or recordings that cannot be used.
+        CalibError: the method's failure, if there is no estimate.
     """
     settings = settings or IdentificationSettings()
     robot = as_calibrated(robot)
@@ -143,26 +147,29 @@ def identify_model(
 ) -> Identification[RegressorModel]:
     """Return the identification of a model, linear in its parameters, from recordings.
 
-    Base columns, prior, richer friction, the method's estimate, ripple, essential parameters: a sequence of steps
-    around one method, which states which of them it accepts.
+    The steps are base columns, prior, additional friction, the method's estimate, ripple, and essential parameters. The
+    method states which of them it supports.
 
     Args:
         model: model of a serial chain, or any other `RegressorModel`.
         cases: training recordings, with the torques of the model's rows as targets.
-        settings: settings of the identification; drives, payloads and gravity are taken from `model`.
+        settings: settings of the identification, whose drives, payloads and gravity are ignored (`model` has its own);
+            None: the defaults.
         nominal: the same model on the geometry on which base columns are chosen; None: `model`.
-        states: states at which base columns are compared; None: the model's random states.
-        cad: the bodies' parameters from the robot's description; None where it has no masses.
-        shape: the bodies' parameters of a robot of one kilogram, where there are no CAD values; None: not known.
-        effort: (n,) torque limits of the joints, up to a factor; None: not known.
-        progress: called with a short text at each stage; None: not called.
+        states: states at which base columns are compared; None: random states of the model.
+        cad: the bodies' parameters from the robot's description; None if it has no masses.
+        shape: the bodies' parameters of a robot of this geometry with a mass of 1 kg, used without CAD values; None:
+            unknown.
+        effort: (n,) torque limits of the joints, up to a factor; None: unknown.
+        progress: function that is called with a short text at each stage; None: not called.
 
     Raises:
-        CalibError: the method's failure, where there is no estimate.
+        UsageError, MeasurementError: for settings or recordings that cannot be used.
+        CalibError: the method's failure, if there is no estimate.
     """
     settings = settings or IdentificationSettings()
     say = progress or (lambda message: None)
-    require(cases, "no recording to identify the model from", UsageError)
+    require(cases, "no recording to identify the model from: give at least one", UsageError)
     method = method_named(settings.method)
     settings = require_usable(settings, method)
     method, constraints = under_constraints(method, settings.constraints)
@@ -234,6 +241,7 @@ def identify_model(
         loop=settings.loop,
         cad=cad,
         constraints=settings.constraints,
+        progress=progress,
     )
     return _identified(problem, method, friction, settings, say)
 
@@ -241,7 +249,14 @@ def identify_model(
 def _first_fit(
     rows: list[ObservationRows], find: Callable[..., Prior], takes_prior: bool, noise: np.ndarray | None
 ) -> _Fitted:
-    """Return the rows with their prior (None where the method takes none) and their first fit."""
+    """Return the rows with their prior (None if the method uses none) and their first fit.
+
+    Args:
+        rows: rows of all recordings.
+        find: function of the rows that returns their prior.
+        takes_prior: whether to use a prior.
+        noise: (rows,) stated standard deviation of the torque noise, up to a common factor; None: from the residuals.
+    """
     if takes_prior:
         prior = find(rows)
         return rows, prior, prior.first
@@ -251,7 +266,13 @@ def _first_fit(
 def _left_out_error(
     fitted: _Fitted, reference_rows: Sequence[ObservationRows], settings: IdentificationSettings
 ) -> float:
-    """Return the error of a first fit on the reference rows of time blocks left out of it."""
+    """Return the cross-validated squared error of a first fit on the reference rows of held-out time blocks.
+
+    Args:
+        fitted: rows with a treatment of standstills, their prior and first fit.
+        reference_rows: the same samples with their standstills marked; the error is that of their rows in motion.
+        settings: settings, which exclude torques of another unit.
+    """
     rows, prior, first = fitted
     prior_rows = None
     if prior is not None:
@@ -268,13 +289,16 @@ def _weighed_after_standstills(
     prior: Prior,
     column_groups: np.ndarray,
 ) -> list[ObservationRows]:
-    """Return the rows with lower weights after standstills, where friction at rest still decays.
+    """Return the rows with lower weights shortly after standstills, where the friction at rest still decays.
 
-    The decay is estimated from residuals with richer friction, which explains slow motion, too.
+    The decay is estimated from residuals of a fit with additional friction, which also explains slow motion.
 
     Args:
-        rows: rows of all recordings, richer friction included.
-        first: the fit from which the joints' weights come.
+        rows: rows of all recordings, additional friction included.
+        cases: recordings.
+        decimator: filter of the rows.
+        torque_rows: kind of torques in the rows.
+        first: first fit, which gives the weights of the joints.
         prior: prior of the base parameters.
         column_groups: ridge group of each column; -1 for base parameters.
     """
@@ -288,7 +312,12 @@ def _weighed_after_standstills(
 
 
 def _terms_of(model: RegressorModel, base: Base) -> list[DriveTerm | None]:
-    """Return the drive term of each base parameter; None for parameters of bodies."""
+    """Return the drive term of each base parameter; None for parameters of bodies.
+
+    Args:
+        model: the model.
+        base: its base parameters.
+    """
     terms: list[DriveTerm | None] = []
     for column in base.kept:
         if column < model.inertial:
@@ -306,10 +335,18 @@ def _observed(
     settings: IdentificationSettings,
     method: Method,
 ) -> tuple[list[ObservationRows], list[ObservationRows]]:
-    """Return the rows of all cases in the base columns, time blocks numbered: as they are, and standstills marked.
+    """Return the rows of all cases in the base columns with numbered time blocks, without and with marked standstills.
+
+    Args:
+        model: the model.
+        base: its base parameters.
+        cases: recordings.
+        decimator: filter and decimation of the rows.
+        settings: settings: number of time blocks, smoothing of the Coulomb sign.
+        method: the method; standstills are marked only for least squares.
 
     Raises:
-        MeasurementError: for fewer rows than twice the base parameters.
+        MeasurementError: if there are fewer rows than twice the number of base parameters.
     """
     rows = [observe(model, base.kept, case, decimator) for case in cases]
     rows = with_blocks(rows, settings.folds)
@@ -335,7 +372,15 @@ def _identified(
     settings: IdentificationSettings,
     say: Progress,
 ) -> Identification[RegressorModel]:
-    """Return the identification of a problem by a method: estimate, test of its loop, ripple, essential parameters."""
+    """Return the identification of a problem by a method: estimate, simulated loop, ripple, essential parameters.
+
+    Args:
+        problem: data and settings of the estimation.
+        method: the method.
+        friction: selected friction terms.
+        settings: settings of the identification.
+        say: function that is called with a short text at each stage.
+    """
     model = problem.model
     base = problem.base
     cases = problem.cases
@@ -378,7 +423,13 @@ def _identified(
 
 
 def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:
-    """Return random states of a chain's model within the chain's limits."""
+    """Return random states of a chain's model within the chain's joint limits.
+
+    Args:
+        chain: the arm.
+        model: its model.
+        seed: seed of random numbers.
+    """
     lower, upper = chain.sampling_limits()
     return bases.random_samples(model, seed=seed, lower=lower, upper=upper)
 
@@ -386,20 +437,27 @@ def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:
 def find_base(
     model: RegressorModel, cases: Sequence[Case], states: States, nominal: RegressorModel | None = None
 ) -> Base:
-    """Return the base columns of a model, selected over states and payloads on the nominal geometry if one is given."""
+    """Return the base parameters of a model, with columns compared over states and over the payloads of the cases.
+
+    Args:
+        model: the model.
+        cases: recordings.
+        states: states at which columns are compared.
+        nominal: the model on the geometry on which columns are chosen; None: `model`.
+    """
     payloads = [tuple(sorted(case.carried)) for case in cases]
     return bases.find(model, states, tuple(dict.fromkeys(payloads)), nominal=nominal)
 
 
 def _torque_limits(chain: Chain) -> np.ndarray | None:
-    """Return the joints' torque limits (n,) from the robot's description; None if any limit is missing."""
+    """Return the torque limits (n,) [N m or N] of the joints of `chain`; None if any limit is missing."""
     limits = np.array([joint.effort for joint in chain.joints])
     usable = np.isfinite(limits) & (limits > 0.0)
     return limits if usable.all() else None
 
 
 def _has_drives(model: RegressorModel) -> TypeGuard[IdentificationModel]:
-    """Return whether a model accepts richer friction, which acts on the motors of single joints."""
+    """Return whether a model supports additional friction terms, which act on the motors of single joints."""
     return isinstance(model, IdentificationModel) and model.torque_rows.with_motors
 
 
@@ -414,7 +472,21 @@ def _richer_friction(
     settings: IdentificationSettings,
     progress: Progress | None,
 ) -> tuple[FrictionSelection, Sequence[np.ndarray | None]]:
-    """Return the friction selected on held-out time, and the torques (N, n) that load-dependent terms depend on."""
+    """Return the friction terms selected on held-out time, and for each case the transmitted torques (N, n).
+
+    Load-dependent friction depends on the transmitted torques; these are None if no tested term needs them.
+
+    Args:
+        model: the model with standard friction.
+        base: its base parameters.
+        rows: rows of all cases.
+        cases: recordings.
+        decimator: filter and decimation of the rows.
+        first: first fit, which gives row weights and predicts transmitted torques.
+        prior: prior of the base parameters; None without one.
+        settings: settings of the identification.
+        progress: function that is called with a short text at each step; None: not called.
+    """
     loads: list[np.ndarray | None] = [None] * len(cases)
     if not _has_drives(model):
         return FrictionSelection((), (), ()), loads
@@ -449,7 +521,16 @@ def _richer_friction(
 def _with_ripple(
     dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings, say: Progress
 ) -> tuple[Dynamics[RegressorModel], tuple[Ripple, ...]]:
-    """Return the model with gear ripple identified from its residuals, if the settings request it."""
+    """Return the model with gear ripple identified from its residuals, and the ripple of all joints.
+
+    Without a request in the settings, the model is unchanged and there is no ripple.
+
+    Args:
+        dynamics: the identified model.
+        cases: recordings.
+        settings: settings of the identification.
+        say: function that is called with a short text.
+    """
     model = dynamics.model
     if not _has_drives(model) or not model.torque_rows.motors_alone or settings.friction not in ("auto", "ripple"):
         return dynamics, ()
@@ -467,7 +548,13 @@ def _with_ripple(
 def _with_payloads(
     dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings
 ) -> Dynamics[RegressorModel]:
-    """Return the model with the known parameters of payloads that occur in no training recording."""
+    """Return the model with known parameters set for payloads that are in no training recording.
+
+    Args:
+        dynamics: the identified model.
+        cases: training recordings.
+        settings: settings, with known masses of payloads.
+    """
     model = dynamics.model
     values = np.array(dynamics.values)
     for label, payload in settings.payloads.items():
@@ -480,11 +567,17 @@ def _with_payloads(
 
 
 def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) -> Decimator:
-    """Return the filter of all rows: the widest of the cases' bands; if that gives too many rows, with every second,
-    third, ... row.
+    """Return the filter and decimation for all cases, with the widest identification band among the cases.
 
-    Too many are more than ``settings.samples``. The band is not reduced: long recordings have redundant rows, but fast
-    motion is only identified in a wide band.
+    If this gives more than ``settings.samples`` rows, only every second, third, … row is used. The band is not reduced:
+    long recordings have redundant rows, but fast motion is identified only in a wide band.
+
+    Args:
+        cases: recordings.
+        settings: settings, with the largest number of rows.
+
+    Raises:
+        MeasurementError: if the sampling rates of the cases differ.
     """
     rates = [case.motion.rate for case in cases]
     message = f"recordings of {min(rates):.4g} Hz and {max(rates):.4g} Hz cannot be combined; resample one of them"
@@ -499,11 +592,15 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
 
 
 def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
-    """Return the torque noise (rows,) estimated from repeats of the motion (rms over the cases); None if not requested.
+    """Return the torque noise (rows,) from repetitions of the motion, rms over the cases; None if not requested.
+
+    Args:
+        cases: recordings that are averages over repetitions.
+        settings: settings, which request this noise by `weights`.
 
     Raises:
-        UsageError: for another method than WLS, or rows with torques that no variance is read for.
-        MeasurementError: for a recording without variances, or with a joint of variance zero.
+        UsageError: for a method other than WLS, or rows other than motor torques.
+        MeasurementError: for a recording without variances, or with a joint of zero variance.
     """
     if settings.weights == "residuals":
         return None
@@ -533,10 +630,16 @@ def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> n
 
 
 def _takes_prior(method: Method, model: RegressorModel, settings: IdentificationSettings, source: str) -> bool:
-    """Return whether the parameters get a prior: requested, and supported by method and model.
+    """Return whether the parameters get a prior: it is requested, and method and model support it.
+
+    Args:
+        method: the method.
+        model: the model.
+        settings: settings, which request the prior.
+        source: source of the prior, ``cad`` or ``sizes``.
 
     Raises:
-        UsageError: where the CAD prior is requested, but the description states no masses.
+        UsageError: if a CAD prior is requested, but the description has no masses.
     """
     if settings.prior == "cad" and source != "cad":
         raise UsageError("prior = 'cad', but the robot's description states no masses")
@@ -544,7 +647,12 @@ def _takes_prior(method: Method, model: RegressorModel, settings: Identification
 
 
 def _essential(fit: MethodEstimate, settings: IdentificationSettings) -> Elimination | None:
-    """Return the elimination of parameters, or None if it is not requested."""
+    """Return the elimination to the essential parameters; None if it is not requested.
+
+    Args:
+        fit: the estimate of base parameters and friction.
+        settings: settings: rule of the elimination, parameters to keep and to drop.
+    """
     if settings.essential == "none":
         return None
     data, std, inflation = fit.testable()
@@ -557,12 +665,12 @@ def _essential(fit: MethodEstimate, settings: IdentificationSettings) -> Elimina
 
 
 def _require_constrainable(method: Method, settings: IdentificationSettings) -> None:
-    """Raise a UsageError for constraints that the method does not support."""
+    """Raise a UsageError if the settings contain constraints that the method does not support."""
     if settings.constraints is None or method.takes_constraints:
         return
     supporting = [name for name, candidate in METHODS.items() if candidate.takes_constraints]
     constrained = f"pc-{method.name}"
-    advice = f"methods that do: {', '.join(supporting)}"
+    advice = f"methods that support them: {', '.join(supporting)}"
     if constrained in supporting:
         advice = f"use '{constrained}'"
     if settings.constraints.by_function:
@@ -571,6 +679,8 @@ def _require_constrainable(method: Method, settings: IdentificationSettings) -> 
 
 
 def _require_motion(cases: Sequence[Case]) -> None:
-    """Raise an error for training cases without motion."""
+    """Raise an error if no joint moves in any of the training cases."""
     if all((np.ptp(case.motion.q, axis=0) < MIN_MOTION).all() for case in cases):
-        refuse_data(cases[0].motion.file, "no joint moves: only gravity in one pose is identifiable")
+        refuse_data(
+            cases[0].motion.file, "no joint moves, so only gravity in one pose is identifiable: record a motion"
+        )

@@ -114,7 +114,7 @@ USED = 600_000
 
 
 def _no_zero(value: object) -> object:
-    """Refuse a list of numbers with a zero."""
+    """Raise a ValueError for a list of numbers that contains a zero; return any other value unchanged."""
     if isinstance(value, list):
         for number in value:
             if type(number) in (int, float) and number == 0:
@@ -122,10 +122,7 @@ def _no_zero(value: object) -> object:
     return value
 
 
-REMOVED = {
-    "cut_slow": "each standstill of a joint now counts once, its friction unknown within the static friction, so that "
-    "no rows need to be cut: remove the line"
-}
+REMOVED = {"cut_slow": "standing rows are no longer cut, since each standstill of a joint counts once: remove the line"}
 """Keys of earlier versions, and what replaced them."""
 FINDINGS = (
     "masses",
@@ -165,7 +162,7 @@ class FileSettings:
 @strict
 @dataclass(frozen=True)
 class GainPair:
-    """Recordings without and with a payload of known mass, by file name."""
+    """Recordings without and with a payload of known mass, by file name, from which drive gains are identified."""
 
     unloaded: Texts
     loaded: Texts
@@ -174,7 +171,7 @@ class GainPair:
 @strict
 @dataclass(frozen=True)
 class TermTable:
-    """A torque term of the options file; `joint` from 0."""
+    """A torque term of the options file; `joint` is counted from 0."""
 
     name: Name
     shape: Annotated[str, OneOf(tuple(SHAPES))]
@@ -211,11 +208,12 @@ class IdentifyOptions:
 
     Attributes:
         settings: settings of the identification.
-        every, files: settings of all recordings, and of single ones.
-        slow: see the module; None: the default share.
-        gain_pair: recordings that identify the drive gains.
-        accept: findings that do not affect the verdict on the model, see `FINDINGS`.
-        source: the file, for messages.
+        every, files: settings of all recordings, and of single ones by file name.
+        slow: speed below which a joint counts as at rest, as a share of its peak speed or one speed per joint; None:
+            the default share.
+        gain_pair: recordings that identify the drive gains; None without any.
+        accept: findings that do not affect the verdict on the model, some of `FINDINGS`.
+        source: name of the file in messages.
     """
 
     settings: IdentificationSettings = field(default_factory=IdentificationSettings)
@@ -227,7 +225,11 @@ class IdentifyOptions:
     source: str = ""
 
     def file_settings(self, path: str | Path) -> FileSettings:
-        """Return the settings of a recording (or a cut of one), with the torques that the model's rows explain."""
+        """Return the settings of a recording (or a cut of one), including which torques its rows need.
+
+        Args:
+            path: the recording, as the user stated it.
+        """
         settings = own_table(self.files, parse_cut(str(path))[0]) or self.every
         rows = self.settings.torque_rows
         samples = settings.recording.samples or USED
@@ -238,7 +240,7 @@ class IdentifyOptions:
 
 
 def read_options(path: str | Path | None = None) -> IdentifyOptions:
-    """Read the options file at `path`; the defaults without one.
+    """Return the options in the file at `path`; None: the default options.
 
     Raises:
         UsageError: for a missing file, invalid TOML, an unknown key, or an invalid value.
@@ -257,7 +259,11 @@ def read_options(path: str | Path | None = None) -> IdentifyOptions:
 
 
 def parse_options(table: Mapping[str, object], source: str = "options") -> IdentifyOptions:
-    """Return the options in a parsed TOML table; `source` names the file in messages."""
+    """Return the options in a parsed TOML table; `source` names the file in messages.
+
+    Raises:
+        UsageError: for an unknown key or an invalid value.
+    """
     for key in table.keys() & REMOVED.keys():
         message = REMOVED[key]
         refuse_option(f"{source}: {key}", message)
@@ -273,7 +279,7 @@ def options_of(keys: IdentifySettings, source: str = "settings") -> IdentifyOpti
     """Return the options of an identification from the keys of an options file.
 
     Args:
-        keys: of an options file.
+        keys: keys and values of the options file.
         source: name of the file in messages.
 
     Raises:

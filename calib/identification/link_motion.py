@@ -1,19 +1,19 @@
-"""Motion of the links behind joints with corrections, and what the corrections' uncertainty means for the dynamics.
+"""Motion of the links behind joints with corrections (compliance and other joint errors), for the dynamics.
 
 A geometric fit with joint corrections (`calib.robot.calibrated`) gives the position of the link of joint j relative to
 the joint's reading,
 
     q_link,j = q_j + δ_j(q, τ),    δ_j = Σ_terms c · b(q, τ),
 
-with terms of compliance under the torque τ_j, gear ratio, coupled axes, harmonics and sag. Compliance was fitted at
-rest, where τ is the gravity torque; in motion it is the torque of the bodies, gravity, Coriolis and inertia alike (a
-joint of stiffness 1/c, Spong 1987, whose motor and link are both of one position signal), computed at the measured
-motion from the masses that the fit used for gravity torques, and low-passed to the identification band. δ is added to
-the filtered positions; its first and second differences in time are added to v and a. First order in c: the torque that
-bends the joint is that of the unbent arm.
+with terms for compliance under the torque τ_j, gear ratio, coupled axes, harmonics and sag. The compliance was fitted
+at rest, where τ is the gravity torque. In motion, τ is the complete torque of the bodies: gravity, Coriolis and inertia
+(a joint of stiffness 1/c, Spong 1987, with motor and link described by one position signal). It is computed at the
+measured motion, with the masses that the fit used for gravity torques, and low-passed to the identification band. δ is
+added to the filtered positions; its first and second time derivatives (by differences) are added to v and a. This is
+first order in c: the torque that deflects a joint is that of the undeflected arm.
 
-Terms that move other elements than joints (tilting axes, wobble) are left out of the dynamics, and so are all terms
-where an identification simulates the robot (as rigid), and for rows of power.
+Terms that move other elements than joints (tilting axes, wobble) are ignored in the dynamics. All terms are ignored if
+an identification simulates the robot (as rigid), and for rows of power.
 """
 
 from dataclasses import replace
@@ -31,7 +31,15 @@ from calib.robot.chain import Chain
 
 
 def with_link_motion(robot: CalibratedChain, case: Case, settings: IdentificationSettings) -> Case:
-    """Return a case with its links' motion (`Case.link`) by the robot's joint corrections; unchanged without any."""
+    """Return a case with the motion of its links (`Case.link`) according to the robot's joint corrections.
+
+    Without joint corrections, or if the settings ignore them, the case is returned unchanged.
+
+    Args:
+        robot: the calibrated robot, with or without joint corrections.
+        case: the recording, with the motion of the motors.
+        settings: settings, which may ignore corrections (`deflections`).
+    """
     simulated = settings.loop is not None or method_named(settings.method).needs_simulation
     rigid = simulated or not settings.deflections or settings.torque_rows == POWER
     chain = robot.complete
@@ -53,7 +61,12 @@ def with_link_motion(robot: CalibratedChain, case: Case, settings: Identificatio
 
 
 def joint_terms(chain: Chain, deflection: Deflection) -> Deflection:
-    """Return the terms that move joints, which the dynamics follow."""
+    """Return the correction terms that move joints, which the dynamics use; other terms are omitted.
+
+    Args:
+        chain: the arm, which shows the elements that joints move.
+        deflection: joint corrections of a geometric fit.
+    """
     mask = np.isin(target_elements(chain, deflection), chain.moving)
     return chosen_terms(deflection, mask)
 
@@ -65,7 +78,13 @@ def chosen_terms(deflection: Deflection, mask: np.ndarray) -> Deflection:
 
 
 def bodies_torques(terms: Deflection, case: Case, settings: IdentificationSettings) -> np.ndarray | None:
-    """Return the bodies' torques (N, n) along a case in its band [N m or N]; None where no term depends on them."""
+    """Return the bodies' low-passed torques (N, n) [N m or N] along a case; None if no correction needs them.
+
+    Args:
+        terms: correction terms that move joints.
+        case: the recording.
+        settings: settings of the identification, with payloads and gravity.
+    """
     if not any(term.basis == "torque" for term in terms.terms) or terms.reference is None:
         return None
     model = make_model(terms.reference, settings)
@@ -83,7 +102,13 @@ def bodies_torques(terms: Deflection, case: Case, settings: IdentificationSettin
 
 
 def motion_of_bases(terms: Deflection, motion: Motion, torque: np.ndarray | None) -> np.ndarray:
-    """Return the terms' bases along a motion and their first and second derivatives in time, (3, E, N)."""
+    """Return the basis functions b of the terms along a motion, with their first two time derivatives, (3, E, N).
+
+    Args:
+        terms: E correction terms.
+        motion: motion of the joints.
+        torque: (N, n) torques of the bodies [N m or N]; None if no term depends on torque.
+    """
     result = np.zeros((3, len(terms.terms), len(motion)))
     result[0] = evaluate(terms, motion.q, torque)
     for start, stop in segments(motion.segment):

@@ -113,10 +113,10 @@ class LoopSettings:
     integral: Flag = False
 
     def check_lengths(self, n: int) -> None:
-        """Raise an error for a list whose length is neither 1 nor n.
+        """Check that every list has one value or n values.
 
         Raises:
-            UsageError: with the key.
+            UsageError: for another length; the message names the key.
         """
         for field in fields(self):
             values = getattr(self, field.name)
@@ -124,12 +124,24 @@ class LoopSettings:
                 self.per_joint(field.name, n)
 
     def per_joint(self, key: str, n: int) -> np.ndarray:
-        """Return the values (n,) of a key that has one value or n."""
+        """Return the n values of a key, which has one value for all joints or one per joint.
+
+        Args:
+            key: name of the setting.
+            n: number of joints.
+
+        Raises:
+            UsageError: for another number of values.
+        """
         return np.array(per_joint(getattr(self, key), n, f"[loop] {key}"), dtype=float)
 
 
 def per_joint(values: Sequence[T], n: int, name: str) -> tuple[T, ...]:
-    """Return n values from a list of one or n."""
+    """Return n values from a sequence of one value (repeated) or n values; `name` is the option in the error message.
+
+    Raises:
+        UsageError: for another number of values.
+    """
     if len(values) not in (1, n):
         refuse_option(name, f"{len(values)} values for {n} joints; give one, or one per joint")
     if len(values) == 1:
@@ -138,7 +150,7 @@ def per_joint(values: Sequence[T], n: int, name: str) -> tuple[T, ...]:
 
 
 def check_loop(table: object) -> object:
-    """Return the parsed table [loop] unchanged after a check that its gains fit its controller.
+    """Return the parsed table [loop] unchanged, if it has a controller and the gains of this controller.
 
     Raises:
         ValueError: for a missing controller, gains of another controller, or missing gains.
@@ -158,7 +170,7 @@ def check_loop(table: object) -> object:
         if key not in table:
             raise ValueError(f"controller '{kind}' needs {' and '.join(NEEDED[kind])}; '{key}' is missing")
     if kind == "identify" and table.get("share", 1.0) != 1.0:
-        raise ValueError("share: not supported with controller = 'identify', which assumes share = 1")
+        raise ValueError("share: not supported with controller = 'identify', which assumes share = 1: remove the key")
     return table
 
 
@@ -167,15 +179,15 @@ class LoopController:
     """A sampled controller for n joints.
 
     Attributes:
-        kp, kd, ki: (n,) [N m/rad, N m s/rad, N m/(rad s)], or the like for a prismatic joint; for computed torque
-            [1/s², 1/s, 1/s³].
+        kp, kd, ki: (n,) gains [N m/rad, N m s/rad, N m/(rad s)], with N and m for a prismatic joint; for computed
+            torque [1/s², 1/s, 1/s³].
         share: (n,) share of the reference velocity in the velocity loop: 1 in a PD, less in some cascades.
-        limit: (n,) torque limit.
+        limit: (n,) torque limit [N m or N].
         windup: (n,) limit of the error's integral [rad s].
-        ahead: (N, n) feedforward torque at the reference's instants; None for none.
-        model: (10 B,) standard parameters of the controller's own model (computed torque); None for none.
+        ahead: (N, n) feedforward torque at the reference's instants [N m or N]; None: no feedforward.
+        model: (10 B,) standard parameters of the controller's model (computed torque); None: no model.
         delay: control periods from measurement to torque.
-        cutoff: cut-off of the low-pass on the measured velocity [Hz]; None for none.
+        cutoff: cut-off of the low-pass on the measured velocity [Hz]; None: no low-pass.
     """
 
     kp: Array
@@ -195,22 +207,25 @@ class LoopController:
             stated = np.asarray(getattr(self, name), dtype=float)
             value = np.broadcast_to(stated, (n,))
             object.__setattr__(self, name, frozen(np.array(value)))
-        require(self.delay >= 0, f"a delay of {self.delay} control periods is invalid")
+        require(self.delay >= 0, f"a delay of {self.delay} control periods is invalid: state 0 or more")
 
     @property
     def rows(self) -> np.ndarray:
-        """Controller values (6, n) in the layout of the kernel."""
+        """Controller values (6, n) in the order of the kernel `closed_loop`."""
         return np.array([self.kp, self.kd, self.ki, self.share, self.limit, self.windup])
 
     def smoothing(self, period: float) -> float:
-        """Return the weight of a new velocity sample in the low-pass."""
+        """Return the weight of a new velocity sample in the low-pass at a control period [s]; 1 without a low-pass."""
         if self.cutoff is None:
             return 1.0
         decay = np.exp(-2.0 * np.pi * self.cutoff * period)
         return float(1.0 - decay)
 
     def scaled(self, factor: np.ndarray | float) -> LoopController:
-        """Return the controller with all gains times `factor`, one or (n,): the same bandwidth at another inertia."""
+        """Return the controller with all gains multiplied by `factor`, one number or (n,).
+
+        With the ratio of two inertias as factor, the bandwidth is the same at the other inertia.
+        """
         kp = self.kp * factor
         kd = self.kd * factor
         ki = self.ki * factor
@@ -224,17 +239,17 @@ class LoopController:
         return replace(self, kp=kp, kd=kd, ki=ki)
 
     def with_feedforward(self, ahead: np.ndarray) -> LoopController:
-        """Return the controller with a feedforward torque (N, n) added."""
+        """Return the controller with the feedforward torques `ahead` (N, n) [N m or N], which replace earlier ones."""
         return replace(self, ahead=frozen(ahead))
 
 
 @dataclass(frozen=True)
 class ExogeneityTest:
-    """Test of the hypothesis that W is uncorrelated with the noise, hence least squares unbiased.
+    """Test of the hypothesis that W is uncorrelated with the noise, so that least squares is unbiased.
 
     Attributes:
-        statistic: F of the augmented regression.
-        degrees: degrees of freedom, numerator and denominator.
+        statistic: F statistic of the augmented regression.
+        degrees: degrees of freedom of numerator and denominator.
         p: probability of a larger statistic if the hypothesis is true.
     """
 
@@ -244,11 +259,15 @@ class ExogeneityTest:
 
     @stored
     def least_squares_biased(self) -> bool:
-        """Whether the test rejects least squares at the default level of `biased`."""
+        """Whether the test shows that least squares is biased, at the default level of `biased`."""
         return self.biased()
 
     def biased(self, level: float = 0.01) -> bool:
-        """Return whether the test rejects least squares at this level: use IV."""
+        """Return whether the test shows, at this significance level, that least squares is biased; use IV then.
+
+        Args:
+            level: probability of this result if least squares is unbiased.
+        """
         return self.p < level
 
 
@@ -259,15 +278,19 @@ class LoopMetrics:
     Attributes:
         failure: reason why there are no instruments; empty otherwise.
         notes: remarks on the simulated loops.
-        instruments: the method that simulates; `beside`: whether the estimate is another method's.
+        instruments: the method that simulates.
+        beside: whether the user's estimate was made by another method.
         rounds: number of iterations until convergence.
-        durbin_wu_hausman: whether least squares is biased.
+        durbin_wu_hausman: test whether least squares is biased.
         largest_shift_sigma: largest difference of a parameter from least squares, in standard deviations.
-        cragg_donald, instruments_weak, least_partial_r2: strength of the instruments, see `InstrumentStrength`.
-        distance_percent, simulated_torque_error_percent, strays_times: (n,) see `Instrumental`.
-        valid, explains: whether the instruments may be trusted, and explain as much as the model.
-        controller: the simulated controller; if it was identified, `controller_explains_percent` (n,) is the share of
-            its torque that it explains.
+        cragg_donald, instruments_weak, least_partial_r2: strength of the instruments, as in `InstrumentStrength`.
+        distance_percent, simulated_torque_error_percent, strays_times: (n,) `distance`, `direct` and `stray` of
+            `Instrumental`.
+        valid, explains: whether the instruments are valid, and whether the simulation explains the recording, as in
+            `Instrumental`.
+        controller: the simulated controller.
+        controller_explains_percent: (n,) share of the torque that an identified controller explains [%]; None if it was
+            stated.
     """
 
     failure: str = ""
@@ -291,13 +314,14 @@ class LoopMetrics:
 
 @dataclass(frozen=True)
 class LoopDisagreement:
-    """Differences between an estimate that simulates the given control loop and an estimate that does not.
+    """Differences between an estimate that simulates the stated control loop and an estimate that does not.
 
     Attributes:
         method, beside: methods of the two estimates.
-        parameter, sigmas: the parameter with the largest difference, and that in combined standard deviations.
-        left, beside_left: by torque row, unexplained share of the torque in the band, for each estimate [%].
-        factor: by torque row, torque by the first estimate over that by the other.
+        parameter, sigmas: the parameter with the largest difference, and this difference in combined standard
+            deviations.
+        left, beside_left: unexplained share of each row's torque in the identification band, for the two estimates [%].
+        factor: for each torque row, torque of the first estimate over that of the second.
     """
 
     method: str
@@ -314,11 +338,11 @@ class LoopResults:
     """Results of simulating the closed loop of the recordings; empty if the options describe no loop.
 
     Attributes:
-        metrics: as ``metrics.json`` stores them; None without a loop.
-        findings: on the loop, the instruments, and the bias of least squares.
+        metrics: results as stored in ``metrics.json``; None without a loop.
+        findings: findings on the loop, the instruments, and the bias of least squares.
         table: rows of ``instrumental.csv``.
         controller: the simulated controller.
-        disagreement: how recorded torques contradict an estimate that relies on the stated loop; None if they do not.
+        disagreement: contradiction of recorded torques to an estimate that relies on the stated loop; None without one.
     """
 
     metrics: LoopMetrics | None = None
@@ -330,15 +354,16 @@ class LoopResults:
 
 @dataclass(frozen=True, eq=False)
 class Replay:
-    """Tracking errors of the simulated robot on a recorded motion, as a record.
+    """Record of the tracking errors of the simulated robot on a recorded motion.
 
     Attributes:
         name: name of the recording.
         seconds: duration of the replayed part.
-        controller: the feedback; `stated`: whether the user stated it.
+        controller: the feedback controller.
+        stated: whether the user stated this controller.
         terms_left_out: terms of the model that cannot be simulated; their torque is part of the disturbance.
-        inertia_added: (n,) inertia added to make the simulated robot consistent [kg m² or kg].
-        rms: kind of feedforward → (n,) rms of q - q_r [rad or m].
+        inertia_added: (n,) inertia added to make the simulated robot physically consistent [kg m² or kg].
+        rms: (n,) rms of q - q_r [rad or m] for each kind of feedforward.
         unseen: whether this motion was not used in the fit.
     """
 
@@ -353,6 +378,6 @@ class Replay:
 
     @stored
     def feedback_over_model(self) -> float:
-        """Ratio of the tracking errors without and with the model as feedforward, geometric mean over the joints."""
+        """Ratio of tracking errors without and with the model as feedforward, geometric mean over the joints."""
         ratio = self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)
         return float(np.exp(np.mean(np.log(ratio))))

@@ -14,8 +14,10 @@ the joint's torque, friction and motor inertia are in amperes of its own motor, 
 
 ``torques_N.csv``: ``t [s]``, then ``measured_joint1 [N m]`` ... and predicted_ ... of each torque row and the joints
 ``q_joint1 [rad]`` ..., then sigma_ ... of each torque row, the standard deviation expected of measured - predicted
-(1.96 of them hold 95 %), ``extrapolated``, 1 where the motion leaves the training range, and, of recordings without a
-payload, v_ ... a_ ... (the joints' speeds and accelerations, filtered); thinned to about 100 Hz. ``calib identify``
+(1.96 of them hold 95 %), ``extrapolated``, 1 where the motion leaves the training range, nominal_ ... of each torque
+row where the robot's geometry was calibrated (the torque of the model that the same recordings give on the nominal
+geometry), and, of recordings without a payload, v_ ... a_ ... (the joints' speeds and accelerations, filtered); thinned
+to about 100 Hz. ``calib identify``
 writes ``torques_1.csv`` alone, of the first validation recording (without one, of the first to learn from); a session
 writes one per validation recording.
 
@@ -71,10 +73,10 @@ NOTE = "regrouped parameters have base values, all others are zero: torques are 
 
 
 def read_dynamics(folder: str | Path) -> tuple[Chain, Dynamics]:
-    """Return the robot and the identified model in `folder`.
+    """Return the robot and the identified model stored in `folder`.
 
     Raises:
-        RobotError: where the folder holds none, or the two files do not belong together.
+        RobotError: if the folder contains no model, or its two files are of different robots or versions.
     """
     folder = Path(folder)
     table = read_table(folder)
@@ -88,7 +90,7 @@ def read_table(folder: Path) -> ParsedTable:
     """Return the content of ``dynamics.json`` as a table for `from_table`.
 
     Raises:
-        RobotError: where the folder holds none.
+        RobotError: if the folder contains no readable model.
     """
     with refused_as(
         RobotError,
@@ -97,16 +99,22 @@ def read_table(folder: Path) -> ParsedTable:
     ):
         table = json.loads((folder / MODEL).read_text(encoding="utf-8"))
     if not isinstance(table, dict):
-        raise RobotError(f"{folder}/dynamics.json is damaged or of another version: it contains no table")
+        raise RobotError(
+            f"{folder}/dynamics.json is damaged or of another version (it contains no table); identify again"
+        )
     return table
 
 
 def refuse_currents(folder: Path, task: str) -> None:
     """Raise an error for a model in amperes (identified from currents without gains) if a task needs torques.
 
+    Args:
+        folder: folder of the identification.
+        task: name of the task in the message.
+
     Raises:
-        UsageError: for a model whose unit is not newton metres.
-        RobotError: where the folder holds no model.
+        UsageError: for a model whose unit is not N m.
+        RobotError: if the folder contains no model.
     """
     unit = read_table(folder).get("unit", TORQUE)
     if unit != TORQUE:
@@ -119,16 +127,18 @@ def refuse_currents(folder: Path, task: str) -> None:
 
 
 def refuse_other_arm(folder: Path, chain: Chain) -> None:
-    """Raise an error for an identification of another arm than `chain`.
+    """Raise an error if `folder` contains the identification of another arm than `chain`.
 
     Raises:
-        UsageError: for another number of joints, or a tip elsewhere at the same joint values.
-        RobotError: where the folder's robot cannot be read.
+        UsageError: for another number of joints, or another position of the tip at equal joint values.
+        RobotError: if the folder's robot cannot be read.
     """
     identified = description.read(folder / ROBOT)
     if identified.n != chain.n:
         refuse_option(
-            folder, f"is of a robot with {identified.n} joints ({identified.name}), {chain.name} has {chain.n}"
+            folder,
+            f"is of a robot with {identified.n} joints ({identified.name}), but {chain.name} has {chain.n}: identify "
+            "this robot",
         )
     q = random_joints(chain, 20, 0)
     tips = forward(chain, q)[:, :3, 3]
@@ -137,12 +147,20 @@ def refuse_other_arm(folder: Path, chain: Chain) -> None:
     reach = float(np.linalg.norm(tips, axis=1).max())
     if distance > MAX_TIP_DISTANCE * reach:
         refuse_option(
-            folder, f"is of another robot ({identified.name}): its tip is {distance:.3g} m from {chain.name}'s (median)"
+            folder,
+            f"is of another robot ({identified.name}): its tip is {distance:.3g} m from that of {chain.name} "
+            "(median); identify this robot",
         )
 
 
 def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, object]:
-    """Return the model as a table for JSON; `unit`: that of its torques."""
+    """Return a model as a table for ``dynamics.json``.
+
+    Args:
+        dynamics: the model with its parameter values.
+        base: its base parameters.
+        unit: unit of its torques.
+    """
     model = dynamics.model
     inertial = model.inertial
     payloads = []
@@ -184,7 +202,7 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, ob
 
 
 def regrouping(base: Base) -> dict[str, dict[str, float]]:
-    """Return for each base parameter its standard parameters and their coefficients."""
+    """Return for each base parameter its standard parameters and their coefficients, by name."""
     coefficients = {}
     for name, row in zip(base.names, base.transform):
         used = np.flatnonzero(row)
@@ -193,7 +211,15 @@ def regrouping(base: Base) -> dict[str, dict[str, float]]:
 
 
 def from_table(chain: Chain, table: ParsedTable) -> Dynamics:
-    """Return the model of a chain from a table that `to_table` made."""
+    """Return the model of a chain from a table of `to_table`.
+
+    Args:
+        chain: the arm.
+        table: the content of ``dynamics.json``.
+
+    Raises:
+        KeyError, TypeError, ValueError, IndexError: for a damaged table.
+    """
     bodies = bodies_of(chain).with_gravity(np.array(table["gravity"], dtype=float))
     for label in table.get("payloads", ()):
         on = chain.n - 1
@@ -211,7 +237,7 @@ def from_table(chain: Chain, table: ParsedTable) -> Dynamics:
 
 
 def _term(entry: ParsedTable) -> DriveTerm:
-    """Return the drive term of an entry of the table."""
+    """Return the drive term stored in an entry of the table."""
     acts = []
     for row, motion in entry["acts"]:
         weights = tuple((int(joint), float(weight)) for joint, weight in motion)
@@ -225,10 +251,14 @@ def _term(entry: ParsedTable) -> DriveTerm:
 
 
 def identified_masses(folder: str | Path, chain: Chain) -> np.ndarray:
-    """Return the standard parameters (n, 10) of an arm's bodies from an identification's folder.
+    """Return the standard parameters (n, 10) of an arm's bodies from an identification's folder, without payloads.
 
-    Their gravity torques are correct on the geometry of the identification; single parameters need not be
-    (`calib.dynamics.base.to_standard`); payloads are left out.
+    Their gravity torques are correct on the geometry of the identification, but single parameters need not be
+    (`calib.dynamics.base.to_standard`).
+
+    Args:
+        folder: folder of the identification.
+        chain: the arm.
 
     Raises:
         UsageError: for an identification of another arm, in amperes, or without bodies.

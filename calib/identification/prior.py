@@ -1,32 +1,35 @@
-"""Prior of the parameters: proper, always used, with sizes estimated from the data by maximum evidence.
+"""Normal prior of the dynamic parameters, whose standard deviations are estimated from the data by maximum evidence.
 
-Standard parameters χ of one kind (masses, first moments, inertias; rotor inertia, viscous friction, Coulomb friction,
-offsets: whatever has one shape and one unit) are about equally large, and the robot as a whole is about s times a known
-one, u: its CAD, or rods between the joints,
+Standard parameters χ of one kind, i.e. of one shape and unit (masses, first moments, inertias; rotor inertia, viscous
+friction, Coulomb friction, offsets), have about equal sizes, and all parameters of the robot are about s times known
+ones, u, from its CAD or from rods between the joints:
 
-    χ = s u + δ,    δ_i ~ N(0, σ_kind²),    s ~ N(0, κ²),
+    χ = s u + δ,    δ_i ~ N(0, σ_kind²),    s ~ N(0, κ²).
 
-and so are rotor inertia, viscous and Coulomb friction of the drives, with the joints' torque limits in place of u: a
-joint that never reverses has the others' friction, and no offset in its place. The base parameters T χ have the prior
-N(0, T (diag σ² + U diag κ² Uᵀ) Tᵀ), U of these directions. Sizes σ and κ are where the marginal likelihood of the data
-is largest (MacKay 1992, automatic relevance of groups),
+Rotor inertia, viscous and Coulomb friction of the drives have such common directions, too, with the joints' torque
+limits as u: a joint that never reverses then gets the friction of the other joints instead of an offset. The base
+parameters T χ have the prior N(0, T (diag σ² + U diag κ² Uᵀ) Tᵀ), where U are these directions. The sizes σ and κ
+maximise the marginal likelihood of the data (MacKay 1992, automatic relevance of groups),
 
     log p(y | σ, κ) = -½ [log det K + zᵀ K⁻¹ z] + const,   K = I + R P Rᵀ,
 
-with [R z] the triangle of the whitened [W y] and P the prior covariance, times a wide prior of their logarithms: what a
-kind would be if it alone explained `EXPLAINED_SHARE` of all torque (offsets: `OFFSET_SHARE`), within a factor
-exp(`KIND_WIDTH`) (our choice), and bounded: without a bound, motion that hardly shows a kind is explained by large
-parameters that cancel. Rows are weighed by their joint's residual, worth as many independent values as its
-autocorrelation lets it, but not fewer than one in `MAX_INFLATION`: residuals of a short record look like one wave
-whatever the model is. What the model lacks is no noise, and differs on other motion: where sizes are found residuals
-count `TEMPERING` times less, and the prior as many times more for the values than for their covariance; more where
-regimes left out ask for it (`calib.identification.prior`).
+with [R z] the triangle of the whitened [W y] and P the prior covariance, times a wide prior of their logarithms. Its
+mean is the size with which a kind alone would explain `EXPLAINED_SHARE` of all torque (offsets: `OFFSET_SHARE`), its
+standard deviation `KIND_WIDTH` (our choice). Sizes are also bounded: without a bound, motion that hardly excites a kind
+is explained by large parameters that cancel each other.
 
-Directions that the motion identifies well do not feel the prior; those that it does not identify follow the whole
-robot. It does not make the parameters those of possible bodies: that is the semidefinite fit of another module; but
-`bounded` keeps the drives' inertia positive, and lets friction brake at any speed.
+Rows are weighted by their joint's residual. The residual's autocorrelation determines how many rows count as one, but
+at most `MAX_INFLATION`, since residuals of a short record resemble a single wave whatever the model is. Errors of the
+model are not noise and differ on other motion. Therefore residuals have `TEMPERING` times less weight when sizes are
+estimated, and the prior as many times more weight for the values than for their covariance; the factor is larger if
+held-out ranges of motion are then predicted better (`tempered_prior`).
 
-Rods between the joints stand for the masses of a robot whose description holds none.
+The prior does not affect directions that the motion identifies well; directions that it does not identify follow the
+whole robot. The prior does not make bodies physically consistent, which is the task of a semidefinite program in
+another module; but least squares keeps motor inertia positive and friction dissipative at any speed
+(`cone_program.bounded`).
+
+Rods between the joints replace the masses of a robot whose description has none.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -94,9 +97,12 @@ KIND_WIDTH = 3.0
 
 
 class FirstFit(NamedTuple):
-    """A first fit of the base parameters for row weights.
+    """A first fit of the base parameters, which gives the row weights.
 
-    std and inflation of its residuals (rows,), values (b,), and the weights of standstills.
+    Attributes:
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation of its residuals.
+        values: (b,) base parameters.
+        rest_weights: weights of standstills.
     """
 
     std: np.ndarray
@@ -111,10 +117,10 @@ class Prior:
 
     Attributes:
         covariance: (b, b) prior covariance.
-        deviation: (b,) standard deviations about the common part of the whole robot, s u.
-        sizes: kind → σ, and ``whole`` → κ.
-        source: source of u, ``cad`` or ``sizes``.
-        first: the fit of the base parameters with this prior, without richer friction.
+        deviation: (b,) prior standard deviations of δ, i.e. about the common part s u of the whole robot.
+        sizes: size σ by kind of parameters, and κ under the name ``whole``.
+        source: source of u, ``cad`` or ``sizes`` (rods between the joints).
+        first: the fit of the base parameters with this prior, without additional friction.
         tempering: weight of the prior for the values, relative to its weight for their covariance.
     """
 
@@ -127,21 +133,24 @@ class Prior:
 
     @property
     def rows(self) -> np.ndarray:
-        """The prior as whitened rows of [W y], (b, b + 1)."""
+        """The prior as whitened rows (b, b + 1), to be appended to the rows [W y] of observation matrix and torques."""
         unit = np.sqrt(np.diag(self.covariance))
         lower = np.linalg.cholesky(self.covariance / np.outer(unit, unit))
         inverse = scipy.linalg.solve_triangular(lower, np.diag(1.0 / unit), lower=True)
         return np.hstack([inverse, np.zeros((len(unit), 1))])
 
     def widened(self, count: int) -> np.ndarray:
-        """Return the prior's rows with `count` zero columns inserted after the base columns."""
+        """Return the prior's whitened rows (b, b + count + 1) with `count` zero columns after the base columns."""
         return np.insert(self.rows, [len(self.deviation)] * count, 0.0, axis=1)
 
     def resting(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the mask (b,) of parameters determined by the prior: data reduce their variance by less than
-        `RESTING_SHARE`.
+        """Return the mask (b,) of parameters that the prior determines rather than the data.
 
-        The variances are those about s u, since the common factor s is identified by little data.
+        The data reduce their variance by less than `RESTING_SHARE`. Variances are those about s u, since few data
+        suffice to identify the common factor s.
+
+        Args:
+            covariance: (p, p) covariance of the estimate, base parameters first.
         """
         variance = np.diag(covariance)[: len(self.deviation)]
         return variance > (1.0 - RESTING_SHARE) * self.deviation**2
@@ -149,12 +158,12 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class _Sizes:
-    """Prior standard deviations exp(E t) of p parameters and k directions, as functions of log sizes t.
+    """Prior standard deviations of p parameters and k common directions, as functions of log sizes t.
 
     Attributes:
-        names: of the sizes; empty for those of richer friction.
-        member: (p + k,) which size each parameter and direction has.
-        centre, width: (sizes,) mean and standard deviation of t before any data.
+        names: names of the sizes; empty for those of additional friction.
+        member: (p + k,) index of the size of each parameter and direction.
+        centre, width: (sizes,) prior mean and standard deviation of t.
         lower, upper: (sizes,) bounds of t.
     """
 
@@ -186,15 +195,16 @@ def find_prior(
 
     Args:
         model: model of the base parameters.
-        base: the base columns of the model.
-        rows: rows in the base columns, followed by those of richer friction.
-        robot: u, the bodies' parameters up to a factor; None: not known.
-        source: of `robot`: ``cad`` or ``sizes``.
-        noise: (rows,) standard deviation of the torques up to a common factor; None: from the residuals.
-        groups: (k,) group of each column of richer friction; each group has a separate size, used only here.
-        start: initial prior, without richer friction or with another tempering; None: none.
-        effort: (n,) torque limits of the joints, up to a factor; None: equal joints.
-        tempering: see `Prior`.
+        base: base parameters of the model.
+        rows: rows in the base columns, followed by those of additional friction.
+        robot: u, the bodies' parameters up to a factor; None: unknown.
+        source: source of `robot`: ``cad`` or ``sizes``.
+        noise: (rows,) standard deviation of the torques' noise, up to a common factor; None: from the residuals.
+        groups: (k,) group of each column of additional friction, which have one size per group; None: there are no such
+            columns.
+        start: prior with which the search starts, e.g. without additional friction; None: none.
+        effort: (n,) torque limits of the joints, up to a factor; None: equal limits.
+        tempering: weight of the prior for the values, relative to its weight for their covariance.
     """
     parts = divided(rows)
     rest_weights = rows[0].rest
@@ -260,7 +270,12 @@ def find_prior(
 
 
 def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) -> FirstFit:
-    """Return a minimum-norm fit: standard deviation and inflation of its residuals (rows,), and values (b,)."""
+    """Return a minimum-norm least-squares fit without prior, as the first fit.
+
+    Args:
+        rows: rows of all recordings.
+        noise: (rows,) standard deviation of the torques' noise, up to a common factor; None: from the residuals.
+    """
     row_count = rows[0].target.shape[1]
     parts = divided(rows)
     rest_weights = rows[0].rest
@@ -288,14 +303,15 @@ def weighing(
     inflation: np.ndarray,
     noise: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return standard deviation and inflation of the residuals (rows,), by their degrees of freedom.
+    """Return standard deviation and variance inflation of the residuals (rows,), with their degrees of freedom.
 
     Args:
         rows: rows of all recordings.
-        data: triangles of the rows, one group per torque row.
+        data: R factors of the rows, one group per torque row.
         values, covariance: (p,), (p, p) the estimate.
-        std, inflation: (rows,) values with which the estimate was weighted.
-        noise: (rows,) standard deviation of the torques up to a common factor; None: from the residuals.
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation with which the estimate was
+            weighted.
+        noise: (rows,) standard deviation of the torques' noise, up to a common factor; None: from the residuals.
     """
     columns = data.factors[:, :, :-1]
     parameters_of_row = np.einsum("gik,gik->g", columns @ covariance, columns) / (std**2 * inflation)
@@ -314,9 +330,14 @@ def weighing(
 def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.ndarray:
     """Return the stated noise (rows,) scaled to the residuals by one common factor; `std` if no noise is stated.
 
-    Relative between joints, with a common scale (our choice): the variance over repeats does not see what every period
-    has alike, so as it stands it would promise too much; and the decimation filter's gain for white noise, one number
-    for all joints, drops out.
+    The stated noise is used only relative between joints (our choice): the variance over repetitions does not contain
+    errors that are equal in every period, so that its absolute size would be too small. The decimation filter's gain
+    for white noise, equal for all joints, is thereby irrelevant.
+
+    Args:
+        noise: (rows,) stated standard deviation of the torques' noise, up to a common factor; None: none is stated.
+        std: (rows,) standard deviations of the residuals [N m or N].
+        counts: (rows,) numbers of residuals.
     """
     if noise is None:
         return std
@@ -326,7 +347,14 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
 
 
 def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
-    """Return the integrated autocorrelation of each row's residuals in motion (rows,), averaged by length of cases."""
+    """Return the variance inflation of each torque row's residuals in motion (rows,).
+
+    It is the integrated autocorrelation, averaged over the cases by their number of residuals.
+
+    Args:
+        all_rows: rows of all recordings.
+        values: (p,) estimate.
+    """
     row_count = all_rows[0].target.shape[1]
     total = np.zeros(row_count)
     weight = np.zeros(row_count)
@@ -342,12 +370,12 @@ def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) 
 
 
 def _shared_directions(model: RegressorModel, robot: np.ndarray, effort: np.ndarray | None) -> np.ndarray:
-    """Return common directions (p, k) of the parameters: the whole robot, then drives by their torque limits.
+    """Return common directions (p, k) of the parameters: of the robot's bodies, then of each kind of drive term.
 
     Args:
-        model: whose parameters they are.
+        model: model of the parameters.
         robot: (p,) parameters of the robot's bodies, up to a factor.
-        effort: (n,) torque limits of the joints, up to a factor; None: joints alike.
+        effort: (n,) torque limits of the joints, up to a factor, which give the drives' directions; None: equal limits.
     """
     by_kind: dict[str, np.ndarray] = {}
     for column, term in enumerate(model.columns):
@@ -365,7 +393,15 @@ def _kind(term: DriveTerm) -> str:
 def _sizes(
     model: RegressorModel, data: Triangles, columns: np.ndarray, shared: np.ndarray, groups: np.ndarray
 ) -> _Sizes:
-    """Return the kinds of parameters and the prior of each kind's size; groups of richer friction have no names."""
+    """Return the sizes of the kinds of parameters, with their priors and bounds.
+
+    Args:
+        model: model of the p parameters.
+        data: R factors of the rows.
+        columns: columns of the parameters, and of the common directions, in the basis of `data`.
+        shared: (p, k) common directions.
+        groups: groups of the columns of additional friction; their sizes have no names.
+    """
     # Names of the sizes of single parameters, then of the directions; and which parameter has which.
     kinds = [f"bodies [{unit}]" for unit in model.units[: model.inertial]]
     kinds += [_kind(term) for term in model.columns]
@@ -405,7 +441,13 @@ def _sizes(
 
 
 def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return posterior values (b,) and their covariance (b, b)."""
+    """Return posterior values (b,) and their covariance (b, b).
+
+    Args:
+        factor: (b + 1, b + 1) triangle [R z; 0 ρ] of the whitened rows.
+        columns: (b, p) matrix that maps p independent, normally distributed unknowns to the values.
+        deviations: (p,) prior standard deviations of these unknowns.
+    """
     b, p = columns.shape
     whitened = columns * deviations
     stacked = np.zeros((b + p, p + 1))
@@ -420,13 +462,20 @@ def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) 
 
 
 def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start: np.ndarray) -> np.ndarray:
-    """Return the logarithms of the sizes (k,) that maximise evidence times their prior."""
+    """Return the log sizes (k,) that maximise evidence times prior.
+
+    Args:
+        factor: (b + 1, b + 1) triangle [R z; 0 ρ] of the whitened rows.
+        columns: (b, p) matrix that maps independent unknowns to the values.
+        sizes: sizes with their priors.
+        start: (k,) first log sizes.
+    """
     b = len(columns)
     unscaled = factor[:b, :b] @ columns
     target = factor[:b, b]
 
     def cost(t: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the negative logarithm of evidence times prior, and its gradient."""
+        """Return the negative logarithm of evidence times prior at log sizes t (k,), and its gradient (k,)."""
         root = unscaled * sizes.deviations(t)
         # Inverse of the root of the covariance of y.
         information = root @ root.T + np.eye(b)
@@ -448,7 +497,15 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
 
 
 def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.ndarray:
-    """Return parameters (B, 10) of rods from each body's frame to the next, mass by length and thickness."""
+    """Return the standard parameters (B, 10) of rods from each body's frame to the next.
+
+    Masses are proportional to length plus thickness, with `total` [kg] as their sum. A payload is a ball of fixed mass.
+
+    Args:
+        chain: the arm, which gives the frames.
+        model: its model, with B bodies.
+        total: sum of the masses [kg].
+    """
     bodies = model.bodies
     moves = bodies.coordinates >= 0
     tail_end = np.asarray(chain.tail)[:3, 3]
@@ -473,15 +530,18 @@ def tempered_prior(
 ) -> Prior:
     """Return the prior with the tempering that best predicts held-out ranges of motion.
 
-    The criterion is the squared error of all rows, in units of their residuals, as geometric mean over the regimes, so
-    that a regime with large errors for every prior does not dominate. A stronger prior must be better by
+    Tempering is the prior's weight for the values, relative to its weight for their covariance.
+
+    The criterion is the squared error of all rows, in units of their residuals, as geometric mean over the ranges, so
+    that a range with large errors for every prior does not dominate. A stronger prior must be better by
     `MIN_TEMPERING_GAIN`.
 
     Args:
-        find: `find_prior` of rows, a prior to start from, and a tempering.
-        prior: the prior with the least of `TEMPERINGS`.
+        find: function that returns the prior of given rows; keyword arguments are the prior to start from and the
+            tempering.
+        prior: the prior with the smallest of `TEMPERINGS`.
         rows: rows in the base columns.
-        regimes: regimes of these rows.
+        regimes: ranges of motion of these rows.
     """
     data = triangulate(rows)
     columns = np.arange(len(rows[0].names))

@@ -20,10 +20,10 @@ VERSIONS: Mapping[str, int] = {method.name: method.version for method in _METHOD
 
 
 def method_named(name: str) -> Method:
-    """Return the identification method with a name.
+    """Return the identification method with this name.
 
     Raises:
-        UsageError: for a name that is none of `METHODS`.
+        UsageError: for a name that is not a key of `METHODS`.
     """
     return METHODS[one_of(name, METHODS, "method", UsageError)]
 

@@ -1,6 +1,6 @@
-"""Rows y = W x of cases, computed in blocks at the full rate; y and W get the same low-pass and decimation.
+"""Rows y = W x of recordings, computed in blocks at the full rate; y and W are equally low-passed and decimated.
 
-A `Case` is one recording: its motion, the torques to explain, and what the robot carried.
+A `Case` is one recording: its motion, the torques to explain, and the payloads that the robot carried.
 """
 
 from __future__ import annotations
@@ -37,13 +37,14 @@ class Case:
     Attributes:
         name: unique name of the recording.
         motion: q, v, a at the full rate.
-        target: (N, rows) torques to explain, unfiltered [N m or N; A where no gain is known].
-        carried: labels of the mounted payloads.
-        present: (N, rows) bool, which rows may be used; False at lost samples.
-        noise: (rows,) standard deviation of the targets' samples, as estimated from repeats of the motion; None: not
-            known.
-        torque_rows: kind of torques in the target.
-        link: motion q, v, a (N, n) of the links, where joint corrections make it differ from the motors'; None: equal.
+        target: (N, rows) torques to explain, unfiltered [N m or N; A if the gain is unknown].
+        carried: labels of the attached payloads.
+        present: (N, rows) mask of rows that may be used; False at lost samples.
+        noise: (rows,) standard deviation of the samples in `target`, estimated from repetitions of the motion; None:
+            unknown.
+        torque_rows: kind of torques in `target`.
+        link: motion q, v, a (N, n) of the links, if joint corrections make it differ from the motors' motion; None:
+            equal.
     """
 
     name: str
@@ -57,11 +58,14 @@ class Case:
 
     @property
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Motion q, v, a (N, n) of the links: the motors' own, where joints do not deflect."""
+        """Motion q, v, a (N, n) of the links, equal to the motors' motion if joints do not deflect."""
         return self.link or (self.motion.q, self.motion.v, self.motion.a)
 
     def deflected(self, part: slice) -> dict[str, object]:
-        """Return the argument ``link`` of a model's regressor at a part of the samples; none where joints are stiff."""
+        """Return the keyword argument ``link`` of a model's regressor for a part of the samples.
+
+        The dictionary is empty if joints are rigid.
+        """
         if self.link is None:
             return {}
         q, v, a = self.link
@@ -76,14 +80,17 @@ class Case:
 def make_case(
     name: str, motion: Motion, rows: TorqueRows = MOTOR, *, gains: np.ndarray | None = None, carried: Sequence[str] = ()
 ) -> Case:
-    """Return the case of a motion and its torques.
+    """Return the case of a recorded motion with its torques.
 
     Args:
         name: unique name of the recording.
         motion: q, v, a and efforts at the full rate.
-        rows: which torques the model explains; all but the motors' need joint torque sensors (`Motion.tau_link`).
+        rows: torque rows that the model explains; all but the motors' need joint torque sensors (`Motion.tau_link`).
         gains: (n,) torque per unit of the effort; None: 1.
-        carried: labels of payloads.
+        carried: labels of the attached payloads.
+
+    Raises:
+        MeasurementError: if the rows need sensor torques and there are none.
     """
     effort = np.array(motion.effort)
     if gains is not None:
@@ -108,10 +115,13 @@ def make_case(
 
 
 def case_names(paths: Sequence[str]) -> tuple[str, ...]:
-    """Return a unique name per recording: the file's name, with the cut or the folder if needed.
+    """Return a unique name for each recording: the file's name, with the cut or the folder if needed.
+
+    Args:
+        paths: recordings, each with a cut such as ``@0:9.4`` or without.
 
     Raises:
-        UsageError: where the same recording and cut is given twice.
+        UsageError: if the same recording and cut occurs twice.
     """
     repeated = sorted({path for path in paths if list(paths).count(path) > 1})
     if repeated:
@@ -128,7 +138,11 @@ def case_names(paths: Sequence[str]) -> tuple[str, ...]:
 
 
 def _file(path: str) -> str:
-    """Return the name of a recording's file without its folder and cut."""
+    """Return the name of a recording's file, without its folder and cut.
+
+    Args:
+        path: the recording, with or without a cut.
+    """
     from calib.data.recordings.recording import parse_cut
 
     file, *_ = parse_cut(path)
@@ -137,11 +151,11 @@ def _file(path: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class RestWeights:
-    """Weights of standstills, see `calib.identification.standstill`.
+    """Weights of standstills, derived in `calib.identification.standstill`.
 
     Attributes:
-        worth: (rows,) weight of one value of the friction at rest, in rows in motion.
-        count: (rows,) number of rows that one value counts as where residuals are averaged.
+        worth: (rows,) weight of one value of the friction at rest, relative to a row in motion.
+        count: (rows,) number of rows that such a value counts as when residuals are averaged.
         reach: (rows,) change of torque [N m or N] after which the friction has another value.
     """
 
@@ -157,16 +171,16 @@ class ObservationRows:
     Attributes:
         names, units: names and units of the p columns.
         matrix: (M, rows, p) observation matrix W.
-        target: (M, rows) torques y.
-        present: (M, rows) bool, rows for training.
-        block: (M,) number of the time block, for cross-validation; -1 next to a cut.
+        target: (M, rows) torques y [N m or N].
+        present: (M, rows) mask of rows used for training.
+        block: (M,) number of the time block, for cross-validation; -1 near a cut between blocks.
         rate: sampling rate [Hz].
-        standing: (M, rows) share of each row in its standstill; 0 in motion.
+        standing: (M, rows) share of each row in its standstill, i.e. 1 / number of rows of the standstill; 0 in motion.
         swing: (M, rows) range of the torque in the row's standstill [N m or N]; 0 in motion.
-        breakaway: (M, rows) factor of each row in motion: less than 1 where friction at rest still decays after a
-            standstill.
+        breakaway: (M, rows) factor of each row in motion: less than 1 while friction of the last standstill still
+            decays.
         rest: weights of standstills.
-        coulomb: (rows, p) columns that are Coulomb friction of a torque row.
+        coulomb: (rows, p) mask of columns that are Coulomb friction of a torque row.
     """
 
     names: tuple[str, ...]
@@ -184,25 +198,25 @@ class ObservationRows:
 
     @property
     def weight(self) -> np.ndarray:
-        """Factor (M, rows) that rows are multiplied by in estimates: 1 in motion, less at rest, 0 where not used."""
+        """Factor (M, rows) by which rows are multiplied in estimates: 1 in motion, less at rest, 0 if not used."""
         at_rest = np.sqrt(self._frictions * self.rest.worth)
         return np.where(self.standing > 0.0, at_rest, self.breakaway) * self.present
 
     @property
     def counted(self) -> np.ndarray:
-        """How many rows each one counts as (M, rows), where residuals are averaged."""
+        """Number of rows that each row counts as when residuals are averaged (M, rows)."""
         counted = self._frictions * self.rest.count
         return np.where(self.standing > 0.0, counted, 1.0) * self.present
 
     @property
     def _frictions(self) -> np.ndarray:
-        """How many values of the friction at rest each row stands for (M, rows)."""
+        """Number of values of the friction at rest that each row represents (M, rows); 0 in motion."""
         return self.standing * (1.0 + self.swing / self.rest.reach)
 
     def by_recording(self, recording: int, count: int) -> ObservationRows:
-        """Return rows with separate torque rows per recording: those of one `recording` of `count` are filled.
+        """Return the rows with separate torque rows for each of `count` recordings, which are then weighted separately.
 
-        Recordings can then be weighted separately, as joints are.
+        Only the torque rows of this `recording` (index) are filled; the others are zero.
         """
         filled = np.arange(count) == recording
         matrix = np.where(filled[:, None], self.matrix, 0.0)
@@ -225,7 +239,14 @@ class ObservationRows:
         )
 
     def extend(self, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
-        """Return rows with columns (M, rows, k) appended."""
+        """Return the rows with the columns (M, rows, k) of drive terms appended.
+
+        Columns whose value at rest is unknown are set to zero in standstills.
+
+        Args:
+            terms: k drive terms.
+            columns: their columns, from `observe_terms`.
+        """
         if not terms:
             return self
         undecided_at_rest = np.array([term.form.undecided_at_rest for term in terms])
@@ -244,10 +265,15 @@ class ObservationRows:
 
 
 def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: Decimator) -> ObservationRows:
-    """Return the rows of a case in the model's `columns`, filtered and decimated by `decimator`.
+    """Return the rows of a case, filtered and decimated.
 
-    Only entries that can differ from 0 are computed: a body's parameters act on the joints before it, a drive's on its
-    own joint.
+    Only regressor entries that can differ from 0 are computed.
+
+    Args:
+        model: the model.
+        columns: indices of the model's columns in the rows.
+        case: the recording.
+        decimator: filter and decimation.
     """
     motion = case.motion
     segment = motion.segment
@@ -314,14 +340,22 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
 def _entry_blocks(
     model: RegressorModel, case: Case, parts: Sequence[slice], states: np.ndarray, columns: np.ndarray, rows: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Yield entries (k, N_i) of the regressor, given by column and row, at each part of the samples."""
+    """Yield entries (k, N_i) of the regressor for each part of the samples.
+
+    Args:
+        model: the model.
+        case: the recording.
+        parts: slices of samples.
+        states: (s, N) states of friction with hysteresis.
+        columns, rows: (k,) column and row of each entry.
+    """
     for part in parts:
         regressor = _regressor(model, case, part, states)
         yield regressor.transpose(2, 1, 0)[columns, rows]
 
 
 def _no_rest(rows: int) -> RestWeights:
-    """Return the weights of standstills before any estimate: each is a row."""
+    """Return the weights of standstills before any estimate: each standstill counts as one row."""
     worth = np.ones(rows)
     count = np.ones(rows)
     reach = np.full(rows, np.inf)
@@ -337,7 +371,14 @@ def observe_terms(
 ) -> np.ndarray:
     """Return the regressor columns of drive terms (M, rows, k), filtered and decimated.
 
-    One column at a time at the full rate: an hour of all friction there is would fill 15 GB.
+    Columns are computed one at a time at the full rate: an hour of all friction terms would need 15 GB.
+
+    Args:
+        terms: k drive terms.
+        case: the recording.
+        decimator: filter and decimation.
+        load: (N, n) torques that the gears transmit [N m or N]; None if no term depends on them.
+        torque_rows: kind of torques in the rows.
     """
     segment = case.motion.segment
     n = case.motion.n
@@ -351,7 +392,13 @@ def observe_terms(
 
 
 def term_columns(term: DriveTerm, case: Case, load: np.ndarray | None = None) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield the torque rows that a drive term acts on, each with its column (N,) at the full rate."""
+    """Yield each torque row that a drive term acts on, with the term's column (N,) at the full rate.
+
+    Args:
+        term: the drive term.
+        case: the recording.
+        load: (N, n) torques that the gears transmit [N m or N]; None if the term does not depend on them.
+    """
     motion = case.motion
     load_of_joints = None if load is None else load.T
     motions = [motion.q.T, motion.v.T, motion.a.T, load_of_joints]
@@ -359,7 +406,12 @@ def term_columns(term: DriveTerm, case: Case, load: np.ndarray | None = None) ->
 
 
 def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:
-    """Return the states (s, N) of friction with hysteresis, zero at the start of each segment."""
+    """Return the states (s, N) of friction with hysteresis along a case; they are zero at the start of each segment.
+
+    Args:
+        terms: drive terms; s is 0 if none of them has hysteresis.
+        case: the recording.
+    """
     motion = case.motion
     states = []
     for start, stop in segments(motion.segment):
@@ -368,16 +420,25 @@ def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:
 
 
 def segments(segment: np.ndarray) -> list[tuple[int, int]]:
-    """Return (start, stop) of each run of equal numbers in an array."""
+    """Return (start, stop) of each run of equal numbers in an array (N,).
+
+    Args:
+        segment: (N,) segment number of each sample.
+    """
     changes = np.flatnonzero(np.diff(segment)) + 1
     edges = np.concatenate([[0], changes, [len(segment)]])
     return list(pairwise(edges.tolist()))
 
 
 def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[ObservationRows]:
-    """Return rows with time blocks numbered over all cases: contiguous, about `count`, at least one per case.
+    """Return the rows with time blocks numbered over all cases.
 
-    Samples within `CUT_MARGIN` of a cut get -1: the filter's window reaches over it.
+    Blocks are contiguous, about `count` in all, with at least one per case. Samples within `CUT_MARGIN` of a cut
+    between blocks get -1, since the filter's window extends across the cut.
+
+    Args:
+        all_rows: rows of all cases.
+        count: approximate number of blocks.
     """
     total = sum(len(rows.target) for rows in all_rows)
     numbered = []
@@ -399,7 +460,7 @@ def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[Observa
 def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
     """Return the R factors of all rows, one group per time block and torque row: group = block · rows + row.
 
-    The last block holds the samples beside cuts. Rows of standstills have their weights.
+    The last block contains the samples near cuts. Standstills have their weights.
     """
     row_count = all_rows[0].target.shape[1]
     last_blocks = [int(rows.block.max(initial=-1)) for rows in all_rows]
@@ -424,7 +485,13 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
 
 
 def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Triangles:
-    """Return R factors with one group per torque row, over all blocks or the given ones."""
+    """Return R factors with one group per torque row, over all time blocks or the given ones.
+
+    Args:
+        data: R factors by time block and torque row.
+        rows: number of torque rows.
+        blocks: numbers of the time blocks; None: all.
+    """
     if blocks is None:
         blocks = range(data.groups // rows)
     # Groups of each row (rows, blocks).
@@ -437,7 +504,14 @@ def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Tri
 
 
 def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarray) -> np.ndarray:
-    """Return the regressor (N_i, rows, p) at a part of the samples."""
+    """Return the regressor (N_i, rows, p) for a part of the samples.
+
+    Args:
+        model: the model.
+        case: the recording.
+        part: slice of its samples.
+        states: (s, N) states of friction with hysteresis of all samples.
+    """
     motion = case.motion
     q = motion.q[part]
     v = motion.v[part]
@@ -449,13 +523,24 @@ def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarra
 def power_block(
     model: RegressorModel, columns: np.ndarray, case: Case, part: slice, states: np.ndarray, segment: slice
 ) -> np.ndarray:
-    """Return entries (k, N_i) of the power regressor: d/dt h of energies, vᵀ W of the other columns.
+    """Return entries (k, N_i) of the power regressor: d/dt h for columns with energy h, vᵀ W for other columns.
 
-    No accelerations are used. Differences and the decimation filter are linear and commute: the result is the
+    No accelerations are used. Differences and the decimation filter are linear and commute, so that the result is the
     derivative of the filtered energies (Gautier 1997; Gautier & Briot 2013).
+
+    Args:
+        model: a model with energies.
+        columns: (k,) indices of the columns.
+        case: the recording.
+        part: slice of samples to compute.
+        states: (s, N) states of friction with hysteresis.
+        segment: slice of samples of the gap-free segment around `part`.
+
+    Raises:
+        UsageError: for a model without energies.
     """
     if not isinstance(model, _HasEnergy):
-        raise UsageError("rows = 'power' requires a model with energies")
+        raise UsageError("rows = 'power' is not supported by this model, which has no energies: use rows = 'motor'")
     motion = case.motion
     start = max(segment.start, part.start - DIFFERENCE_REACH)
     stop = min(segment.stop, part.stop + DIFFERENCE_REACH)
@@ -488,7 +573,13 @@ class _HasEnergy(Protocol):
 
 
 def thinned(mask: np.ndarray, segment: np.ndarray, decimator: Decimator) -> np.ndarray:
-    """Return the decimated mask (M, rows): true where more than half of the samples of a mask (N, rows) are true."""
+    """Return the decimated mask (M, rows), true where more than half of the samples of a mask (N, rows) are true.
+
+    Args:
+        mask: (N, rows) mask at the full rate.
+        segment: (N,) number of each sample's segment.
+        decimator: filter and decimation.
+    """
     majority = decimate(mask.astype(float), decimator, segment) > 0.5
     if len(decimator.taps) == 1:
         return majority & mask[kept(segment, decimator)]

@@ -30,7 +30,7 @@ WEIGHTS = ("residuals", "repeats")
 @strict
 @dataclass(frozen=True)
 class Coupling:
-    """A gear whose motor turns with the sum of two joints (from 0), see `calib.dynamics.drives.coupled`."""
+    """A gear whose motor turns with the sum of two joints (from 0), as in `calib.dynamics.drives.coupled`."""
 
     joints: Annotated[tuple[JointNumber, JointNumber], Expect("two joint numbers, counted from 1")]
     label: Text = ""
@@ -39,14 +39,19 @@ class Coupling:
 @strict
 @dataclass(frozen=True)
 class Payload:
-    """A body at the flange: mass [kg] and centre of mass in the tip's frame [m]; None if unknown."""
+    """A body at the flange; None for what is unknown.
+
+    Attributes:
+        mass: its mass [kg]
+        com: its centre of mass in the tip's frame [m]
+    """
 
     mass: Annotated[float, Real(above=0, most=1e4, unit="kg")] | None = None
     com: Annotated[tuple[float, float, float], Expect("three numbers [m]")] | None = None
 
     @property
     def parameters(self) -> tuple[float, ...] | None:
-        """Ten standard parameters in the tip's frame, as a point mass; None if mass or centre is unknown."""
+        """Ten standard parameters of a point mass, in the tip's frame [SI]; None if mass or centre is unknown."""
         if self.mass is None or self.com is None:
             return None
         x, y, z = self.com
@@ -142,8 +147,20 @@ class IdentificationSettings(Choices):
 
 
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
-    """Return the model of a chain: bodies, payloads at the tip, and standard drive terms."""
-    require(not (settings.passive or settings.identical_legs), "passive, identical_legs: arms have no legs", UsageError)
+    """Return the model of a chain: bodies, payloads at the tip, and drive terms.
+
+    Args:
+        chain: the arm.
+        settings: settings, with drive terms, payloads and gravity.
+
+    Raises:
+        UsageError: for settings that do not apply to this chain.
+    """
+    require(
+        not (settings.passive or settings.identical_legs),
+        "passive, identical_legs: for parallel robots only; remove them",
+        UsageError,
+    )
     _check_joints(chain.n, settings)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     values = settings.sets or (settings.torque_rows.drives,)
@@ -158,7 +175,7 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
             if term.name in names:
                 label = f"{first + 1}_{second + 1}"
                 raise UsageError(
-                    f'coupling: parameter {term.name} is a joint\'s own; add another label: label = "{label}"'
+                    f'coupling: {term.name} is already a joint\'s parameter; add another label: label = "{label}"'
                 )
         terms += coupled
     for term in settings.terms:
@@ -171,7 +188,12 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
 
 
 def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
-    """Return the bodies of a chain under the stated gravity, with payloads at the tip."""
+    """Return the bodies of a chain under the stated gravity, with payloads at the tip.
+
+    Args:
+        chain: the arm.
+        settings: settings, with gravity and payloads.
+    """
     bodies = bodies_of(chain)
     if settings.gravity is not None:
         bodies = bodies.with_gravity(np.array(settings.gravity))
@@ -183,7 +205,12 @@ def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
 
 
 def _check_joints(n: int, settings: IdentificationSettings) -> None:
-    """Raise an error for couplings or terms of unknown joints, and for a joint coupled with itself."""
+    """Raise a UsageError for couplings or terms of unknown joints, and for a joint coupled with itself.
+
+    Args:
+        n: number of joints.
+        settings: settings, with couplings and terms.
+    """
     for coupling in settings.couplings:
         numbers = [joint + 1 for joint in coupling.joints]
         require(max(numbers) <= n, f"coupling: joints {numbers}: the robot has joints 1 to {n}", UsageError)
@@ -202,29 +229,36 @@ def _check_joints(n: int, settings: IdentificationSettings) -> None:
 
 
 def require_usable(settings: IdentificationSettings, method: Method) -> IdentificationSettings:
-    """Return the settings for a method, with what it makes of friction = "auto".
+    """Return the settings for a method, with friction = "auto" replaced by its meaning for this method.
+
+    Args:
+        settings: the requested settings.
+        method: the method that will be used.
 
     Raises:
-        UsageError: for a missing loop, torque rows that the method does not take, or richer friction; the message
-            names all methods that do.
+        UsageError: for a missing loop, or torque rows or friction that the method does not support; the message names
+            the methods that do.
     """
     option = f"method '{method.name}'"
     rows, friction = settings.torque_rows, settings.friction
     if method.needs_controller and settings.loop is None:
         refuse_option(
             option,
-            "state the controller in the options file, [loop] controller = … (calib formats "
+            "needs the closed loop: state [loop] controller = … in the options file (calib formats "
             "identify-options), and log or state the reference; from q and torque alone use wls or irls",
         )
     if not method.takes(rows):
         supporting = [name for name, candidate in METHODS.items() if candidate.takes(rows)]
-        refuse_option(option, f"rows = '{rows.name}' is not supported; methods that do: {', '.join(supporting)}")
+        refuse_option(
+            option, f"rows = '{rows.name}' is not supported; methods that support it: {', '.join(supporting)}"
+        )
     if friction == "auto":
         return replace(settings, friction=method.auto_friction)
     if friction != "standard" and not method.takes_models:
         supporting = [name for name, candidate in METHODS.items() if candidate.takes_models]
         refuse_option(
             option,
-            f"standard friction only, not friction = '{friction}'; methods that take it: {', '.join(supporting)}",
+            f"supports standard friction only, not friction = '{friction}'; methods that support it: "
+            f"{', '.join(supporting)}",
         )
     return settings

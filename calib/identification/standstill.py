@@ -1,35 +1,35 @@
 """Joints at rest: each standstill counts as one row, with friction unknown within the static friction.
 
-While a joint stands, friction takes any value that keeps it there. Of a standstill of K rows the torques are
+While a joint is at rest, friction may have any value that prevents motion. In a standstill of K rows the torques are
 
     y_k = w_k x + f + e_k,    abs(f) <= F_s unknown,
 
-w without friction that depends only on the direction of motion (Coulomb friction and similar). The K rows share one f,
-so that together they have the information of one row of variance τ s² / K + f², where s² is the variance of the
-residuals in motion, τ the number of neighbouring residuals that count as one, and
+where w does not contain friction that depends only on the direction of motion (Coulomb friction and similar). The K
+rows have a common f, so that together they have the information of one row of variance τ s² / K + f². Here s² is the
+variance of the residuals in motion, τ the number of neighbouring residuals that count as one, and
 
     f² = max(F_c² / 3, mean square of the residuals at rest),
 
-F_c² / 3 being the variance of a value that may be anywhere within ± F_c. Rows of the standstill share this weight
-evenly, so that they still show how the torque changes with the motion of other joints. Where the torque changes by more
-than the range of friction, friction has taken another value: a standstill whose torque ranges over r counts as 1 + r /
-reach values, reach = 2 √3 √(f² + τ s²), the width of an even distribution of that variance.
+where F_c² / 3 is the variance of a value evenly distributed within ± F_c. The rows of a standstill have equal shares of
+this weight, so that they still contain how the torque changes with the motion of other joints. If the torque changes by
+more than the range of friction, friction has taken another value: a standstill with a torque range r counts as 1 + r /
+reach values, with reach = 2 √3 √(f² + τ s²), the width of an even distribution of that variance.
 
-After a standstill friction does not at once have its value in motion: gears unwind, and contacts give way. Its value at
-rest decays over a travel δ, so that a row at the travel d since the last standstill has the variance
+After a standstill, friction does not immediately have its value in motion: gears unwind, and contacts give way. Its
+value at rest decays over a travel δ, so that a row at a travel d since the last standstill has the variance
 
-    s² + f² exp(-2 d / δ),
+    s² + f² exp(-2 d / δ).
 
-δ being one value for the robot, the most likely of `TRAVELS` given the residuals of a fit (0: no delay). On
-the KR300 it is some 5 to 20 mrad, on harmonic drives 1 mrad.
+δ is one value for the robot, the most probable one of `TRAVELS` given the residuals of a fit (0: no decay). It is about
+5 to 20 mrad on the KR300 and 1 mrad on harmonic drives.
 
-Reversals pass through zero speed and stay rows as others: shorter than `MIN_STANDSTILL`, or, of slow motion, as often
-at one small speed as at another, where a joint that stands is slower than `MAX_MEDIAN` for half of the time. Torques of
-sensors behind the gear have no such friction.
+Reversals pass through zero speed but are ordinary rows, not standstills. They are shorter than `MIN_STANDSTILL` or, in
+slow motion, small speeds occur evenly, whereas a standing joint is slower than `MAX_MEDIAN` for half of the time.
+Torques of sensors behind the gear do not contain such friction.
 
-Where the drive's friction is low, or the model of the motion is wrong (a torso whose effort holds no gravity), rows at
-rest have more information than this. Both treatments therefore predict the motion of held-out time blocks; rows at rest
-count like all others where the error is then less than `CLEARLY_LESS` times as large.
+If the drive's friction is low, or the model of the motion is wrong (a torso whose effort contains no gravity), rows at
+rest have more information than this. Both treatments therefore predict the motion of held-out time blocks. Rows at rest
+count like all other rows if the error is then less than `CLEARLY_LESS` times as large.
 """
 
 from __future__ import annotations
@@ -60,9 +60,13 @@ MIN_MOVING = 10  # rows in motion, below which a joint's standing rows count as 
 
 
 def standing_joints(case: Case, v0: np.ndarray) -> np.ndarray:
-    """Return the mask (N, n) of joints that stand: slower than Coulomb's sign is wide, for `MIN_STANDSTILL` or more.
+    """Return the mask (N, n) of joints at rest.
+
+    A joint is at rest if it is slower than the width of Coulomb's sign for at least `MIN_STANDSTILL`, and slower than
+    `MAX_MEDIAN` times this width for half of that time.
 
     Args:
+        case: the recording.
         v0: (n,) width of Coulomb's sign [rad/s or m/s].
     """
     motion = case.motion
@@ -85,10 +89,14 @@ def with_standstills(
     columns: np.ndarray,
     v0: np.ndarray,
 ) -> list[ObservationRows]:
-    """Return rows with their standstills marked, Coulomb's columns zero there.
+    """Return the rows with their standstills marked, and with the columns of Coulomb friction zero in standstills.
 
     Args:
-        columns: of the model, in the rows.
+        all_rows: rows of all recordings.
+        cases: recordings.
+        decimator: filter and decimation of the rows.
+        model: the model.
+        columns: indices of the model's columns in the rows.
         v0: (n,) width of Coulomb's sign [rad/s or m/s].
     """
     rows, n = all_rows[0].target.shape[1], cases[0].motion.n
@@ -123,7 +131,13 @@ def with_standstills(
 
 
 def _held_rows(model: RegressorModel, n: int, rows: int) -> np.ndarray:
-    """Return the torque rows (rows,) bool that hold a motor's friction."""
+    """Return the mask (rows,) of torque rows that contain a motor's friction.
+
+    Args:
+        model: the model.
+        n: number of joints.
+        rows: number of torque rows.
+    """
     held = np.zeros(rows, dtype=bool)
     if model.torque_rows.projection is None and rows == model.torque_rows.count(n):
         for joint in range(n):
@@ -132,7 +146,15 @@ def _held_rows(model: RegressorModel, n: int, rows: int) -> np.ndarray:
 
 
 def _acted(acts: Sequence[tuple[int, object]], torque_rows: TorqueRows, side: str, n: int, rows: int) -> np.ndarray:
-    """Return the torque rows (rows,) bool that a drive term acts on."""
+    """Return the mask (rows,) of torque rows that a drive term acts on.
+
+    Args:
+        acts: pairs (joint, motion) of the drive term.
+        torque_rows: kind of torques in the rows.
+        side: side of the term, ``link`` or ``motor``.
+        n: number of joints.
+        rows: number of torque rows.
+    """
     result = np.zeros(rows, dtype=bool)
     if torque_rows.projection is None:
         for joint, _ in acts:
@@ -141,14 +163,19 @@ def _acted(acts: Sequence[tuple[int, object]], torque_rows: TorqueRows, side: st
 
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """Return (start, stop) of each run of true values."""
+    """Return (start, stop) of each run of true values in a mask (N,)."""
     padded = np.concatenate([[0], mask.astype(int), [0]])
     edges = np.flatnonzero(np.diff(padded))
     return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
 def _shares(mask: np.ndarray, segment: np.ndarray) -> np.ndarray:
-    """Return the share (M, rows) of its standstill that each row is; 0 in motion."""
+    """Return the share (M, rows) of each row in its standstill, 1 / number of rows; 0 in motion.
+
+    Args:
+        mask: (M, rows) mask of rows at rest.
+        segment: (M,) number of each sample's segment; a standstill does not continue in the next segment.
+    """
     result = np.zeros(mask.shape)
     for start, stop in segments(segment):
         for row in range(mask.shape[1]):
@@ -158,7 +185,13 @@ def _shares(mask: np.ndarray, segment: np.ndarray) -> np.ndarray:
 
 
 def _swings(mask: np.ndarray, target: np.ndarray, segment: np.ndarray) -> np.ndarray:
-    """Return the range of the torque in the standstill that each row belongs to (M, rows); 0 in motion."""
+    """Return the range of the torque (M, rows) in the standstill that contains each row; 0 in motion.
+
+    Args:
+        mask: (M, rows) mask of rows at rest.
+        target: (M, rows) torques [N m or N].
+        segment: (M,) number of each sample's segment.
+    """
     result = np.zeros(mask.shape)
     for start, stop in segments(segment):
         for row in range(mask.shape[1]):
@@ -173,13 +206,13 @@ class DividedRows:
     """Separate R factors of rows in motion and at rest, one group per torque row, so that weights may change.
 
     Attributes:
-        moving, standing: R factors of rows in motion, and of rows at rest scaled by the root of their share of a
-            standstill.
-        swinging: R factors of rows at rest scaled by the root of that share times the range of the torque.
+        moving, standing: R factors of rows in motion, and of rows at rest multiplied by the square root of their share
+            in a standstill.
+        swinging: R factors of rows at rest multiplied by the square root of that share times the range of the torque.
         standstills: (rows,) number of standstills.
         swing: (rows,) mean range of the torque in a standstill [N m or N].
         length: (rows,) mean number of rows of a standstill.
-        coulomb: (rows, p) which columns are Coulomb friction of a torque row.
+        coulomb: (rows, p) mask of columns that are Coulomb friction of a torque row.
     """
 
     moving: Triangles
@@ -191,10 +224,12 @@ class DividedRows:
     coulomb: np.ndarray
 
     def weights(self, values: np.ndarray, std: np.ndarray, tau: np.ndarray) -> RestWeights:
-        """Return the weights of standstills for parameter values (p,), see the module.
+        """Return the weights of standstills for parameter values (p,), as derived in the module's docstring.
 
         Args:
-            std, tau: (rows,) standard deviation of the residuals in motion, and how many of them count as one.
+            values: (p,) parameters.
+            std, tau: (rows,) standard deviation of the residuals in motion [N m or N], and number of these residuals
+                that count as one.
         """
         count = np.maximum(self.standstills, 1.0)
         friction = np.sum(np.abs(values) * self.coulomb, axis=1)
@@ -207,7 +242,7 @@ class DividedRows:
         return RestWeights(worth, frozen(tau * (std**2 + spread) / variance), frozen(reach))
 
     def joined(self, weights: RestWeights) -> Triangles:
-        """Return the R factors of all rows, standstills with these weights."""
+        """Return the R factors of all rows, with the given weights of standstills."""
         if not self.standstills.any():
             return self.moving
         scaled = self.standing.factors * np.sqrt(weights.worth)[:, None, None]
@@ -222,7 +257,11 @@ class DividedRows:
 
 
 def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
-    """Return the R factors of rows in motion and at rest."""
+    """Return separate R factors of rows in motion and of rows at rest.
+
+    Args:
+        all_rows: rows of all recordings, with their standstills marked.
+    """
     first = all_rows[0]
     rows = first.target.shape[1]
     moving = standing = swinging = empty(first.names, first.units, rows)
@@ -250,7 +289,12 @@ def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
 
 
 def with_weights(all_rows: Sequence[ObservationRows], weights: RestWeights) -> list[ObservationRows]:
-    """Return rows whose standstills have these weights."""
+    """Return the rows with other weights of their standstills.
+
+    Args:
+        all_rows: rows of all recordings, with their standstills marked.
+        weights: weights of the standstills.
+    """
     return [replace(part, rest=weights) for part in all_rows]
 
 
@@ -261,10 +305,16 @@ def with_breakaway(
     torque_rows: TorqueRows,
     values: np.ndarray,
 ) -> list[ObservationRows]:
-    """Return rows weighted by how far friction after a standstill has approached its value in motion, see the module.
+    """Return the rows with lower weights shortly after standstills, where the friction at rest still decays.
+
+    The travel δ of this decay is estimated from residuals, as the module's docstring explains.
 
     Args:
-        values: (p,) parameters of a fit, from whose residuals the travel δ is estimated.
+        all_rows: rows of all recordings.
+        cases: recordings.
+        decimator: filter and decimation of the rows.
+        torque_rows: kind of torques in the rows.
+        values: (p,) parameters of a fit, whose residuals are used.
     """
     parts = divided(all_rows)
     spread = parts.standing.residual_squares(values) / np.maximum(parts.standstills, 1.0)
@@ -299,7 +349,16 @@ def with_breakaway(
 def _travel_since_standstill(
     part: ObservationRows, case: Case, decimator: Decimator, torque_rows: TorqueRows
 ) -> np.ndarray:
-    """Return how far each row's joint has come since its last standstill (M, rows) [rad or m]; infinite before any."""
+    """Return the travel (M, rows) of each row's joint since its last standstill [rad or m].
+
+    It is infinite before the first standstill.
+
+    Args:
+        part: rows of one recording.
+        case: the recording.
+        decimator: filter and decimation of the rows.
+        torque_rows: kind of torques in the rows.
+    """
     index = kept(case.motion.segment, decimator)
     segment = case.motion.segment[index]
     position = torque_rows.of_joints(case.motion.q)[index]
@@ -316,14 +375,24 @@ def _travel_since_standstill(
 
 
 def _remembered(travel: np.ndarray, fade: float) -> np.ndarray:
-    """Return the share of the variance of friction at rest that remains after a travel; `fade` is δ of the module."""
+    """Return the share of the variance of friction at rest that remains after a travel.
+
+    Args:
+        travel: travel since the last standstill [rad or m].
+        fade: travel δ over which friction at rest decays; 0: no friction at rest remains.
+    """
     if fade == 0.0:
         return np.zeros(travel.shape)
     return np.exp(-2.0 * travel / fade)
 
 
 def _variance_in_motion(squares: np.ndarray, friction: np.ndarray) -> float:
-    """Return the most probable variance of residuals with these squares (M,), to which that of friction (M,) adds."""
+    """Return the most probable variance s² of residuals whose total variance is s² plus the variance of friction.
+
+    Args:
+        squares: (M,) squared residuals.
+        friction: (M,) variances of friction at rest that remain.
+    """
     variance = max(float(squares.mean()), 1e-300)
     for _ in range(VARIANCE_ROUNDS):
         variance = max(float(np.mean(squares * variance / (variance + friction))), 1e-300)
@@ -338,17 +407,17 @@ def left_out_error(
     prior: np.ndarray | None,
     apart: Sequence[int],
 ) -> float:
-    """Return Σ (τ - τ̂)² of the rows in motion, each time block predicted by a fit of the other blocks.
+    """Return Σ (τ - τ̂)² of the rows in motion, each time block being predicted by a fit of the other blocks.
 
-    The sum is over torques as they are, as in the error that users read: weighed by its own residuals, a joint whose
-    torques are fitted by wrong parameters would count most.
+    τ are measured and τ̂ predicted torques. Their errors are not weighted, as in the errors shown to users. If rows
+    were weighted by their residuals, a joint whose torques are fitted by wrong parameters would dominate.
 
     Args:
         training: rows with the tested treatment of standstills.
         marked: the same samples with their standstills marked.
-        std, inflation: (rows,) standard deviation and variance inflation of the residuals.
-        prior: whitened rows (k, p + 1) of [W y]; None without one.
-        apart: rows in a different unit, excluded from the sum.
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation of the residuals.
+        prior: (k, p + 1) whitened rows of the prior, to be appended to the rows [W y]; None without a prior.
+        apart: indices of torque rows in a different unit, excluded from the sum.
     """
     rows = training[0].target.shape[1]
     data = triangulate(training)

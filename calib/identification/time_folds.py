@@ -1,8 +1,8 @@
-"""Cross-validation of models over time blocks: computed from R factors, one fit per fold.
+"""Cross-validation of models over time blocks, computed from R factors with one fit per fold.
 
-Models are also tested on held-out regimes of a motion, the extremes of each joint: a correct model extrapolates to
-higher speeds and accelerations, positions farther out, and the other direction of travel. Time blocks hardly test this,
-since each contains some of every regime.
+Models are also tested on held-out ranges of a motion ("regimes"), the extremes of each joint: a correct model
+extrapolates to higher speeds and accelerations, to more distant positions, and to the other direction of motion. Time
+blocks hardly test this, since each contains some of every range.
 """
 
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ RELEVANCE_ITERATIONS = 12
 
 @dataclass(frozen=True, eq=False)
 class Regimes:
-    """Products [W y]ᵀ[W y] of the samples in which a torque row's joint is in a range of motion (e.g. fast).
+    """Products [W y]ᵀ[W y] of the samples in which a torque row's joint is in a range of its motion (e.g. fast).
 
     Attributes:
-        squares, counts: (k, rows, p + 1, p + 1) and (k, rows) of the k ranges.
-        total_squares, total_counts: (rows, p + 1, p + 1) and (rows,) of all rows.
+        squares, counts: (k, rows, p + 1, p + 1) products and (k, rows) numbers of rows in the k ranges.
+        total_squares, total_counts: (rows, p + 1, p + 1) products and (rows,) numbers of all rows.
     """
 
     squares: np.ndarray
@@ -41,9 +41,14 @@ class Regimes:
 
 
 def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator) -> Regimes:
-    """Return the products of cases by range of motion: fast, accelerated, at each end of travel, each direction.
+    """Return the products [W y]ᵀ[W y] by range of motion: fast, accelerated, near each end of travel, each direction.
 
-    Standstills belong to no regime, since friction at rest is undetermined.
+    W is the observation matrix, y are the torques. Standstills are in no range, since friction at rest is undetermined.
+
+    Args:
+        all_rows: rows of all recordings.
+        cases: recordings.
+        decimator: filter and decimation of the rows.
     """
     positions = []
     speeds = []
@@ -100,7 +105,10 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
 
 
 def _signed_norm(rates: np.ndarray) -> np.ndarray:
-    """Return the norm of all joints' rates (N, n), each in units of its spread, with the signs of each (N, n)."""
+    """Return the norm over the joints of rates (N, n), with the sign of each joint's rate, as (N, n).
+
+    Each rate is divided by its standard deviation first.
+    """
     normalised = rates / (np.std(rates, axis=0) + 1e-12)
     norm = np.linalg.norm(normalised, axis=1)
     return np.copysign(norm[:, None], rates)
@@ -108,17 +116,17 @@ def _signed_norm(rates: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """R factors of all candidate columns by (block, row), with their weights and priors.
+    """Cross-validation with the R factors of all candidate columns, their weights and priors.
 
     Attributes:
-        data: triangles by (block, row).
+        data: R factors by time block and torque row.
         rows: number of torque rows per sample.
         blocks: number of time blocks, each held out in turn.
-        std: (rows,) standard deviation of the residuals.
-        inflation: (rows,) variance inflation: number of rows that count as one.
+        std: (rows,) standard deviation of the residuals [N m or N].
+        inflation: (rows,) variance inflation, i.e. number of rows that count as one.
         group: (p,) ridge group of each column, -1 for none.
         prior: (k, p + 1) whitened rows of [W y] of a prior; None without one.
-        regimes: products by range of motion and torque row, see `calib.identification.time_folds`.
+        regimes: products by range of motion and torque row; None: ranges are not tested.
     """
 
     data: Triangles
@@ -132,13 +140,14 @@ class CrossValidation:
     _results: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
     def errors(self, columns: np.ndarray, folds: int | None = None) -> np.ndarray:
-        """Return the squared errors (blocks, rows) on each held-out block of a model with these columns.
+        """Return the squared errors (blocks, rows) on each held-out time block, for a model with these columns.
 
-        Squares are of samples, not whitened; blocks that a recording's gaps left empty hold zeros.
+        Errors are sums over samples, not whitened. Blocks without samples have zero errors.
 
         Args:
-            folds: in how many runs of neighbouring blocks the time is left out; None: block by block. Two: each half
-                predicts the other, as far as one recording can extrapolate.
+            columns: indices of the model's columns.
+            folds: number of runs of neighbouring blocks that are held out in turn; None: each block is one. With two,
+                each half predicts the other, which is the most that one recording can test extrapolation.
         """
         columns = np.asarray(columns, dtype=int)
         runs = np.array_split(np.arange(self.blocks), folds or self.blocks)
@@ -148,7 +157,11 @@ class CrossValidation:
         return self._results[key].copy()
 
     def extrapolated(self, columns: np.ndarray) -> np.ndarray:
-        """Return the squared errors (ranges, rows) in each held-out range of motion of a model with these columns."""
+        """Return the squared errors (ranges, rows) in each held-out range of motion, for a model with these columns.
+
+        Args:
+            columns: indices of the model's columns.
+        """
         assert self.regimes is not None
         key = b"ranges" + np.asarray(columns, dtype=int).tobytes()
         if key in self._results:
@@ -173,7 +186,12 @@ class CrossValidation:
         return self._results.setdefault(key, np.maximum(result, 0.0))
 
     def _held_out_errors(self, columns: np.ndarray, runs: list[np.ndarray]) -> np.ndarray:
-        """Return the squared errors (blocks, rows) of ridge estimates: each run of blocks from all others."""
+        """Return the squared errors (blocks, rows) of ridge estimates, each run of blocks predicted from the others.
+
+        Args:
+            columns: indices of the model's columns.
+            runs: sets of block numbers, each held out together.
+        """
         index = np.append(columns, self.data.parameters)
         squares = self._squares.take(index, 1).take(index, 2)
         prior_square = self._prior_square(index)
@@ -193,7 +211,7 @@ class CrossValidation:
         return errors
 
     def _prior_square(self, index: np.ndarray) -> np.ndarray | float:
-        """Return the product [W y]ᵀ[W y] of the prior's rows in some columns; zero without a prior."""
+        """Return the product [W y]ᵀ[W y] of the prior's rows in the columns `index`; zero without a prior."""
         if self.prior is None:
             return 0.0
         return self.prior[:, index].T @ self.prior[:, index]
@@ -204,7 +222,7 @@ class CrossValidation:
 
     @cached_property
     def _squares(self) -> np.ndarray:
-        """Products [W y]ᵀ[W y] of the whitened rows of each block (blocks, p + 1, p + 1)."""
+        """Products [W y]ᵀ[W y] of the whitened rows of each time block (blocks, p + 1, p + 1)."""
         factors = self.data.factors[: self.blocks * self.rows]
         weight = np.tile(1.0 / (self.std**2 * self.inflation), self.blocks)
         weighted = factors.transpose(0, 2, 1) * weight[:, None, None]
@@ -216,10 +234,18 @@ class CrossValidation:
 def estimate(
     data: Triangles, std: np.ndarray, inflation: np.ndarray, group: np.ndarray, prior: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (p,) and prior standard deviations (p,): infinite without ridge, 0 for columns switched off.
+    """Return parameter values (p,) and their prior standard deviations (p,).
 
-    Columns with a group are regularised towards zero as strongly as the evidence says (`calib.estimation.relevance`);
-    with none, this is weighted least squares. Directions without any data remain zero.
+    Columns with a group are regularised towards zero with the strength that maximises the evidence
+    (`calib.estimation.relevance`). If no column has a group, the estimate is that of weighted least squares. Directions
+    without data are zero. Prior standard deviations are infinite without ridge, and 0 for columns of a group that is
+    switched off.
+
+    Args:
+        data: R factors, one group per torque row.
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation of the residuals.
+        group: (p,) ridge group of each column; -1 for none.
+        prior: (k, p + 1) whitened rows of a prior, to be appended to the rows [W y]; None without one.
     """
     weight = 1.0 / (std * np.sqrt(inflation))
     weighted = data.factors * weight[:, None, None]
@@ -237,17 +263,29 @@ def estimate(
 
 
 def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
-    """Return a number (p,) for columns with the same group and unit; -1 for columns without a group."""
+    """Return a number (p,) that is equal for columns of the same group and unit; -1 for columns without a group.
+
+    Args:
+        group: (p,) ridge group of each column; -1 for none.
+        units: unit of each column.
+    """
     distinct, unit = np.unique(units, return_inverse=True)
     return np.where(group < 0, -1, group * len(distinct) + unit)
 
 
 def _regularised(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return values and prior standard deviations (p,) from [W y]ᵀ[W y] (p + 1, p + 1) and its number of rows.
+    """Return values and prior standard deviations (p,) from the product [W y]ᵀ[W y] and its number of rows.
 
-    A group's ridge is in units of what each column explains, so that one is enough for different units; but parameters
-    of one kind are about equally large. What the motion hardly shows (Stribeck's torque of a joint that never slows
-    down) has a prior deviation of `MAX_DEVIATION_RATIO` times that of the best shown at most, not one without end.
+    A group's ridge is in units of what each column explains, so that one ridge suffices for different units. But
+    parameters of one kind have about equal sizes. A parameter that the motion hardly excites (Stribeck friction of a
+    joint that never slows down) therefore has a prior standard deviation of at most `MAX_DEVIATION_RATIO` times that of
+    the best excited parameter of its kind.
+
+    Args:
+        square: (p + 1, p + 1) product [W y]ᵀ[W y] of whitened rows.
+        rows: number of rows.
+        group: (p,) ridge group of each column; -1 for none.
+        kinds: (p,) number that is equal for columns of the same group and unit; -1 without group.
     """
     size = np.sqrt(np.diag(square)[:-1])
     # Largest size of each kind; the last entry is that of kind -1.

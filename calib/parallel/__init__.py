@@ -1,6 +1,7 @@
 """Parallel robots: the commands for serial arms, applied to closed loops (`calib.parallel.mechanism`).
 
-The package is what `calib.procedure.robot_kinds.RobotKind` asks for; it loads its modules when they are needed.
+The functions are those of `calib.procedure.robot_kinds.RobotKind`. They import the package's modules when called,
+because these imports are slow.
 """
 
 from __future__ import annotations
@@ -50,7 +51,10 @@ def drive_gains(
     known: Mapping[str, float],
     reference: int | None,
 ) -> DriveGains:
-    """Return the drive gains of a parallel robot; see `calib.parallel.actuator_gains.drive_gains`."""
+    """Return the drive gains [N m/A] of a parallel robot with their covariance.
+
+    Arguments and errors are those of `calib.parallel.actuator_gains.drive_gains`.
+    """
     from calib.parallel import actuator_gains
 
     return actuator_gains.drive_gains(robot, cases, settings, known, reference)

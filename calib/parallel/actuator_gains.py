@@ -1,17 +1,18 @@
 """Drive gains of a parallel robot from currents, by runs without and with a payload of known mass.
 
-Redundant actuators share the forces in proportions that no model determines. Determined are the forces on the platform,
+No model determines the proportions in which redundant actuators share the forces. The forces on the platform are
+determined,
 
     J_p^invᵀ diag(i) K = W χ + P χ_L,    an entry of χ_L known
 
-(Briot, Gautier & Krut 2013, eq. 24; Gautier & Briot 2011), with noise σ_k of the currents, taken from
-their part above the identification band (our choice), in the columns of the gains K. It scatters row r by
-m_r = Σ_k K_k² σ_k² mean(J_kr²), and
+(Briot, Gautier & Krut 2013, eq. 24; Gautier & Briot 2011). The columns of the gains K contain the noise σ_k of the
+currents, which is taken from their part above the identification band (our choice). It gives row r the variance
+m_r = Σ_k K_k² σ_k² mean(J_kr²), so that
 
     min Σ_r ‖J_rᵀ diag(i) K - W_r χ - P_r χ_L‖² / m_r(K)
 
-is a total least squares: what noise adds to the sum does not depend on K. With m_r constant, noise would bias K towards
-zero.
+is a total least-squares problem: the noise's contribution to the sum does not depend on K. With a constant m_r, noise
+would bias K towards zero.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,6 +38,12 @@ from calib.parallel.mechanism.parallel_robot import ParallelRobot
 from calib.parallel.mechanism.velocities import loop_jacobians
 from calib.records import frozen
 
+# Largest number of Gauss–Newton steps of the total least squares, and relative step at which it has converged.
+MAX_ROUNDS = 100
+SETTLED = 1e-9
+# Share of the mean noise that is added to each current's noise, which may be zero in simulations.
+MIN_NOISE_SHARE = 1e-12
+
 
 def drive_gains(
     robot: ParallelRobot,
@@ -45,15 +52,17 @@ def drive_gains(
     known_values: Mapping[str, float],
     reference: int | None,
 ) -> DriveGains:
-    """Return the drive gains of a parallel robot; each sigma is the larger one of the residuals' and of a jackknife.
+    """Return the drive gains of a parallel robot with their covariance.
 
-    The jackknife leaves out blocks of time (Efron & Tibshirani 1993, eq. 11.5) and so includes part of the model's
-    error.
+    Each sigma is the larger of two: from the residuals, and from a jackknife that omits a block of time in turn (Efron
+    & Tibshirani 1993, eq. 11.5). The jackknife includes a part of the model's error.
 
     Args:
+        robot: the robot.
         cases: recordings whose targets (N, n) are the actuators' currents [A].
-        known: parameters of payloads whose values are known, in SI.
-        reference: index of the joint to which gains would be relative without a known payload; refused here.
+        settings: settings of the identification.
+        known_values: values of known parameters of payloads by name, in SI.
+        reference: index of the joint relative to which a serial arm's gains are identified; not None is refused.
 
     Raises:
         UsageError: without a known payload, or if no recording distinguishes the payload.
@@ -64,50 +73,65 @@ def drive_gains(
             "without and with a payload of known mass"
         )
     mechanism = closed(robot)
-    model = model_of(mechanism, replace(settings, torque_rows=rows_named(mechanism, PLATFORM)))
-    base = find_base(model, cases, bases.random_samples(model, seed=settings.seed))
+    platform_rows = rows_named(mechanism, PLATFORM)
+    model = model_of(mechanism, replace(settings, torque_rows=platform_rows))
+    samples = bases.random_samples(model, seed=settings.seed)
+    base = find_base(model, cases, samples)
     names = [model.names[k] for k in base.kept]
     missing = [name for name in known_values if name not in names]
     if missing:
-        raise UsageError(f"'{missing[0]}' is not separately identifiable here; was the payload attached?")
+        raise UsageError(f"'{missing[0]}' is not separately identifiable from these runs; was the payload attached?")
     decimator = common_decimator(cases, settings)
     rows = []
     squares = []
     noises = []
-    fixed = np.array([name in known_values for name in names])
-    drive_values = np.array([known_values.get(name, 0.0) for name in names])
+    is_known = [name in known_values for name in names]
+    fixed = np.array(is_known)
+    stated_values = [known_values.get(name, 0.0) for name in names]
+    drive_values = np.array(stated_values)
     for case in cases:
         motion = case.motion
-        J = loop_jacobians(mechanism, mechanism.locate(motion.q)).readings.transpose(0, 2, 1)
+        posture = mechanism.locate(motion.q)
+        jacobians = loop_jacobians(mechanism, posture)
+        J = jacobians.readings.transpose(0, 2, 1)
         currents = J * case.target[:, None]
         rows_kind = model.torque_rows
         present = rows_kind.of_joints(case.present)
         projected = replace(case, target=currents.sum(axis=2), torque_rows=rows_kind, present=present)
         row_set = observe(model, base.kept, projected, decimator)
-        # Unknown: gains of the currents, and the parameters that are not stated.
+        # Unknown are the gains of the currents, and the parameters without stated value.
         currents = decimate(currents, decimator, motion.segment)
-        matrix = np.concatenate([currents, -row_set.matrix[:, :, ~fixed]], axis=2)
+        free_columns = row_set.matrix[:, :, ~fixed]
+        matrix = np.concatenate([currents, -free_columns], axis=2)
         unknowns = (*robot.joint_names, *np.array(names)[~fixed])
         target = row_set.matrix @ drive_values
         units = ("",) * matrix.shape[2]
-        rows.append(replace(row_set, matrix=matrix, target=target, names=unknowns, units=units))
+        gain_rows = replace(row_set, matrix=matrix, target=target, names=unknowns, units=units)
+        rows.append(gain_rows)
         squares.append(np.mean(J**2, axis=0))
         out_of_band = case.target - motion.in_band(case.target)
         noises.append(np.mean(out_of_band**2, axis=0))
-    noise = np.mean(noises, axis=0) + 1e-12 * np.mean(noises)
+    noise = np.mean(noises, axis=0) + MIN_NOISE_SHARE * np.mean(noises)
     squares = noise * np.mean(squares, axis=0)
     folds = max(settings.folds, 2 * len(cases))
     data = triangulate(with_blocks(rows, folds))
     solution = _total_least_squares(data, squares, rows)
-    pseudo_values = []
-    blocks = np.flatnonzero(data.rows.reshape(-1, len(squares)).any(axis=1)).tolist()
+
+    # jackknife over the blocks of time
+    replicates = []
+    has_rows = data.rows.reshape(-1, len(squares)).any(axis=1)
+    blocks = np.flatnonzero(has_rows).tolist()
     for block in blocks:
         without_block = [k for k in blocks if k != block]
-        # without the only run that carries the payload
+        # Raised where the block contains the only run with the payload.
         with suppress(NotConverged, Unidentifiable):
-            pseudo_values.append(_total_least_squares(data, squares, rows, without_block).gains)
-    jackknife = np.sqrt((len(pseudo_values) - 1) * np.var(pseudo_values, axis=0))
-    wider = np.maximum(1.0, jackknife / np.sqrt(np.diag(solution.covariance)))
+            replicate = _total_least_squares(data, squares, rows, without_block)
+            replicates.append(replicate.gains)
+    variance = np.var(replicates, axis=0)
+    jackknife = np.sqrt((len(replicates) - 1) * variance)
+    sigmas = np.sqrt(np.diag(solution.covariance))
+    wider = np.maximum(1.0, jackknife / sigmas)
+
     values = np.zeros(len(names))
     values[fixed] = drive_values[fixed]
     values[~fixed] = solution.remaining
@@ -118,7 +142,13 @@ def drive_gains(
 
 
 class _Solution(NamedTuple):
-    """Gains (n,) with covariance (n, n), other parameters (b,), and the share of the currents' noise in the rows."""
+    """Solution of the total least squares.
+
+    Attributes:
+        gains, covariance: gains (n,) and their covariance (n, n).
+        remaining: (b,) values of the other unknown parameters.
+        share: ratio of the rows' residual variance to the variance that the currents' noise predicts.
+    """
 
     gains: np.ndarray
     covariance: np.ndarray
@@ -129,16 +159,23 @@ class _Solution(NamedTuple):
 def _total_least_squares(
     data: Triangles, squares: np.ndarray, rows: Sequence[ObservationRows], blocks: Sequence[int] | None = None
 ) -> _Solution:
-    """Return the solution for rows whose first n columns are the currents on the platform's coordinates.
+    """Return the solution for rows whose first n columns are the currents on the platform's r coordinates.
 
     Args:
-        data: triangles of the rows by block and coordinate; blocks: that count, None: all.
-        squares: (r, n) σ² mean(J²) of each current's noise.
+        data: triangles of the rows by block and coordinate.
+        squares: (r, n) σ² mean(J²), the variance of a coordinate's rows per squared gain, due to each current's noise.
+        rows: the rows, from which the autocorrelation of the residuals is estimated.
+        blocks: numbers of the blocks that enter; None: all.
+
+    Raises:
+        NotConverged: if the gains do not converge.
+        Unidentifiable: if the rows do not identify all unknowns.
     """
     n = squares.shape[1]
     data = pool(data, len(squares), blocks)
     factors = np.array(data.factors)
-    size = np.maximum(np.linalg.norm(factors, axis=(0, 1)), 1e-300)
+    norms = np.linalg.norm(factors, axis=(0, 1))
+    size = np.maximum(norms, 1e-300)
     size[-1] = 1.0
     factors /= size
     matrix = factors[:, :, :-1]
@@ -146,7 +183,6 @@ def _total_least_squares(
     flat = matrix.reshape(-1, matrix.shape[2])
     x = np.linalg.lstsq(flat, target.ravel(), rcond=1e-12)[0]
     tau = residual_inflation(rows, x / size[:-1])
-    max_rounds = 100
     rounds = 0
     while True:
         rounds += 1
@@ -154,24 +190,30 @@ def _total_least_squares(
         scatter = squares @ gain**2
         residual = matrix @ x - target
         weigh = 1.0 / np.sqrt(scatter * tau)[:, None]
+        # derivative of the weighted residual by the gains: the weight depends on them, too
         slopes = matrix.copy()
         share = gain * squares / scatter[:, None] / size[:n]
         slopes[:, :, :n] -= residual[:, :, None] * share[:, None]
-        flat = (slopes * weigh[:, :, None]).reshape(-1, len(x))
+        weighted_slopes = slopes * weigh[:, :, None]
+        flat = weighted_slopes.reshape(-1, len(x))
         weighted = (residual * weigh).ravel()
         step = np.linalg.lstsq(flat, -weighted, rcond=1e-12)[0]
         x = x + step
-        if np.abs(step[:n]).max() < 1e-9 * np.abs(x[:n]).max():
+        largest_step = np.abs(step[:n]).max()
+        if largest_step < SETTLED * np.abs(x[:n]).max():
             break
-        if rounds == max_rounds:
+        if rounds == MAX_ROUNDS:
             message = "the drive gains do not converge; check that the payload moves with every actuator"
             raise NotConverged(message, gain)
     if np.linalg.matrix_rank(flat, rtol=1e-10) < len(x):
         raise Unidentifiable("these runs do not identify the drive gains: record richer motion", data.names[:n])
     inverse = np.linalg.pinv(flat) / size[:-1, None]
-    variance = float(weighted @ weighted) / max((data.rows / tau).sum() - len(x), 1.0)
+    independent_rows = (data.rows / tau).sum()
+    variance = float(weighted @ weighted) / max(independent_rows - len(x), 1.0)
     weighted_square = np.sum(residual**2 / scatter[:, None])
-    squared = weighted_square / max(data.rows.sum() - len(x), 1)
+    share_of_noise = weighted_square / max(data.rows.sum() - len(x), 1)
     gains = x[:n] / size[:n]
-    covariance = variance * (inverse @ inverse.T)[:n, :n]
-    return _Solution(gains, covariance, x[n:] / size[n:-1], float(squared))
+    remaining = x[n:] / size[n:-1]
+    cofactors = inverse @ inverse.T
+    covariance = variance * cofactors[:n, :n]
+    return _Solution(gains, covariance, remaining, float(share_of_noise))

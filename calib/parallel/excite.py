@@ -1,4 +1,4 @@
-"""Design of an exciting motion of a parallel robot, by the search for serial arms in platform coordinates."""
+"""Design of an exciting motion of a parallel robot: the search for serial arms, applied to platform coordinates."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -35,8 +35,9 @@ from calib.trajectories.design.verify import dense_motion
 from calib.trajectories.setpoints import Setpoints
 from calib.units import headings
 
-# instants over the period while searching
+# Number of instants over the period during the search.
 SAMPLES = 100
+# Names of the settings that apply to parallel robots.
 READ = (
     "period",
     "harmonics",
@@ -50,9 +51,11 @@ READ = (
     "hard",
     "loads",
     "columns",
-)  # of the settings
+)
+# Design criteria that are available for parallel robots.
 GOALS = ("raw", "normalised", "logdet", "smallest")
 FIGURES = "plot_*.png"
+# Files of a motion's folder.
 MOTION = (ROBOT, COVARIANCE, METRICS, PLANNED, coefficients.NAME, prediction.NAME, FIGURES)
 
 
@@ -61,10 +64,12 @@ class _ActuatorLimit(TwoSided):
     """Limit of each actuator's torque |τ| ≤ τ_max, or speed |q̇| ≤ v_max.
 
     Attributes:
-        plan: maps platform coordinates to the robot's motion.
-        of: maps a motion of N samples to the limited quantity (N, n).
-        limits: (n,) finite limits; rows: names of the n actuators.
-        name, unit: of the limit.
+        plan: function of platform coordinates that gives the robot's motion.
+        of: function that maps a motion of N samples to the limited quantity (N, n).
+        limits: (n,) finite limits.
+        rows: names of the n actuators.
+        name, unit: name and unit of the limited quantity.
+        joints: (n,) indices of the actuators.
     """
 
     plan: PlatformRegressor
@@ -83,8 +88,11 @@ class _ActuatorLimit(TwoSided):
         return np.tile(self.limits, 2)
 
     def values(self, motion: SampledMotion) -> np.ndarray:
-        values = self.of(self.plan.motion(motion.q, motion.v, motion.a))
-        return np.concatenate([values - self.limits, -values - self.limits], axis=1)
+        robot_motion = self.plan.motion(motion.q, motion.v, motion.a)
+        values = self.of(robot_motion)
+        above = values - self.limits
+        below = -values - self.limits
+        return np.concatenate([above, below], axis=1)
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         k = len(self.limits)
@@ -101,21 +109,23 @@ class ParallelExcitation(ExcitationDesign):
 
     Attributes:
         robot: the robot, with its file.
-        plan: maps platform coordinates to the robot's motion and torques.
+        plan: function of platform coordinates that gives the robot's motion and torques.
     """
 
     robot: ParallelMechanism
     plan: PlatformRegressor
 
     def orders(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return x, v, a (N, r) of the platform's coordinates at times (N,) [s]; the motion repeats."""
+        """Return x, v, a (N, r) of the platform's coordinates at times (N,) [s] of the periodic motion."""
         family = self.family
-        motion = dense_motion(family, self.found.x, np.mod(times, family.period))
+        phases = np.mod(times, family.period)
+        motion = dense_motion(family, self.found.x, phases)
         return motion.q, motion.v, motion.a
 
     def sampled(self, rate: float | None = None) -> Sampled:
         """Return t (N,) [s] and q, v, a (N, n) of the actuators over one period at `rate` [Hz], ends included."""
-        track = self._actuators(folder.one_period(self, rate))
+        platform_track = folder.one_period(self, rate)
+        track = self._actuators(platform_track)
         return track.times, track.q, track.v, track.a
 
     def _actuators(self, track: Setpoints) -> Setpoints:
@@ -125,20 +135,25 @@ class ParallelExcitation(ExcitationDesign):
         q = motion.posture.q[:, actuated]
         v = motion.v[:, actuated]
         a = motion.a[:, actuated]
-        return Setpoints(track.rate, q, v, a, self._torques(motion))
+        torques = self._torques(motion)
+        return Setpoints(track.rate, q, v, a, torques)
 
     def _torques(self, motion: LoopMotion) -> np.ndarray:
-        """Return the torques of the actuators (N, n), for each the largest one over all loads."""
-        torques = self.plan.torques(motion).reshape(len(motion.v), -1, self.robot.chain.n)
+        """Return the torques (N, n) of the actuators; of several loads the torque of the largest magnitude."""
+        all_torques = self.plan.torques(motion)
+        torques = all_torques.reshape(len(motion.v), -1, self.robot.chain.n)
         heaviest = np.abs(torques).argmax(axis=1, keepdims=True)
         return np.take_along_axis(torques, heaviest, axis=1)[:, 0]
 
     @property
     def peaks(self) -> tuple[np.ndarray, np.ndarray]:
         """Largest torque of each actuator (n,) [N m or N] and acceleration of each platform coordinate (r,)."""
-        x, v, a = self.orders(self.period / INSTANTS * np.arange(INSTANTS))
-        torques = self._torques(self.plan.motion(x, v, a))
-        return np.abs(torques).max(axis=0), np.abs(a).max(axis=0)
+        times = self.period / INSTANTS * np.arange(INSTANTS)
+        x, v, a = self.orders(times)
+        motion = self.plan.motion(x, v, a)
+        peak_torques = np.abs(self._torques(motion)).max(axis=0)
+        peak_accelerations = np.abs(a).max(axis=0)
+        return peak_torques, peak_accelerations
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the result folder of `calib excite`: one period at the controller's rate, and the actuators' series."""
@@ -165,19 +180,24 @@ class ParallelExcitation(ExcitationDesign):
             max_error: largest deviation of the series from the motion [rad or m].
             samples: number of samples over the period from which the series are computed.
         """
-        x, _, _ = self.orders(self.period / samples * np.arange(samples))
+        times = self.period / samples * np.arange(samples)
+        x, _, _ = self.orders(times)
         robot = self.robot.chain
-        q = self.robot.mechanism.place(x).q[:, robot.actuated]
+        posture = self.robot.mechanism.place(x)
+        q = posture.q[:, robot.actuated]
         lines = np.fft.rfft(q, axis=0) / samples
-        # What the harmonics from each on add to the motion, at most.
-        from_last = np.cumsum(2.0 * np.abs(lines[::-1]), axis=0)
+        # bound of the error that results if the harmonics from a given one on are omitted
+        amplitudes = 2.0 * np.abs(lines)
+        from_last = np.cumsum(amplitudes[::-1], axis=0)
         remainder = from_last[::-1].max(axis=1)
-        last = 1 + max(1, int((remainder[1:] > max_error).sum()))
+        needed = int((remainder[1:] > max_error).sum())
+        last = 1 + max(1, needed)
         series = []
         for line in lines.T:
+            constant = [line[0].real]
             sines = -2.0 * line[1:last].imag
             cosines = 2.0 * line[1:last].real
-            series.append(np.concatenate([[line[0].real], sines, cosines]))
+            series.append(np.concatenate([constant, sines, cosines]))
         kinds = tuple(joint.kind for joint in robot.joints)
         rate = self.settings.rate
         return coefficients.Periodic(robot.joint_names, kinds, self.period, rate, 1, "fourier", tuple(series))
@@ -185,18 +205,19 @@ class ParallelExcitation(ExcitationDesign):
     def to_dict(self) -> dict[str, object]:
         """Return the metrics of ``metrics.json``."""
         torque, acceleration = self.peaks
-        return super().to_dict() | {
-            "robot": self.robot.chain.name,
-            "peak_torque": torque.tolist(),
-            "peak_acceleration": acceleration.tolist(),
-        }
+        metrics = super().to_dict()
+        metrics["robot"] = self.robot.chain.name
+        metrics["peak_torque"] = torque.tolist()
+        metrics["peak_acceleration"] = acceleration.tolist()
+        return metrics
 
     def __repr__(self) -> str:
         return f"<ParallelExcitation for {self.robot.chain.name}: {self.period:g} s>"
 
     def __str__(self) -> str:
         torques, _ = self.peaks
-        peaks = [f"{name} {torque:.3g}" for name, torque in zip(self.robot.chain.joint_names, torques)]
+        names = self.robot.chain.joint_names
+        peaks = [f"{name} {torque:.3g}" for name, torque in zip(names, torques)]
         return f"{super().__str__()}\npeak torques: {', '.join(peaks)}"
 
 
@@ -213,19 +234,23 @@ def excite_parallel(
     """Return an exciting motion of a parallel robot within the torque limits and platform box of its file.
 
     Args:
-        settings: period, harmonics, drives, loads, columns, goals (`GOALS`), starts, evaluations, seed, rate; the
-            others are for serial arms.
+        robot: the robot.
+        settings: period, harmonics, drives, loads, columns, goals (`GOALS`), starts, evaluations, seed, rate; other
+            settings apply to serial arms only.
         model: folder of an identification of the same robot, which predicts the torques and whose drive terms are to
-            be identified; None: the file's inertias.
+            be identified; None: the inertias of the robot's file.
         options: options of the identification that will follow: rows, drives, friction of passive joints, payloads.
         after: folder of an identification that the motion is to complement; it also serves as `model`.
+        map: `map`, or a replacement that evaluates the starts of the search in parallel.
+        progress: function called with a line of text; None: none.
 
     Raises:
         UsageError: for options that apply to serial arms only.
     """
     refuse_unread(settings, DEFAULT_DESIGN, READ)
     for text in (*settings.goals, *settings.hard):
-        one_of(text.partition("=")[0], GOALS, "goals: of a parallel robot", UsageError)
+        name = text.partition("=")[0]
+        one_of(name, GOALS, "goals: of a parallel robot", UsageError)
     require(after is None or model is None, "after: its folder is also the model; leave --model out", UsageError)
     folder = model or after
     if options is None and after is None and not settings.loads and not settings.columns:
@@ -242,7 +267,9 @@ def excite_parallel(
         parallel_model, values, loads, notes = of_folder(robot, folder, settings)
     purpose = purpose_of(parallel_model, values, loads, notes, settings, folder, after)
     design = design_parallel(robot, parallel_model, values, settings, purpose=purpose, map=map, progress=progress)
-    return design if after is None else foretold(design)
+    if after is None:
+        return design
+    return foretold(design)
 
 
 def design_parallel(
@@ -258,15 +285,19 @@ def design_parallel(
 ) -> ParallelExcitation:
     """Return a motion of the platform, optimised to identify the base parameters of a parallel robot.
 
-    The determinant of the information is maximised, with σ of the rows as it follows at home from equal noise of all
-    torques; a share `GUARD` of the torque limits is kept in reserve.
+    Without goals in the settings the determinant of the information is maximised. σ of the rows is the one that equal
+    noise of all torques has at home. A share `GUARD` of the torque limits remains in reserve.
 
     Args:
+        robot: the robot, with its file.
         model: model of the robot, with payloads and the preload of redundant actuators.
         values: (p,) parameters that predict the actuators' torques.
         settings: period, harmonics, starts, evaluations, seed, rate.
-        acceleration: (r,) limits of the coordinates' second derivatives; infinite where there is no limit.
+        acceleration: (r,) limits of the second derivatives of the platform's coordinates [m/s², rad/s²], infinite for
+            a coordinate without limit; None: no limits.
         purpose: design goal; None: all base parameters, on the platform's coordinates.
+        map: `map`, or a replacement that evaluates the starts of the search in parallel.
+        progress: function called with a line of text; None: none.
 
     Raises:
         UsageError: if an actuator's speed or torque has no limit.
@@ -279,10 +310,12 @@ def design_parallel(
     plan: Any = purpose.model.exact
     rows = getattr(plan, "row_names", parallel_robot.joint_names)
     coordinates = tuple(f"platform {name}" for name in parallel_robot.freedom)
-    constraints: list[MotionConstraint] = [BoxLimit(0, parallel_robot.lower, parallel_robot.upper, rows=coordinates)]
+    box = BoxLimit(0, parallel_robot.lower, parallel_robot.upper, rows=coordinates)
+    constraints: list[MotionConstraint] = [box]
     if acceleration is not None:
         constraints.append(BoxLimit(2, -acceleration, acceleration, rows=coordinates))
-    torque_limits = np.resize((1.0 - GUARD) * bounds.torque, len(rows))
+    guarded_torque = (1.0 - GUARD) * bounds.torque
+    torque_limits = np.resize(guarded_torque, len(rows))
     constraints.append(_ActuatorLimit(plan, plan.torques, torque_limits, rows))
     names = parallel_robot.joint_names
     constraints.append(_ActuatorLimit(plan, plan.speeds, bounds.velocity, names, "velocity", "rad/s"))
@@ -318,7 +351,13 @@ class _PlatformAxes:
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        return tuple(Joint(name, "revolute" if "r" in name else "prismatic") for name in self.robot.freedom)
+        joints = []
+        for name in self.robot.freedom:
+            kind = "prismatic"
+            if name.startswith("r"):
+                kind = "revolute"
+            joints.append(Joint(name, kind))
+        return tuple(joints)
 
 
 def actuator_bounds(mechanism: ClosedRobot) -> MotionBounds:
@@ -353,13 +392,23 @@ def write_motion(
     """Write the folder of a motion: ``robot.toml``, ``motion.csv``, ``metrics.json`` and what `write_files` adds.
 
     Args:
-        track: setpoints of the actuators; coordinates: (N, r) of the platform; both are written to ``motion.csv``.
-        bounds: limits that the motion keeps, written at the head of the file.
+        robot: the robot, with its file.
+        out: the folder.
+        track: setpoints of the actuators, written to ``motion.csv``.
+        coordinates: (N, r) coordinates of the platform [m, rad], written to ``motion.csv``.
+        bounds: limits that the motion keeps, written at the head of ``motion.csv``.
+        metrics: content of ``metrics.json``.
+        write_files: function that writes further files into the folder it is given.
+
+    Returns:
+        The folder.
     """
     parts = {"q": track.q, "v": track.v, "tau": track.tau}
     names = []
     for name in robot.chain.freedom:
-        unit = "rad" if name.startswith("r") else "m"
+        unit = "m"
+        if name.startswith("r"):
+            unit = "rad"
         names.append(f"{name} [{unit}]")
     for part in parts:
         names += headings(part, robot.chain.joints)

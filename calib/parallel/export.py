@@ -61,7 +61,7 @@ from calib.procedure.export.delivery import DRIVES, MJCF, README, TO_SIMULATE, w
 from calib.procedure.export.identified import Drives, drive_table
 from calib.procedure.findings import NOT_JUDGED
 from calib.procedure.kinematic_stage.folder import URDF
-from calib.results.registry import open_result
+from calib.results.result_classes import open_result
 from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Chain, Element, Joint
 from calib.robot.formats.native import NativeModel
@@ -71,7 +71,9 @@ from calib.robot.formats.urdf_write import add_joint, centred, numbers_text, put
 from calib.robot.kinematics import joint_frames
 from calib.transforms import invert
 
-PLATFORM, CLOSURES = "platform", "robot.yaml"
+PLATFORM = "platform"
+CLOSURES = "robot.yaml"
+# Files of an export, and the use of each.
 USES = {
     URDF: "for ROS, MoveIt, Pinocchio: the robot cut open at its platform",
     CLOSURES: "for Pinocchio: the frames of robot.urdf that close the loops, the actuated joints, joint values at home",
@@ -81,19 +83,23 @@ USES = {
     PARAMETERS: "all parameters with their covariance",
     README: "",
 }
-"""Files of an export, and the use of each."""
-# of frames read back [m, and as rotation matrices], and of forces over the largest
+# Largest difference of frames that Pinocchio reads back [m, and entries of rotation matrices], and of forces as a share
+# of the largest force.
 MAX_DIFFERENCE = 1e-9
+# MuJoCo's settings of the loops. In a motion of 1 s of the five-bar robot, loops open by 5 mm with MuJoCo's default
+# settings, and by 0.03 mm with these.
 CLOSED = {"solref": "0.002 1", "solimp": "0.99 0.999 0.0001"}
-"""MuJoCo's settings of the loops: with its default they give way by 5 mm (five-bar, 1 s motion), with these by 0.03."""
+# Names of the moments of inertia in URDF, in the order of `centred`.
+INERTIA_KEYS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass(frozen=True, eq=False)
 class OpenedRobot:
-    """A parallel robot cut open for export, its masses consistent.
+    """A parallel robot with its loops cut at the platform, for export as a tree; its inertias are consistent.
 
     Attributes:
-        model, values: dynamics model and its parameters (p,), without payloads.
+        model: dynamics model without payloads.
+        values: (p,) values of the model's parameters.
         drives: drive parameters of all joints of the tree.
     """
 
@@ -107,31 +113,37 @@ class OpenedRobot:
 
     @cached_property
     def rigid(self) -> list[Leg]:
-        """The legs whose last link is the platform; the first carries it in the tree."""
+        """Legs with a rigid end: their last link is the platform. In the tree the first leg carries the platform."""
         return [leg for leg in self.mechanism.robot.legs if leg.end == "rigid"]
 
     @property
     def closing(self) -> list[Leg]:
-        """The legs that the tree leaves open."""
+        """Legs whose ends the tree does not connect to the platform: the loops that a simulator has to close."""
         return [leg for leg in self.mechanism.robot.legs if leg not in self.rigid[:1]]
 
     @property
     def free(self) -> np.ndarray:
-        """Standard parameters (10,) of a platform that no leg carries in the tree."""
+        """Standard parameters (10,) of the platform without payloads."""
         return self.model.platform_parameters(self.values, ())
 
     @cached_property
     def chains(self) -> list[Chain]:
-        """The legs as chains, uniquely named; the last link of each rigid leg has its share of the platform's mass."""
+        """The legs as chains whose joints have unique names.
+
+        Each of k legs with a rigid end has 1/k of the platform's inertial parameters in its last link.
+        """
         robot = self.mechanism.robot
         rows = self.model.leg_parameters(self.values)
-        names = [joint.name for leg in robot.legs for joint in leg.chain.joints]
+        names = []
+        for leg in robot.legs:
+            names += leg.chain.joint_names
         chains = []
         for leg, row in zip(robot.legs, rows):
             bodies = row.reshape(-1, 10)
             if leg.end == "rigid":
                 T_tip = leg.chain.tail @ invert(leg.attachment)
-                bodies[-1] = transform_body(self.free / len(self.rigid), T_tip)
+                share = self.free / len(self.rigid)
+                bodies[-1] = transform_body(share, T_tip)
             joints = []
             for joint in leg.chain.joints:
                 if names.count(joint.name) > 1:
@@ -143,8 +155,11 @@ class OpenedRobot:
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """All joints of the tree, under their names in the files."""
-        return tuple(joint for chain in self.chains for joint in chain.joints)
+        """All joints of the tree, with the names that they have in the exported files."""
+        joints: list[Joint] = []
+        for chain in self.chains:
+            joints += chain.joints
+        return tuple(joints)
 
     @property
     def actuated(self) -> list[str]:
@@ -152,45 +167,52 @@ class OpenedRobot:
 
     @property
     def home(self) -> dict[str, float]:
-        """Values of all joints at which the loops close with the platform at home [rad or m]."""
+        """Values of all joints at home, by name, at which the loops close [rad or m]."""
         names = [joint.name for joint in self.joints]
-        return dict(zip(names, self.mechanism.home.q[0].tolist()))
+        values = self.mechanism.home.q[0].tolist()
+        return dict(zip(names, values))
 
     def rows(self, values: np.ndarray) -> list[np.ndarray]:
-        """Return values (n_t, …) of all joints, by leg."""
-        return np.split(values, self.mechanism.robot.starts[1:-1])
+        """Return values (n_t, …) of all joints of the tree as one array per leg."""
+        starts = self.mechanism.robot.starts
+        return np.split(values, starts[1:-1])
 
     def urdf(self) -> str:
         """Return the text of ``robot.urdf``."""
         root = ET.Element("robot", name=self.mechanism.robot.name)
         for chain in self.chains:
-            elements = list(ET.fromstring(write_new(chain)))
-            # the link that all legs begin at stands in the tree once
+            leg_root = ET.fromstring(write_new(chain))
+            elements = list(leg_root)
+            # The first link is common to all legs: it is added once.
             if len(root):
                 elements = elements[1:]
             root.extend(elements)
         link = ET.SubElement(root, "link", name=PLATFORM)
         if self.rigid:
             first_leg = self.rigid[0]
-            add_joint(root, "platform_fixed", "fixed", f"{first_leg.name}_end", PLATFORM, invert(first_leg.attachment))
+            end = f"{first_leg.name}_end"
+            add_joint(root, "platform_fixed", "fixed", end, PLATFORM, invert(first_leg.attachment))
         else:
             mass, centre, moments = centred(self.free)
             inertial = ET.SubElement(link, "inertial")
             ET.SubElement(inertial, "origin", xyz=numbers_text(centre), rpy="0 0 0")
             ET.SubElement(inertial, "mass", value=repr(mass))
-            names = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
             values = [repr(float(moment)) for moment in moments]
-            ET.SubElement(inertial, "inertia", dict(zip(names, values)))
+            inertia: dict[str, str] = dict(zip(INERTIA_KEYS, values))
+            ET.SubElement(inertial, "inertia", inertia)
             add_joint(root, "platform_floating", "floating", "base", PLATFORM, self.mechanism.robot.home)
         for leg in self.closing:
-            ET.SubElement(root, "link", name=f"{leg.name}_attachment")
             name = f"{leg.name}_attachment"
+            ET.SubElement(root, "link", name=name)
             add_joint(root, f"{name}_fixed", "fixed", PLATFORM, name, np.asarray(leg.attachment))
-        text = f'<?xml version="1.0"?>\n<!-- loops are open here: {CLOSURES} closes them -->\n' + xml_text(root)
+        head = f'<?xml version="1.0"?>\n<!-- loops are open here: {CLOSURES} closes them -->\n'
+        text = head + xml_text(root)
         friction = {}
         for joint, row in zip(self.joints, self.drives.values.tolist()):
-            if row[1] or row[2]:
-                friction[joint.name] = (row[1], row[2])
+            viscous = row[1]
+            coulomb = row[2]
+            if viscous or coulomb:
+                friction[joint.name] = (viscous, coulomb)
         return put(text, URDF, {}, friction)
 
     def closures(self) -> str:
@@ -199,7 +221,10 @@ class OpenedRobot:
         types = []
         for leg in self.closing:
             pairs.append([f"{leg.name}_end", f"{leg.name}_attachment"])
-            types.append("6d" if leg.end == "rigid" else "3d")
+            if leg.end == "rigid":
+                types.append("6d")
+            else:
+                types.append("3d")
         table = {"closed_loop": pairs, "type": types, "name_mot": self.actuated, "joint_name": [], "joint_type": []}
         lines = ["# Loops of robot.urdf: pairs of links that coincide; values at home [rad or m]"]
         lines += [f"{key}: {json.dumps(value)}" for key, value in table.items()]
@@ -214,44 +239,62 @@ class OpenedRobot:
         world = ET.Element("worldbody")
         home = numbers_text(self.mechanism.home.q[0])
         for chain, drives in zip(self.chains, self.rows(self.drives.values)):
-            model: Any = ET.fromstring(mjcf_text(chain, np.asarray(chain.inertias), *drives.T[:3]))
+            inertias = np.asarray(chain.inertias)
+            leg_text = mjcf_text(chain, inertias, *drives.T[:3])
+            model: Any = ET.fromstring(leg_text)
             if not len(root):
-                root.extend([model.find("compiler"), model.find("option"), world])
-                root[1].set("timestep", "0.001")
+                compiler = model.find("compiler")
+                option = model.find("option")
+                option.set("timestep", "0.001")
+                root.extend([compiler, option, world])
             world.extend(model.find("worldbody"))
         if self.rigid:
-            last = self.chains[robot.legs.index(self.rigid[0])].joint_names[-1]
+            first_leg = self.rigid[0]
+            chain = self.chains[robot.legs.index(first_leg)]
+            last = chain.joint_names[-1]
             body = next(element for element in world.iter("body") if element.get("name") == f"{last}_body")
-            T_tip = self.rigid[0].chain.tail @ invert(self.rigid[0].attachment)
+            T_tip = first_leg.chain.tail @ invert(first_leg.attachment)
         else:
             mass, centre, (xx, xy, xz, yy, yz, zz) = centred(self.free)
-            body = ET.SubElement(world, "body", {"name": "platform_body", **pose_attributes(robot.home)})
+            home_attributes = pose_attributes(robot.home)
+            body = ET.SubElement(world, "body", {"name": "platform_body", **home_attributes})
             ET.SubElement(body, "freejoint", name=PLATFORM)
-            full = numbers_text(np.array([xx, yy, zz, xy, xz, yz]))
+            inertia = np.array([xx, yy, zz, xy, xz, yz])
+            full = numbers_text(inertia)
             ET.SubElement(body, "inertial", pos=numbers_text(centre), mass=repr(mass), fullinertia=full)
-            home += " " + " ".join(pose_attributes(robot.home).values())
+            home += " " + " ".join(home_attributes.values())
             T_tip = np.eye(4)
         ET.SubElement(body, "site", {"name": PLATFORM, **pose_attributes(T_tip)})
         ties = ET.SubElement(root, "equality")
         motors = ET.SubElement(root, "actuator")
         for leg in self.closing:
             name = f"{leg.name}_attachment"
-            ET.SubElement(body, "site", {"name": name, **pose_attributes(T_tip @ leg.attachment)})
+            attachment = pose_attributes(T_tip @ leg.attachment)
+            ET.SubElement(body, "site", {"name": name, **attachment})
             tie = {"name": leg.name, "site1": name, "site2": f"{leg.name}_end_tip", **CLOSED}
-            ET.SubElement(ties, "weld" if leg.end == "rigid" else "connect", tie)
+            kind = "connect"
+            if leg.end == "rigid":
+                kind = "weld"
+            ET.SubElement(ties, kind, tie)
         for name, joint in zip(self.actuated, robot.joints):
+            motor = {"name": name, "joint": name}
             if np.isfinite(joint.effort):
-                limit = {"ctrlrange": f"{-joint.effort!r} {joint.effort!r}"}
-            else:
-                limit = {}
-            ET.SubElement(motors, "motor", {"name": name, "joint": name, **limit})
-        ET.SubElement(ET.SubElement(root, "keyframe"), "key", name="home", qpos=home)
+                motor["ctrlrange"] = f"{-joint.effort!r} {joint.effort!r}"
+            ET.SubElement(motors, "motor", motor)
+        keyframe = ET.SubElement(root, "keyframe")
+        ET.SubElement(keyframe, "key", name="home", qpos=home)
         return xml_text(root)
 
 
 @dataclass(frozen=True, eq=False)
 class _Source:
-    """Input of an export: the robot with its dynamics, all parameters as a table, and notes."""
+    """Input of an export.
+
+    Attributes:
+        opened: the robot, cut open, with its dynamics.
+        parameters: content of ``parameters.json``.
+        notes: sentences for the user.
+    """
 
     opened: OpenedRobot
     parameters: dict[str, object]
@@ -260,7 +303,14 @@ class _Source:
 
 @dataclass(frozen=True, eq=False)
 class _ArmBodies:
-    """The bodies of a parallel robot in an arm's form: number of bodies and joints, labels, joint of each body."""
+    """The bodies of a parallel robot in the form of a serial arm's `calib.dynamics.bodies.Bodies`.
+
+    Attributes:
+        count: number of bodies.
+        n: number of joints of all legs.
+        labels: labels of the bodies.
+        coordinates: joint of each body; -1 for payloads.
+    """
 
     count: int
     n: int
@@ -270,7 +320,7 @@ class _ArmBodies:
 
 @dataclass(frozen=True, eq=False)
 class _ArmModel:
-    """The part of an arm's model that `find_possible` reads."""
+    """The attributes of a serial arm's identification model that `find_possible` reads."""
 
     bodies: _ArmBodies
     columns: tuple[object, ...]
@@ -280,35 +330,50 @@ class _ArmModel:
 
 
 def _side_by_side(model: ParallelModel, bodies: np.ndarray | None) -> tuple[Chain, Any]:
-    """Return the bodies of a model in the form that `find_possible` requires (parameters and labels of a serial arm).
+    """Return the bodies of a model in the form of a serial arm, which `find_possible` requires.
 
-    Bodies without known masses become rods of 1 kg each, for a leg between its joints.
+    Args:
+        model: model of the robot.
+        bodies: inertial parameters of the bodies; None: unknown. Then a link of a leg becomes a rod of 1 kg between its
+            joints, and the platform a ball of 1 kg.
+
+    Returns:
+        A chain with a joint per body, and a model with its labels and columns.
     """
-    labels = tuple(name.removeprefix(STANDARD[0]) for name in model.names[: model.inertial : 10])
+    names = model.names[: model.inertial : 10]
+    labels = tuple(name.removeprefix(STANDARD[0]) for name in names)
     count = len(labels) - len(model.payloads)
+    robot = model.mechanism.robot
     if bodies is None:
-        rods = [pseudo_inertia.ball(1.0, RADIUS)] * count
-        legs = model.mechanism.robot.legs[: 1 if model.identical_legs else None]
-        count_of_rods = 0
+        assumed = [pseudo_inertia.ball(1.0, RADIUS)] * count
+        legs = robot.legs
+        if model.identical_legs:
+            legs = robot.legs[:1]
+        body = 0
         for leg in legs:
             for frame in _next_frames(leg)[: leg.bodies]:
-                rods[count_of_rods] = pseudo_inertia.rod(1.0, frame[:3, 3], RADIUS / 4)
-                count_of_rods += 1
-        bodies = np.array(rods)
+                assumed[body] = pseudo_inertia.rod(1.0, frame[:3, 3], RADIUS / 4)
+                body += 1
+        bodies = np.array(assumed)
     rows = bodies.reshape(-1, 10)[:count]
-    joints = tuple(Joint(label) for label in labels[:count])
-    elements = tuple(Element(joint.name, "rz", joint=k, owner=k) for k, joint in enumerate(joints))
-    chain = Chain(model.mechanism.robot.name, joints, elements, inertias=rows)
-    coordinates = np.array([*range(count), *[-1] * len(model.payloads)])
-    n = int(model.mechanism.robot.starts[-1])
+    joints = []
+    elements = []
+    for k, label in enumerate(labels[:count]):
+        joints.append(Joint(label))
+        elements.append(Element(label, "rz", joint=k, owner=k))
+    chain = Chain(robot.name, tuple(joints), tuple(elements), inertias=rows)
+    no_joint = [-1] * len(model.payloads)
+    coordinates = np.array([*range(count), *no_joint])
+    n = int(robot.starts[-1])
     arm_bodies = _ArmBodies(len(labels), n, labels, coordinates)
     return chain, _ArmModel(arm_bodies, model.columns, model.names, model.inertial, model.torque_rows)
 
 
 def _next_frames(leg: Leg) -> np.ndarray:
-    """Return the frame (n, 4, 4) of what follows each link of a leg, in the link's frame, at home."""
+    """Return the pose (n, 4, 4) of the next joint, or of the leg's end, in the frame of each link of a leg, at home."""
     frames = joint_frames(leg.chain, leg.home[None])[:, 0]
-    return np.concatenate([invert(frames[:-1]) @ frames[1:], leg.chain.tail[None]])
+    next_joints = invert(frames[:-1]) @ frames[1:]
+    return np.concatenate([next_joints, leg.chain.tail[None]])
 
 
 def _identified(robot: ParallelMechanism, folder: Path, prior: str) -> _Source:
@@ -324,9 +389,11 @@ def _identified(robot: ParallelMechanism, folder: Path, prior: str) -> _Source:
     possible = find_possible(estimate, prior=prior)
     single = model.single
     values = model.spread(possible.dynamics.values)
-    covariance = possible.covariance[np.ix_(model.owners, model.owners)]
+    owners = np.ix_(model.owners, model.owners)
+    covariance = possible.covariance[owners]
     _, single_arm = _side_by_side(single, single.known_parameters())
-    drives = drive_table(Dynamics(single_arm, values), covariance)
+    single_dynamics = Dynamics(single_arm, values)
+    drives = drive_table(single_dynamics, covariance)
     keys = ("possible", "nearest", "distance", "allowed", "weight", "prior", "notes")
     standard = {
         "names": single.names,
@@ -344,14 +411,18 @@ def _identified(robot: ParallelMechanism, folder: Path, prior: str) -> _Source:
     consistency = {key: getattr(possible, key) for key in keys}
     table = {"base": base, "standard": standard, "consistency": consistency}
     notes = [_consistency(possible, estimate.b), *possible.notes]
-    if drives.left or np.any(drives.values[:, 3]):
-        notes.append(f"not in URDF and MJCF, but in parameters.json: {', '.join(('offsets', *drives.left))}")
+    offsets = drives.values[:, 3]
+    if drives.left or np.any(offsets):
+        missing = ", ".join(("offsets", *drives.left))
+        notes.append(f"not in URDF and MJCF, but in parameters.json: {missing}")
     if model.payloads:
-        notes.append(f"payloads are not part of the robot: {', '.join(model.payloads)} are in parameters.json alone")
+        payloads = ", ".join(model.payloads)
+        notes.append(f"payloads are not part of the robot: {payloads} are in parameters.json alone")
     return _Source(OpenedRobot(single, values, drives), {"dynamics": table}, tuple(notes))
 
 
 def _consistency(possible: PossibleBodies, count: int) -> str:
+    """Return a sentence on how far the consistent inertias are from the estimate of `count` parameters."""
     head = f"consistent inertias {possible.distance:.2g} σ from the estimate of {count} parameters"
     limit = f"95 % of correct models are within {possible.allowed:.2g}"
     worst = "; ".join(f"{name} (without it {ratio:.3g})" for name, ratio in possible.blamed)
@@ -376,7 +447,9 @@ def _calibrated(robot: ParallelMechanism, folder: Path) -> _Source:
     prior_bodies = next(find_prior_bodies(chain, arm))
     estimate = read_estimate(folder)
     _, covariance = read_covariance(folder / COVARIANCE)
-    names, units, values = [], [], []
+    names = []
+    units = []
+    values = []
     for row in estimate:
         names.append(row.name)
         units.append(row.unit)
@@ -405,19 +478,23 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
     result = open_result(folder, "export")
     if result.identification is None and not (folder / ESTIMATE).is_file():
         result.refuse("export")
-    check_export_target(
-        into, [robot.source, *(folder / name for name in (ROBOT, METRICS, MODEL, ESTIMATE, COVARIANCE))]
-    )
+    inputs = [robot.source]
+    inputs += [folder / name for name in (ROBOT, METRICS, MODEL, ESTIMATE, COVARIANCE)]
+    check_export_target(into, inputs)
     if result.identification is not None:
         source = _identified(robot, folder, prior)
     else:
         source = _calibrated(robot, folder)
     opened = source.opened
     level = result.verdict.level
-    verdict = "" if level == NOT_JUDGED else str(result.verdict)
+    verdict = ""
+    if level != NOT_JUDGED:
+        verdict = str(result.verdict)
     if level == "fail":
         verdict += "; do not use"
-    remark = verdict if level in ("marginal", "fail") else ""
+    remark = ""
+    if level in ("marginal", "fail"):
+        remark = verdict
     texts = {URDF: opened.urdf(), MJCF: opened.mjcf()}
     for name, text in texts.items():
         _check(opened, text, name)
@@ -425,20 +502,24 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
     def write(target: Path) -> None:
         robot.write(target)
         for name, text in texts.items():
+            content = text.encode()
             if name == URDF:
-                content = with_comment(text.encode(), "its loops are closed by robot.yaml")
-            else:
-                content = text.encode()
-            files.write(target / name, with_comment(content, remark) if remark else content)
+                content = with_comment(content, "its loops are closed by robot.yaml")
+            if remark:
+                content = with_comment(content, remark)
+            files.write(target / name, content)
         files.write(target / CLOSURES, opened.closures())
         write_drives(opened.joints, opened.drives, target / DRIVES)
         files.write_json(target / PARAMETERS, {"robot": robot.chain.name, **source.parameters})
-        files.write(target / README, "\n".join([verdict or "verdict unknown", "", *_uses(), ""]))
+        lines = [verdict or "verdict unknown", "", *_uses(), ""]
+        files.write(target / README, "\n".join(lines))
 
     write_staged(into, tuple(USES), write)
     files_written = f"{URDF} ({len(opened.closing)} loops open, closed by {CLOSURES}), {MJCF} (loops closed)"
-    message = f"{files_written}; Pinocchio reads the same loops and forces to 1e-9"
-    return (*([remark] if remark else []), message, *source.notes)
+    sentences = [f"{files_written}; Pinocchio reads the same loops and forces to 1e-9", *source.notes]
+    if remark:
+        sentences.insert(0, remark)
+    return tuple(sentences)
 
 
 def check_export_target(out: Path, inputs: Iterable[str | Path | None] = ()) -> None:
@@ -451,17 +532,26 @@ def _uses() -> Iterator[str]:
 
 
 def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> None:
-    """Raise RobotError if Pinocchio computes open loops or other forces on the platform on random motion."""
+    """Raise RobotError if a file, read by Pinocchio, has open loops or other forces on the platform.
+
+    Args:
+        opened: the robot.
+        text: content of the file.
+        where: name of the file; ``.xml`` for MJCF, else URDF.
+        postures: number of random states that are compared.
+    """
     mechanism = opened.mechanism
     rng = np.random.default_rng(0)
     r = opened.mechanism.robot.r
     mjcf = where.endswith(".xml")
-    coordinates = rng.uniform(mechanism.robot.lower, mechanism.robot.upper, (postures, r))
+    robot = mechanism.robot
+    coordinates = rng.uniform(robot.lower, robot.upper, (postures, r))
     posture = mechanism.place(0.9 * coordinates)
     rate, change = rng.uniform(-1.0, 1.0, (2, postures, r))
     motion = of_platform(mechanism, posture, rate, change)
     inertial = opened.values[: opened.model.inertial]
-    rigid = np.concatenate([inertial, np.zeros(len(opened.model.terms))])
+    no_friction = np.zeros(len(opened.model.terms))
+    rigid = np.concatenate([inertial, no_friction])
     expected = opened.model.platform_force(rigid, motion, ())
     if mjcf:
         motor_torques = opened.drives.values[:, 0] * motion.a
@@ -477,27 +567,36 @@ def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> Non
         for model in parts:
             forces[m] += _forces(opened, model, motion, m, frames)
         for leg in opened.closing:
-            end_name = f"{leg.name}_end_tip" if mjcf else f"{leg.name}_end"
-            gap = invert(frames[end_name]) @ frames[f"{leg.name}_attachment"] - np.eye(4)
-            # A leg that ends in a point holds the position alone.
+            end_name = f"{leg.name}_end"
+            if mjcf:
+                end_name += "_tip"
+            end = frames[end_name]
+            attachment = frames[f"{leg.name}_attachment"]
+            gap = invert(end) @ attachment - np.eye(4)
+            # A spherical end constrains the position only.
             if leg.end != "rigid":
                 gap = gap[:, 3]
-            gap_size = max(gap_size, float(np.abs(gap).max()))
+            largest_gap = float(np.abs(gap).max())
+            gap_size = max(gap_size, largest_gap)
     if gap_size > MAX_DIFFERENCE:
         raise RobotError(
-            f"{where}: loops stay {gap_size:.2g} m (or rad) open when Pinocchio reads it; nothing was written"
+            f"{where}: loops stay {gap_size:.2g} m (or rad) open when Pinocchio reads it; nothing was written: "
+            "report this as a bug"
         )
     largest = max(1.0, float(np.abs(expected).max()))
-    off = float(np.abs(forces - expected).max()) / largest
-    if off > MAX_DIFFERENCE:
-        raise RobotError(f"{where}: forces differ by {off:.2g} of the largest when Pinocchio reads it; nothing written")
+    difference = float(np.abs(forces - expected).max()) / largest
+    if difference > MAX_DIFFERENCE:
+        raise RobotError(
+            f"{where}: forces differ by {difference:.2g} of the largest when Pinocchio reads it; nothing was written: "
+            "report this as a bug"
+        )
 
 
 def _models(text: str) -> list[NativeModel]:
-    """Return Pinocchio's models of each leg and of a floating platform of an MJCF text: Pinocchio reads one tree at a
-    time.
+    """Return Pinocchio's models of an MJCF text, one per leg and one of a floating platform.
 
-    The keyframe is left out, since Pinocchio requires cosine and sine for joints without limits.
+    Pinocchio reads a single tree per text. The keyframe is omitted: for joints without limits, Pinocchio requires
+    cosine and sine in place of the angle.
     """
     root = ET.fromstring(text)
     world = root.find("worldbody")
@@ -514,7 +613,15 @@ def _models(text: str) -> list[NativeModel]:
 def _forces(
     opened: OpenedRobot, model: NativeModel, motion: LoopMotion, m: int, frames: dict[str, np.ndarray]
 ) -> np.ndarray:
-    """Return the forces (r,) on the platform's coordinates in sample m by a Pinocchio model; adds to `frames`."""
+    """Return the forces (r,) on the platform's coordinates by a Pinocchio model of a part of the robot.
+
+    Args:
+        opened: the robot.
+        model: Pinocchio's model.
+        motion: motion of all joints and the platform.
+        m: number of the sample.
+        frames: (4, 4) frames in the base by name, to which the model's frames are added.
+    """
     pin = import_module("pinocchio")
     data = model.createData()
     mechanism = opened.mechanism
@@ -527,29 +634,33 @@ def _forces(
         if model.existJointName(drive.name):
             joint = model.joints[model.getJointId(drive.name)]
             value = motion.posture.q[m, j]
+            first = joint.idx_q
             if joint.nq == 1:
-                q[joint.idx_q : joint.idx_q + joint.nq] = [value]
+                q[first] = value
             else:
-                q[joint.idx_q : joint.idx_q + joint.nq] = [np.cos(value), np.sin(value)]
+                q[first] = np.cos(value)
+                q[first + 1] = np.sin(value)
             v[joint.idx_v] = motion.v[m, j]
             a[joint.idx_v] = motion.a[m, j]
             J[joint.idx_v] = motion.jacobians.joints[m, j]
     for k, joint in enumerate(model.joints):
         if joint.nv == 6:
             pose = motion.posture.pose[m]
-            drive = slice(joint.idx_v, joint.idx_v + 6)
+            first = joint.idx_q
+            rows = slice(joint.idx_v, joint.idx_v + 6)
             turn = np.kron(np.eye(2), pose[:3, :3].T)
+            placement = np.eye(4)
             if "platform_floating" in model.names:
-                placed = model.jointPlacements[k].homogeneous
-            else:
-                placed = np.eye(4)
-            q[joint.idx_q : joint.idx_q + 7] = pin.SE3ToXYZQUAT(pin.SE3(invert(placed) @ pose))
-            v[drive] = turn @ motion.twist[m]
-            a[drive] = turn @ motion.change[m]
-            J[drive] = turn @ motion.jacobians.platform[m]
-            # Pinocchio's accelerations are spatial
-            linear, angular = np.split(v[drive], 2)
-            a[drive] -= [*np.cross(angular, linear), 0.0, 0.0, 0.0]
+                placement = model.jointPlacements[k].homogeneous
+            relative = pin.SE3(invert(placement) @ pose)
+            q[first : first + 7] = pin.SE3ToXYZQUAT(relative)
+            v[rows] = turn @ motion.twist[m]
+            a[rows] = turn @ motion.change[m]
+            J[rows] = turn @ motion.jacobians.platform[m]
+            # Pinocchio's accelerations are spatial ones.
+            linear, angular = np.split(v[rows], 2)
+            convective = np.cross(angular, linear)
+            a[rows] -= [*convective, 0.0, 0.0, 0.0]
     pin.framesForwardKinematics(model, data, q)
     for k, frame in enumerate(model.frames):
         frames[frame.name] = data.oMf[k].homogeneous.copy()

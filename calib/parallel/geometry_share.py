@@ -1,13 +1,13 @@
 """Share of the geometry's uncertainty in the identified dynamics of a parallel robot.
 
 The estimator and its implicit derivative are those of serial arms
-(`calib.identification.uncertainty.geometry_uncertainty`). What
-differs: a changed geometry moves every joint of the loops at the same encoder readings, and the torques' projection on
-the platform's coordinates,
+(`calib.identification.uncertainty.geometry_uncertainty`). For a parallel robot a change of the geometry g also changes
+all joint values of the loops at given encoder readings, and the projection of the torques on the platform's
+coordinates,
 
-    y - W φ = J_p^invᵀ(g) τ - W(q̂(g), …; g) φ,
+    y - W φ = J_p^invᵀ(g) τ - W(q̂(g), …; g) φ.
 
-so that closure, Jacobians and regressor are solved again on changed geometries, by central differences.
+Closure, Jacobians and regressor are therefore computed again for changed geometries, in central differences.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from calib.parallel.mechanism.parallel_model import PLATFORM, ParallelModel
 from calib.parallel.mechanism.parallel_robot import ParallelRobot
 from calib.records import frozen
 
-# of the central differences [m or rad]
+# Step of the central differences [m or rad].
 STEP = 1e-5
-# at the full rate; longer recordings are represented by pieces spread over them (our choice)
+# Largest number of samples of a recording at its full rate; of longer recordings evenly spread pieces (our choice).
 SAMPLES = 6000
 
 
@@ -42,12 +42,14 @@ def propagate(
     torques: Callable[[Case], np.ndarray],
     progress: Callable[[str], None] | None = None,
 ) -> GeometryUncertainty:
-    """Return the covariance of identified parameters with the share of the geometry's covariance.
+    """Return how the geometry's covariance adds to the covariance of identified parameters.
 
     Args:
         identification: identification with a parallel robot's model.
         covariance: covariance of the geometry on which the identification is based.
-        cases: training data; torques: returns the actuators' torques (N, n) of a case [N m or N].
+        cases: training data.
+        torques: function that returns the actuators' torques (N, n) of a case [N m or N].
+        progress: function called with a line of text; None: none.
 
     Raises:
         RobotError: for a covariance of another robot.
@@ -56,21 +58,26 @@ def propagate(
     parameters = covariance.of(mechanism)
     differences = _Differences.of(identification, parameters, torques)
     matrix, felt, residual = solve_sensitivity(identification, cases, differences, SAMPLES, progress)
-    slopes = matrix[:, : len(parameters)]
-    deviations = np.sqrt(np.clip(np.diag(covariance.matrix), 0.0, None))
-    names = tuple(parameter.name for parameter in parameters)
-    units = tuple(parameter.unit for parameter in parameters)
+    count = len(parameters)
+    slopes = matrix[:, :count]
+    share = slopes @ covariance.matrix @ slopes.T
+    variances = np.clip(np.diag(covariance.matrix), 0.0, None)
+    deviations = np.sqrt(variances)
+    names = [parameter.name for parameter in parameters]
+    units = [parameter.unit for parameter in parameters]
+    tilt_units = ["rad"] * len(TILTS)
     # The directions of gravity have no stated uncertainty, nor have constants that were not fitted.
-    sigma = np.full(len(parameters) + len(TILTS), np.nan)
-    sigma[: len(parameters)] = np.where(deviations > 0.0, deviations, np.nan)
+    sigma = np.full(count + len(TILTS), np.nan)
+    sigma[:count] = np.where(deviations > 0.0, deviations, np.nan)
+    estimate = identification.fitted.estimate
     return GeometryUncertainty(
         identification.names,
         (*names, *TILTS),
-        (*units, *["rad"] * len(TILTS)),
+        (*units, *tilt_units),
         matrix,
-        identification.fitted.estimate.covariance,
+        estimate.covariance,
         sigma,
-        frozen(slopes @ covariance.matrix @ slopes.T),
+        frozen(share),
         felt,
         residual,
     )
@@ -82,9 +89,9 @@ class _Differences:
 
     Attributes:
         identification: identification with a parallel robot's model.
-        pairs: per direction, the models on geometries displaced by +`STEP` and -`STEP`.
+        pairs: for each direction of change, the models of geometries displaced by +`STEP` and -`STEP`.
         by_direction: (directions, K + 2) components of each constant and each tilt along the directions.
-        torques: returns the actuators' torques (N, n) of a case.
+        torques: function that returns the actuators' torques (N, n) of a case.
     """
 
     identification: Identification[ParallelModel]
@@ -99,7 +106,7 @@ class _Differences:
         parameters: Sequence[LoopParameter],
         torques: Callable[[Case], np.ndarray],
     ) -> _Differences:
-        """Return the derivatives by constants of the loops of an identification's robot."""
+        """Return the derivatives by `parameters`, constants of the loops of the identification's robot."""
         model = identification.dynamics.model
         directions = visible_directions(model.mechanism, parameters)
 
@@ -113,22 +120,30 @@ class _Differences:
             back = changed(robot, parameters, -step)
             pairs.append((on(forth), on(back)))
         axes = STEP * np.eye(3)[: len(TILTS)]
-        pairs += [(on(robot.tilted(axis)), on(robot.tilted(-axis))) for axis in axes]
-        by_direction = scipy.linalg.block_diag(directions.T, np.eye(len(TILTS)))
+        for axis in axes:
+            forth = robot.tilted(axis)
+            back = robot.tilted(-axis)
+            pairs.append((on(forth), on(back)))
+        by_tilt = np.eye(len(TILTS))
+        by_direction = scipy.linalg.block_diag(directions.T, by_tilt)
         return cls(identification, pairs, np.array(by_direction), torques)
 
     def __call__(
         self, case: Case, span: slice, weighed: np.ndarray, decimator: Decimator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return ∂(W φ - y)/∂g (M, rows, K + 2) and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K + 2) of a case's samples `span`.
+        """Return ∂(W φ - y)/∂g (M, rows, K + 2) and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K + 2) of a part of a case.
 
         Args:
-            weighed: (M, rows) R⁻¹ (y - W φ) of the rows that result from the samples.
+            case: the case.
+            span: the samples of the part.
+            weighed: (M, rows) R⁻¹ (y - W φ) of the M samples that remain after decimation.
+            decimator: filter and rate of the decimation.
         """
+        model = self.identification.dynamics.model
         columns = self.identification.base.kept
         values = self.identification.fitted.estimate.values
-        rows = self.identification.dynamics.model.rows
-        posture = self.identification.dynamics.model.mechanism.locate(case.motion.q[span])
+        rows = model.rows
+        posture = model.mechanism.locate(case.motion.q[span])
         if weighed.shape[1] != rows:
             weighed = weighed.sum(axis=1)[:, None]
         felt = spread(weighed, decimator, len(posture))
@@ -141,26 +156,43 @@ class _Differences:
             W, target = self._observed(back, case, span, posture)
             residual_back = W @ values - target
             pull_back = np.einsum("nrp,nr->p", W, felt)
-            change[:, :, k] = (residual_forth - residual_back) / (2.0 * STEP)
-            pulled[:, k] = (pull_forth - pull_back) / (2.0 * STEP)
-        return decimate(change, decimator) @ self.by_direction, pulled @ self.by_direction
+            residual_change = residual_forth - residual_back
+            pull_change = pull_forth - pull_back
+            change[:, :, k] = residual_change / (2.0 * STEP)
+            pulled[:, k] = pull_change / (2.0 * STEP)
+        decimated = decimate(change, decimator)
+        return decimated @ self.by_direction, pulled @ self.by_direction
 
     def _observed(
         self, model: ParallelModel, case: Case, span: slice, posture: Posture
     ) -> tuple[np.ndarray, np.ndarray | float]:
-        """Return W (N, rows, b), and the target (N, rows) where it depends on the geometry, else zero."""
+        """Return W (N, rows, b) and the target (N, rows) of a part of a case by a model.
+
+        The target is 0 for rows whose target does not depend on the geometry.
+        """
         columns = self.identification.base.kept
+        recorded = case.motion
         if model.torque_rows.name == POWER.name:
-            segment = next(slice(a, b) for a, b in segments(case.motion.segment) if a <= span.start < b)
-            no_payloads = np.zeros((0, len(case.motion)))
+            segment = _segment_of(case, span)
+            no_payloads = np.zeros((0, len(recorded)))
             block = power_block(model, columns, case, span, no_payloads, segment)
             return block.T[:, None], 0.0
-        q = np.asarray(case.motion.q[span])
-        v = np.asarray(case.motion.v[span])
-        a = np.asarray(case.motion.a[span])
+        q = np.asarray(recorded.q[span])
+        v = np.asarray(recorded.v[span])
+        a = np.asarray(recorded.a[span])
         motion = model.moved(q, v, a, posture)
         regressor = model.platform_regressor(motion, case.carried)
         W = model.on_rows(regressor, motion)[:, :, columns]
         if model.torque_rows.name != PLATFORM:
             return W, 0.0
-        return W, np.einsum("nar,na->nr", motion.jacobians.readings, self.torques(case)[span])
+        torques = self.torques(case)[span]
+        forces = np.einsum("nar,na->nr", motion.jacobians.readings, torques)
+        return W, forces
+
+
+def _segment_of(case: Case, span: slice) -> slice:
+    """Return the samples of the case's uninterrupted segment that contains the first sample of `span`."""
+    for start, stop in segments(case.motion.segment):
+        if start <= span.start < stop:
+            return slice(start, stop)
+    raise AssertionError("a span lies in a segment")

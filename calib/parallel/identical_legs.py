@@ -1,10 +1,11 @@
-"""Test of identical legs: whether the recordings contradict a common set of inertial parameters for all legs.
+"""Test of identical legs: whether the recordings contradict common inertial parameters of all legs.
 
-The model with one set is nested in that with a set for each leg, so that by Fisher's test
+The model with common parameters (b) is nested in the model with separate parameters of each leg (b_1), so that
 
-    F = [(RSS - RSS_1) / (b_1 - b)] / [RSS_1 / (N - b_1)],
+    F = [(RSS - RSS_1) / (b_1 - b)] / [RSS_1 / (N - b_1)]
 
-RSS_1 and b_1 being those of the model with more parameters; rows have equal weights, N counts independent rows.
+has Fisher's distribution if the legs are identical. RSS and RSS_1 are the sums of squared residuals of the two models,
+with equal weights of all rows; N is the number of independent rows.
 """
 
 from collections.abc import Sequence
@@ -23,38 +24,62 @@ from calib.parallel.mechanism.parallel_model import ParallelModel
 def legs_differ(
     identification: Identification[ParallelModel], cases: Sequence[Case], level: float = 0.001
 ) -> list[Finding]:
-    """Return the finding that legs are not identical, with the parameters that differ most; empty if they may be
-    identical.
+    """Return the finding that legs are not identical, with the parameters that differ most.
 
     Args:
-        identification: identification with identical legs; cases: its training data.
-        level: probability of a finding on legs that are identical (our choice).
+        identification: identification of a model with identical legs.
+        cases: its training data.
+        level: probability of a wrong finding on identical legs (our choice).
+
+    Returns:
+        One finding; an empty list if the recordings do not contradict identical legs.
     """
     model = identification.dynamics.model
+    settings = identification.settings
     fitted = identification.fitted
-    base = find_base(model.single, cases, bases.random_samples(model.single, seed=identification.settings.seed))
-    decimator = common_decimator(cases, identification.settings)
-    rows = [observe(model.single, base.kept, case, decimator) for case in cases]
-    # power rows, weighed by recording
-    if len(fitted.std) != model.rows:
-        rows = [part.by_recording(k, len(cases)) for k, part in enumerate(rows)]
-    data = pool(triangulate(rows), len(fitted.std))
-    shared_fit = wls(fitted.pooled, fitted.std, fitted.inflation).estimate
-    single_fit = wls(data, fitted.std, fitted.inflation).estimate
-    shared_rss = np.sum(fitted.pooled.residual_squares(shared_fit.values) / fitted.std**2 / fitted.inflation)
-    single_rss = np.sum(data.residual_squares(single_fit.values) / fitted.std**2 / fitted.inflation)
-    added = data.parameters - fitted.pooled.parameters
+    std = fitted.std
+    inflation = fitted.inflation
+
+    # rows of the model with separate parameters of each leg
+    single = model.single
+    samples = bases.random_samples(single, seed=settings.seed)
+    base = find_base(single, cases, samples)
+    decimator = common_decimator(cases, settings)
+    rows = []
+    for k, case in enumerate(cases):
+        case_rows = observe(single, base.kept, case, decimator)
+        # power rows have a weight per recording
+        if len(std) != model.rows:
+            case_rows = case_rows.by_recording(k, len(cases))
+        rows.append(case_rows)
+    data = pool(triangulate(rows), len(std))
+
+    # Fisher's test
+    common = fitted.pooled
+    common_fit = wls(common, std, inflation).estimate
+    single_fit = wls(data, std, inflation).estimate
+    common_squares = common.residual_squares(common_fit.values)
+    single_squares = data.residual_squares(single_fit.values)
+    common_rss = np.sum(common_squares / std**2 / inflation)
+    single_rss = np.sum(single_squares / std**2 / inflation)
+    added = data.parameters - common.parameters
     dof = single_fit.dof
-    f = (shared_rss - single_rss) / max(added, 1) / (single_rss / dof)
+    f = (common_rss - single_rss) / max(added, 1) / (single_rss / dof)
     p = 1.0
     if added:
         p = float(fdtrc(added, dof, max(f, 0.0)))
     if p >= level:
         return []
-    standard = identification.base.to_standard(shared_fit.values[: identification.base.b])
-    alike = base.transform @ model.spread(standard)
-    shared = np.bincount(model.owners)[model.owners[base.kept]] > 1
-    away = np.where(shared, np.abs(single_fit.values - alike) / single_fit.sigma, 0.0)
-    order = np.argsort(-away)[: shared.sum()]
-    names = [f"{base.names[k]} ({away[k]:.2g} σ)" for k in order]
+
+    # differences of the legs' parameters from the common ones, in sigmas
+    common_values = common_fit.values[: identification.base.b]
+    standard = identification.base.to_standard(common_values)
+    identical_values = base.transform @ model.spread(standard)
+    legs_of_parameter = np.bincount(model.owners)
+    owners = model.owners[base.kept]
+    is_common = legs_of_parameter[owners] > 1
+    difference = np.abs(single_fit.values - identical_values)
+    sigmas = np.where(is_common, difference / single_fit.sigma, 0.0)
+    order = np.argsort(-sigmas)[: is_common.sum()]
+    names = [f"{base.names[k]} ({sigmas[k]:.2g} σ)" for k in order]
     return [finding("legs-differ", p=p, names=names)]

@@ -44,11 +44,11 @@ from calib.procedure.findings import Verdict, lines_of, settle
 from calib.records import field_values
 from calib.workers.threads import one_blas_thread
 
-# settings
+# Names of settings that apply to serial arms only.
 OF_ARMS = {"couplings", "terms", "gravity", "payload_values"}
-# methods that simulate any robot
+# Methods whose simulation is available for parallel robots.
 SIMULATED = ("iv", "didim", "pc-iv", "pc-didim", "cloe", "clie")
-# of a recording, at which redundant encoders are compared
+# Number of samples of a recording at which redundant encoders are compared.
 MAX_SAMPLES = 200
 
 Recorded = str | Path | Recording
@@ -59,10 +59,13 @@ class ParallelDynamics(DynamicsModel):
 
     @one_blas_thread()
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the torques of all rows (N, rows) for a motion q, v, a (N, n) of the actuated joints, without payload.
+        """Return the torques (N, rows) that the model predicts without payload.
 
-        As the model was identified: torques of the actuators [N m or N], for redundant ones the forces on the
-        platform's coordinates, or their power [W].
+        The rows are those of the identification: torques of the actuators [N m or N], forces on the platform's
+        coordinates [N or N m] (always for redundant actuators), or the actuators' power [W].
+
+        Args:
+            q, v, a: (N, n) positions, velocities and accelerations of the actuated joints.
         """
         dynamics: Any = self.found.dynamics
         q = np.asarray(q, dtype=float)
@@ -87,11 +90,17 @@ def identify_parallel(
     """Return the identified dynamics of a parallel robot from recordings of its actuated joints, with a verdict.
 
     Args:
-        recordings, validate: files (optionally with a cut in time), or recordings in memory.
+        robot: the robot.
+        recordings: recordings to fit: files (optionally with a cut in time), or recordings in memory.
+        validate: recordings to judge by, in the same form.
         options: filters, payloads, drives, method; ``rows``: motor (on the platform's coordinates where actuators are
             redundant) or power; ``passive``: friction of the passive joints.
-        method, friction: replace those of the options; None to use these.
-        designed: motions of `calib excite`, the reference of recordings that have none, for options with a [loop].
+        method, friction: replace those of the options; None: the options' method and friction.
+        seed: seed of random samples and folds.
+        designed: motions of `calib excite` that serve as references of recordings without reference, for options with a
+            [loop].
+        on_read: function called with the inputs once they are read; None: none.
+        progress: function called with a line of text; None: none.
 
     Raises:
         UsageError: for options that apply to serial arms only.
@@ -100,7 +109,9 @@ def identify_parallel(
     options = options or IdentifyOptions()
     mechanism = robot.mechanism
     row_kind = options.settings.torque_rows.name
-    rows = rows_named(mechanism, "" if row_kind == "motor" else row_kind)
+    if row_kind == "motor":
+        row_kind = ""
+    rows = rows_named(mechanism, row_kind)
     settings = replace(options.settings, torque_rows=rows, seed=seed)
     if method is not None:
         settings = replace(settings, method=method)
@@ -118,14 +129,15 @@ def identify_parallel(
         noticed += legs_differ(identification, inputs.cases)
     if mechanism.robot.redundant:
         noticed.append(finding("torques-projected", actuators=mechanism.robot.n, freedoms=mechanism.robot.r))
-        preloads = [_preload(mechanism, inputs, case) for case in inputs.cases]
         means = []
-        for preload in preloads:
+        for case in inputs.cases:
+            preload = _preload(mechanism, inputs, case)
             noticed += preload
             means.append([item.values["mean"] for item in preload])
         mean = np.mean(means, axis=0)
         preloaded = replace(model, preload=tuple(mean.tolist()))
-        identification = replace(identification, dynamics=replace(identification.dynamics, model=preloaded))
+        dynamics = replace(identification.dynamics, model=preloaded)
+        identification = replace(identification, dynamics=dynamics)
     noticed = (*parameter_findings(identification), *identification.loop.findings, *settle(noticed))
     findings = ModelFindings(resting_parameters(identification), noticed=noticed)
     assessment = assess(inputs, identification, findings)
@@ -133,7 +145,8 @@ def identify_parallel(
     if robot.covariance is not None:
         if progress is not None:
             progress("the geometry's share of the covariance")
-        carried = propagate(identification, robot.covariance, inputs.cases, partial(actuator_torques, inputs), progress)
+        torques = partial(actuator_torques, inputs)
+        carried = propagate(identification, robot.covariance, inputs.cases, torques, progress)
     return ParallelDynamics(
         **field_values(assessment),
         inputs=inputs,
@@ -159,16 +172,27 @@ def model_of(mechanism: ClosedRobot, settings: IdentificationSettings) -> Parall
 
 
 def actuator_torques(inputs: IdentificationInputs, case: Case) -> np.ndarray:
-    """Return the torques (N, n) of the actuators in a recording [N m or N; A where no gain is known]."""
-    gains = inputs.currents.for_motion(case.motion, inputs.options.file_settings(case.motion.file))
-    return np.asarray(case.motion.effort if gains is None else case.motion.effort * gains)
+    """Return the torques (N, n) of the actuators in a recording [N m or N; A without known gains]."""
+    motion = case.motion
+    file_settings = inputs.options.file_settings(motion.file)
+    gains = inputs.currents.for_motion(motion, file_settings)
+    if gains is None:
+        return np.asarray(motion.effort)
+    return np.asarray(motion.effort * gains)
 
 
 def _preload(mechanism: ClosedRobot, inputs: IdentificationInputs, case: Case) -> list[Finding]:
-    """Return findings on the overconstraint of redundant actuators in a recording: mean with sigma, and spread."""
-    jacobians = loop_jacobians(mechanism, mechanism.locate(case.motion.q))
-    forces = overconstraint(mechanism, jacobians, actuator_torques(inputs, case))
-    forces = case.motion.in_band(forces)[:: case.motion.decimator.factor]
+    """Return findings on the overconstraint of redundant actuators in a recording.
+
+    The overconstraint is the part of the torques that does no work. A finding per component states its mean with σ, and
+    its standard deviation over the recording.
+    """
+    motion = case.motion
+    posture = mechanism.locate(motion.q)
+    jacobians = loop_jacobians(mechanism, posture)
+    torques = actuator_torques(inputs, case)
+    forces = overconstraint(mechanism, jacobians, torques)
+    forces = motion.in_band(forces)[:: motion.decimator.factor]
     unit = "N m"
     if mechanism.robot.joints[0].kind == "prismatic":
         unit = "N"
@@ -176,10 +200,11 @@ def _preload(mechanism: ClosedRobot, inputs: IdentificationInputs, case: Case) -
     for number, force in enumerate(forces.T, 1):
         mean = force.mean()
         spread = force.std()
-        # Neighbouring samples are alike: of the mean, the number of independent ones counts.
-        sigma = spread * np.sqrt(inflation(force) / len(force))
-        values = {"mean": mean, "spread": spread, "unit": unit, "sigma": sigma}
-        findings.append(finding("preload", file=case.name, number=number, **values))
+        # Samples are correlated: σ of the mean follows from the number of independent samples.
+        variance_ratio = inflation(force) / len(force)
+        sigma = spread * np.sqrt(variance_ratio)
+        preload = finding("preload", file=case.name, number=number, mean=mean, spread=spread, unit=unit, sigma=sigma)
+        findings.append(preload)
     return findings
 
 
@@ -203,23 +228,31 @@ def assess(
 def _judged(
     model: ParallelModel, identification: Identification[RegressorModel], cases: Sequence[Case], errors: RecordingErrors
 ) -> tuple[Verdict, list[Finding]]:
-    drives = friction_drives(_driven_joints(model, identification, cases), "a payload that the options do not name")
+    """Return the verdict on an identification, and the findings on which it is based."""
+    driven = _driven_joints(model, identification, cases)
+    drives = friction_drives(driven, "a payload that the options do not name")
     if drives:
         return Verdict.of("", drives), drives
     labels = identification.settings.torque_rows.titles(model.mechanism.robot.joint_names)
-    kind = "platform" if model.torque_rows.name == PLATFORM else "joint"
+    kind = "joint"
+    if model.torque_rows.name == PLATFORM:
+        kind = "platform"
     figures, rules = judge(errors.fit, errors.proofs, errors.repeated, errors.excitation, labels, kind)
-    verdict = with_prior(Verdict.of(figures, rules), resting_parameters(identification))
+    resting = resting_parameters(identification)
+    verdict = with_prior(Verdict.of(figures, rules), resting)
     return with_duration(verdict, errors.excitation), rules
 
 
 def _driven_joints(
     model: ParallelModel, identification: Identification[RegressorModel], cases: Sequence[Case]
 ) -> tuple[str, ...]:
-    """Return the names of joints whose identified friction would drive the motion: a wrong sign of power."""
-    joints = [joint.name for leg in model.mechanism.robot.legs for joint in leg.chain.joints]
+    """Return the names of joints whose identified friction would feed energy into the motion."""
+    joints: list[str] = []
+    for leg in model.mechanism.robot.legs:
+        joints += leg.chain.joint_names
+    inertial = [False] * model.inertial
     dissipative = [column.form.dissipative for column in model.columns]
-    friction = np.array([False] * model.inertial + dissipative)
+    friction = np.array(inertial + dissipative)
     values = np.where(friction, identification.dynamics.values, 0.0)
     energy = np.zeros(len(joints))
     total = 0.0
@@ -228,27 +261,35 @@ def _driven_joints(
         v = case.motion.v[::step]
         motion = model.moved(case.motion.q[::step], v, case.motion.a[::step])
         target = case.target[::step]
-        # Speeds that the target's forces act along; of power rows the target is the power.
-        speeds: np.ndarray | float = 1.0
+        # power of the target's forces; the target of power rows is a power
+        power = target
         if case.torque_rows.name == PLATFORM:
-            speeds = motion.rate
+            power = target * motion.rate
         elif target.shape[1] == model.n:
-            speeds = v
-        total += np.abs((target * speeds).sum(axis=1)).sum()
-        energy += (model.tree_torque(values, motion) * motion.v).sum(axis=0)
-    return tuple(name for name, joint_energy in zip(joints, energy) if joint_energy < MIN_ENERGY_SHARE * total)
+            power = target * v
+        total += np.abs(power.sum(axis=1)).sum()
+        friction_torque = model.tree_torque(values, motion)
+        energy += (friction_torque * motion.v).sum(axis=0)
+    min_energy = MIN_ENERGY_SHARE * total
+    return tuple(name for name, joint_energy in zip(joints, energy) if joint_energy < min_energy)
 
 
 def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOptions) -> None:
     """Raise UsageError for settings and options that apply to serial arms only."""
-    read = {field.name for field in fields(settings)} - OF_ARMS
+    names = {field.name for field in fields(settings)}
+    read = names - OF_ARMS
     refuse_unread(settings, IdentificationSettings(), read, options.source)
     if settings.friction not in ("auto", "standard"):
-        raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
+        raise UsageError(
+            f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off): remove the key"
+        )
     method = method_named(settings.method)
     if _of_arms(method):
-        activity = "simulates" if method.needs_simulation else "differentiates the torques of"
-        accepted = ", ".join(name for name, candidate in METHODS.items() if not _of_arms(candidate))
+        activity = "differentiates the torques of"
+        if method.needs_simulation:
+            activity = "simulates"
+        available = [name for name, candidate in METHODS.items() if not _of_arms(candidate)]
+        accepted = ", ".join(available)
         raise UsageError(f"method '{method.name}' {activity} a serial arm; parallel robots take {accepted}")
 
 
@@ -258,17 +299,22 @@ def _of_arms(method: Method) -> bool:
 
 
 def _encoders(mechanism: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
-    """Yield findings on contradictory redundant encoders, and on columns of passive joints (not used)."""
+    """Yield findings on contradictory redundant encoders, and on columns of passive joints, which are not used."""
     robot = mechanism.robot
-    passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
+    passive: list[str] = []
+    for leg in robot.legs:
+        passive += [name for name in leg.chain.joint_names if name not in robot.joint_names]
     for case in cases:
-        q = case.motion.q[:: max(1, len(case.motion) // MAX_SAMPLES)]
+        step = max(1, len(case.motion) // MAX_SAMPLES)
+        q = case.motion.q[::step]
         difference = 0.0
         if robot.redundant:
             closed_q = mechanism.locate(q).q[:, robot.actuated]
-            difference = float(np.sqrt(np.mean((q - closed_q) ** 2)))
+            mean_square = np.mean((q - closed_q) ** 2)
+            difference = float(np.sqrt(mean_square))
         yield finding("encoders-contradict", file=case.name, count=robot.n, rms=difference)
-        unread = " ".join(note for note in case.motion.notes if note.startswith("not read: "))
+        unread_notes = [note for note in case.motion.notes if note.startswith("not read: ")]
+        unread = " ".join(unread_notes)
         unread_names = [name for name in passive if name in unread]
         if unread_names:
             yield finding("passive-joints-unread", file=case.name, joints=unread_names)
@@ -278,5 +324,7 @@ def _payloads(model: ParallelModel, cases: Sequence[Case]) -> Iterator[Finding]:
     """Yield findings on payloads that are attached in all recordings, or in none."""
     for label in model.payloads:
         count = sum(label in case.carried for case in cases)
-        if count in (0, len(cases)):
-            yield finding("payload-always" if count else "payload-never", label=label)
+        if count == 0:
+            yield finding("payload-never", label=label)
+        elif count == len(cases):
+            yield finding("payload-always", label=label)

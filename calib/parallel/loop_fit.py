@@ -53,12 +53,13 @@ if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
-# of the settings
+# Names of the settings that apply to parallel robots.
 READ = ("holdout", "tolerance", "seed")
 FIGURES = "plot_*.png"
+# Files of a fit's folder.
 FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE, calibrated.COVARIANCE, RESIDUALS, REPORT, *PAGES, FIGURES)
 HEADER = ("name", "unit", "value", "sigma")
-# of a cross-validation, where no rows are unseen (our choice)
+# Number of folds of the cross-validation that replaces missing held-out rows (our choice).
 FOLDS = 4
 
 
@@ -69,12 +70,12 @@ class ParallelFit(ChartedResult, ReportedResult):
     Attributes:
         nominal: the robot before calibration.
         files: files that were read.
-        rows: (m, n) encoder readings that were fitted, or (m, n + r) with the platform's coordinates behind them.
+        rows: (m, n) fitted encoder readings, or (m, n + r) readings followed by the platform's measured coordinates.
         fit: the calibration.
-        errors: on the fitted rows, nominal and calibrated (2, m, k): errors of the platform coordinates or, of readings
-            alone, contradictions between the encoders.
-        unseen: such errors on held-out rows, by name of the set of rows.
-        unseen_rows: held-out rows by name, except those of a cross-validation.
+        errors: (2, m, k) errors of the nominal and of the calibrated robot on the fitted rows: errors of the platform's
+            coordinates or, without measured coordinates, contradictions between the encoders.
+        unseen: errors of the same kind on held-out rows, by name of the set of rows.
+        unseen_rows: held-out rows by name of the set; a cross-validation has none.
         settings: settings of the fit.
     """
 
@@ -101,7 +102,7 @@ class ParallelFit(ChartedResult, ReportedResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Pass, marginal or fail, with the reason (rules: see the module; limits: catalogue of findings)."""
+        """Pass, marginal or fail, with the reason; the module's docstring states the rules."""
         kinds = {"contradictions": (np.ones(self.errors.shape[2], dtype=bool), "mrad (or mm)")}
         figures = []
         rules = [finding("readings-alone")]
@@ -120,8 +121,9 @@ class ParallelFit(ChartedResult, ReportedResult):
             if tolerance is not None and kind == "position":
                 rules.append(finding("above-tolerance", tolerance=tolerance, times=after / tolerance))
                 figures[-1] += f", tolerance {1e3 * tolerance:g} mm"
+            fitted = _rms(self.errors[1][:, columns])
             share = after / max(before, 1e-300)
-            times = after / max(_rms(self.errors[1][:, columns]), 1e-300)
+            times = after / max(fitted, 1e-300)
             rules.append(finding("worse-than-nominal", times=share))
             rules.append(finding("no-transfer", times=times, remedy=""))
             rules.append(finding("small-gain", left=share))
@@ -236,17 +238,20 @@ class ParallelFit(ChartedResult, ReportedResult):
 
         fit = self.fit
         verdict = self.verdict
-        identified = len(fit.parameters) - len(fit.vague)
+        count = len(fit.parameters)
+        identified = count - len(fit.vague)
         lines = [
-            f"{self.nominal.chain.name}: {identified} of {len(fit.parameters)} constants of the loops identified; "
-            f"encoders off by {fit.before:.3g}, calibrated by {fit.after:.3g} (rms, rad or m)"
+            f"{self.nominal.chain.name}: {identified} of {count} constants of the loops identified; "
+            f"encoder residuals {fit.before:.3g} nominal, {fit.after:.3g} calibrated (rms, rad or m)"
         ]
         for where, errors in self.judged.items():
             rms = 1e3 * np.sqrt(np.mean(errors**2, axis=1))
             for name, (before, after) in zip(self.columns, rms.T):
                 unit = "mrad (or mm)"
-                if name in COORDINATES:
-                    unit = "mm" if name in COORDINATES[:3] else "mrad"
+                if name in COORDINATES[:3]:
+                    unit = "mm"
+                elif name in COORDINATES:
+                    unit = "mrad"
                 lines.append(f"  {name} on {where} rows: {before:.3g} -> {after:.3g} {unit} rms")
         return Section("", (Text("", lines),), verdict.level, verdict.reason)
 
@@ -254,7 +259,7 @@ class ParallelFit(ChartedResult, ReportedResult):
         return f"<ParallelFit of {self.nominal.chain.name}: {self.verdict.level}>"
 
     def with_unseen(self, unseen: Sequence[str | Path]) -> ParallelFit:
-        """Return the same fit with a verdict on additional unseen files, without refitting."""
+        """Return this fit, not fitted again, with a verdict that also counts further files of held-out rows."""
         validate = _paths(unseen)
         proofs = {name: self.unseen[name] for name in self.unseen_rows}
         unseen_rows = dict(self.unseen_rows)
@@ -282,15 +287,18 @@ def fit_parallel(
     """Return the geometric calibration of a parallel robot from measured files, with a verdict on unseen rows.
 
     Args:
+        robot: the nominal robot.
+        measured: CSV files to fit.
+        validate: CSV files to judge by.
         settings: holdout, tolerance and seed; other settings apply to serial arms only.
         options: only ``fix`` is used.
+        progress: function called with a line of text; None: none.
 
     Raises:
         UsageError: for options that apply to serial arms only.
         MeasurementError: for missing columns, or rows that no posture reaches.
         Unidentifiable: if only readings are given for a robot without redundant encoders.
     """
-    say = progress or (lambda message: None)
     settings = settings or FitSettings()
     mechanism = robot.mechanism
     measured = _paths(measured)
@@ -312,11 +320,15 @@ def fit_parallel(
         rows = rows[order[:count]]
         if len(held_out):
             unseen_rows["held out, unseen"] = held_out
-    say("fitting")
+    if progress is not None:
+        progress("fitting")
     try:
         fit = fit_loops(mechanism, *_parts(mechanism, rows), fixed=fixed)
-        say("judging")
-        proofs = {name: _errors(mechanism, fit.mechanism, table) for name, table in unseen_rows.items()}
+        if progress is not None:
+            progress("judging")
+        proofs = {}
+        for name, table in unseen_rows.items():
+            proofs[name] = _errors(mechanism, fit.mechanism, table)
         fit_errors = _errors(mechanism, fit.mechanism, rows)
     except NoPosture as error:
         raise MeasurementError(f"{error}", measured[0]) from error
@@ -326,6 +338,7 @@ def fit_parallel(
 
 
 def _paths(measured: Sequence[object]) -> tuple[Path, ...]:
+    """Return the paths of measured files; raise UsageError for measurements in memory."""
     if all(isinstance(item, (str, Path)) for item in measured):
         return tuple(Path(str(item)) for item in measured)
     raise UsageError("a parallel robot's measurements are CSV files (calib formats parallel), not values in memory")
@@ -338,10 +351,14 @@ def read_rows(path: Path, robot: ParallelRobot) -> np.ndarray:
         MeasurementError: for a missing or unknown column.
     """
     table = read_table(path)
-    passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
+    passive: list[str] = []
+    for leg in robot.legs:
+        passive += [name for name in leg.chain.joint_names if name not in robot.joint_names]
     readings = []
     for joint in robot.joints:
-        quantity = "angle" if joint.kind == "revolute" else "length"
+        quantity = "length"
+        if joint.kind == "revolute":
+            quantity = "angle"
         readings.append(table.numbers(joint.name, quantity))
     for name in table.header:
         if name in passive:
@@ -361,7 +378,9 @@ def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
     """
     columns = []
     for name in robot.freedom:
-        quantity = "length" if name in COORDINATES[:3] else "angle"
+        quantity = "angle"
+        if name in COORDINATES[:3]:
+            quantity = "length"
         columns.append(table.numbers(name, quantity))
     return np.column_stack(columns)
 
@@ -378,7 +397,10 @@ def _held(mechanism: ClosedRobot, settings: FitSettings, options: FitOptions) ->
 
 
 def _read(robot: ParallelRobot, paths: Sequence[Path], width: int = 0) -> list[np.ndarray]:
-    """Return the rows of each file, all with the same columns: `width` of them, or as many as the first file has."""
+    """Return the rows of each file; raise an error unless all files have the same number of columns.
+
+    `width`: the number of columns; 0: that of the first file.
+    """
     tables = [read_rows(path, robot) for path in paths]
     for path, rows in zip(paths, tables):
         if rows.shape[1] != (width or tables[0].shape[1]):
@@ -395,7 +417,10 @@ def _parts(mechanism: ClosedRobot, rows: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _errors(nominal: ClosedRobot, calibrated: ClosedRobot, rows: np.ndarray) -> np.ndarray:
-    """Return the errors (2, m, k) of nominal and calibrated robot: platform coordinates, or `contradictions`."""
+    """Return the errors (2, m, k) of the nominal and of the calibrated robot on rows.
+
+    The k components are errors of the platform's coordinates or, without measured coordinates, `contradictions`.
+    """
     readings, coordinates = _parts(nominal, rows)
     if coordinates is None:
         return np.array([contradictions(nominal, readings), contradictions(calibrated, readings)])
@@ -412,7 +437,8 @@ def _cross_validated(
     folds = np.array_split(order, FOLDS)
     errors = []
     for k, fold in enumerate(folds):
-        training = rows[np.concatenate(folds[:k] + folds[k + 1 :])]
+        other_folds = folds[:k] + folds[k + 1 :]
+        training = rows[np.concatenate(other_folds)]
         try:
             fitted = fit_loops(mechanism, *_parts(mechanism, training), fixed=fixed)
             errors.append(_errors(mechanism, fitted.mechanism, rows[fold]))

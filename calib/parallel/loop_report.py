@@ -44,22 +44,24 @@ class ReportedFit(Protocol):
     def measured(self) -> bool: ...
 
 
-# the one model of a parallel robot's geometry
+# Name of the geometry's model in a report: parallel robots have this model only.
 MODEL = "loops"
-# correlation of two parameters from which on a report states it (our choice)
+# Correlation of two parameters from which on a report states it (our choice).
 CORRELATED = 0.9
 
 
 def report_of(fit: ReportedFit) -> Report:
     """Return the report of a fit: errors by set of rows, verdict, constants of the loops with their sigmas.
 
-    A fit of readings alone states no errors, since contradictions between encoders are neither position nor orientation
-    errors.
+    The report of a fit of encoder readings alone states no errors: contradictions between encoders are neither errors
+    of position nor of orientation.
     """
     robot = fit.nominal.chain
     estimate = fit.estimate
+    changes = estimate.values.tolist()
+    sigmas = estimate.sigma.tolist()
     parameters = []
-    for parameter, change, sigma in zip(fit.fit.parameters, estimate.values.tolist(), estimate.sigma.tolist()):
+    for parameter, change, sigma in zip(fit.fit.parameters, changes, sigmas):
         nominal = _nominal_value(robot, parameter)
         value = nominal + change
         relative = _relative(sigma, value)
@@ -68,7 +70,9 @@ def report_of(fit: ReportedFit) -> Report:
     for name, errors in _unseen(fit).items():
         sets.append(_row_errors(fit, name, errors))
     prismatic = [joint.kind == "prismatic" for joint in robot.joints]
-    correlations = [CorrelatedPair(*pair) for pair in estimate.strong_correlations(CORRELATED)]
+    strong = estimate.strong_correlations(CORRELATED)
+    correlations = [CorrelatedPair(*pair) for pair in strong]
+    correlated = fit_report.most_correlated(estimate.names, estimate.covariance)
     return Report(
         schema=fit_report.SCHEMA,
         robot=robot.name,
@@ -80,7 +84,7 @@ def report_of(fit: ReportedFit) -> Report:
         parameters=tuple(parameters),
         kept=(),
         correlations=tuple(correlations),
-        correlated=fit_report.most_correlated(estimate.names, estimate.covariance),
+        correlated=correlated,
         singular_values=(),
         rank=0,
         sets=tuple(sets),
@@ -105,13 +109,20 @@ def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
 
 
 def _metrics(fit: ReportedFit) -> FitMetrics:
+    """Return the metrics of a fit in the form of a serial arm's."""
     verdict = fit.verdict
-    tolerance = fit.settings.tolerance
-    tolerance_mm = None if tolerance is None else 1e3 * tolerance
+    tolerance_mm = None
+    if fit.settings.tolerance is not None:
+        tolerance_mm = 1e3 * fit.settings.tolerance
     not_identifiable: tuple[str, ...] = ()
     if fit.fit.vague:
-        not_identifiable = (f"hardly identified by these poses: {', '.join(fit.fit.vague)}",)
-    validation = {name: _compared(fit, errors) for name, errors in _unseen(fit).items()}
+        names = ", ".join(fit.fit.vague)
+        not_identifiable = (f"hardly identified by these poses: {names}",)
+    validation = {}
+    for name, errors in _unseen(fit).items():
+        validation[name] = _compared(fit, errors)
+    count = len(fit.fit.parameters)
+    fitted_rows = _compared(fit, fit.errors, unseen=False, parameters=count)
     return FitMetrics(
         validation=validation,
         verdict=verdict.level,
@@ -119,7 +130,7 @@ def _metrics(fit: ReportedFit) -> FitMetrics:
         warnings=(),
         code=verdict.code,
         advice=verdict.advice,
-        fit=_compared(fit, fit.errors, unseen=False, parameters=len(fit.fit.parameters)),
+        fit=fitted_rows,
         model=MODEL,
         ladder=(),
         seed=fit.settings.seed,
@@ -136,14 +147,23 @@ def _unseen(fit: ReportedFit) -> dict[str, np.ndarray]:
 
 
 def _compared(fit: ReportedFit, errors: np.ndarray, unseen: bool = True, parameters: int = 0) -> ComparedRows:
-    """Return the statistics of the errors (2, m, k) of both robots on some rows."""
+    """Return the statistics of the errors of both robots on a set of rows.
+
+    Args:
+        fit: the fit.
+        errors: (2, m, k) errors of the nominal and of the calibrated robot on m rows.
+        unseen: whether the rows were not fitted.
+        parameters: number of parameters fitted to the rows.
+    """
     nominal, calibrated = errors
-    statistics = _errors(fit, nominal).summary(), _errors(fit, calibrated).summary()
-    return ComparedRows(errors.shape[1], "the file's own", *statistics, unseen=unseen, parameters=parameters)
+    before = _errors(fit, nominal).summary()
+    after = _errors(fit, calibrated).summary()
+    count = errors.shape[1]
+    return ComparedRows(count, "the file's own", before, after, unseen=unseen, parameters=parameters)
 
 
 def _errors(fit: ReportedFit, joint_errors: np.ndarray) -> Errors:
-    """Return the magnitudes of errors (m, k) by kind; without any kind if no platform coordinate was measured."""
+    """Return the magnitudes of errors (m, k) of position and orientation; None for a kind that was not measured."""
     if not fit.measured:
         return Errors(None, None, None)
     places = fit.nominal.chain.selected < 3
@@ -157,8 +177,11 @@ def _errors(fit: ReportedFit, joint_errors: np.ndarray) -> Errors:
 
 
 def _row_errors(fit: ReportedFit, name: str, errors: np.ndarray) -> RowErrors:
+    """Return the magnitudes of both robots' errors (2, m, k) on the set of rows `name`."""
     nominal, calibrated = errors
-    return RowErrors(name, name != "fit", errors.shape[1], _sizes(fit, nominal), _sizes(fit, calibrated))
+    before = _sizes(fit, nominal)
+    after = _sizes(fit, calibrated)
+    return RowErrors(name, name != "fit", errors.shape[1], before, after)
 
 
 def _sizes(fit: ReportedFit, errors: np.ndarray) -> dict[str, tuple[float, ...]]:
@@ -175,15 +198,24 @@ def _sizes(fit: ReportedFit, errors: np.ndarray) -> dict[str, tuple[float, ...]]
 def _nominal_value(robot: ParallelRobot, parameter: LoopParameter) -> float:
     """Return a constant's nominal value; 0 for a displacement of a leg's base or attachment."""
     if parameter.part == "element":
-        return float(robot.legs[parameter.leg].chain.elements[parameter.index].value)
+        chain = robot.legs[parameter.leg].chain
+        return float(chain.elements[parameter.index].value)
     return 0.0
 
 
 def _relative(sigma: float, value: float) -> float | None:
-    return 100.0 * sigma / abs(value) if value else None
+    """Return σ as a share of a value [%]; None for the value 0."""
+    if not value:
+        return None
+    return 100.0 * sigma / abs(value)
 
 
 def _files(fit: ReportedFit) -> tuple[fit_report.FileRow, ...]:
-    roles = {fit.nominal.source: "nominal robot"} | dict.fromkeys(fit.files, "measured")
-    rows = [fit_report.file_row(path.name, role, path) for path, role in roles.items() if path.is_file()]
+    """Return the files that were read, as rows of the report; files that no longer exist are omitted."""
+    roles = {fit.nominal.source: "nominal robot"}
+    roles |= dict.fromkeys(fit.files, "measured")
+    rows = []
+    for path, role in roles.items():
+        if path.is_file():
+            rows.append(fit_report.file_row(path.name, role, path))
     return tuple(rows)

@@ -1,11 +1,10 @@
 """The fastest motion of a parallel robot through platform waypoints, within its actuators' speeds and torques.
 
-Waypoints are a CSV, a row each, in order: the platform's coordinates (``x [mm]``, ``rz [deg]``), counted from home in
-the base's axes; or readings of all actuators under their names. The path is a spline through them in the platform's
-coordinates (a straight line between each two, where asked for); its timing is that of serial arms
-(`calib.trajectories.timing.time_scaling`) on the actuators' own motion along it, redundant torques those of least norm
-with
-the identified preload.
+Waypoints are the rows of a CSV in their order. The columns are either the platform's coordinates (``x [mm]``, ``rz
+[deg]``), counted from home in the base's axes, or the readings of all actuators under their names. The path is a spline
+through the waypoints in the platform's coordinates, or, if the settings ask for lines, straight between waypoints. Its
+timing is that of serial arms (`calib.trajectories.timing.time_scaling`), computed on the actuators' motion along the
+path. Torques of redundant actuators are those of least norm, plus the identified preload.
 """
 
 from collections.abc import Callable
@@ -36,8 +35,14 @@ from calib.trajectories.timing.profile import track
 from calib.trajectories.timing.time_scaling import time_optimal
 
 FRICTIONLESS = "friction unknown (no model): a real robot needs more torque than planned"
-# of the settings
+# Names of the settings that apply to parallel robots.
 READ = ("payloads", "lines", "rate")
+# Smoothing of Coulomb's sign along a path [rad/s or m/s]: nearly none, since the direction of motion is known.
+SIGN_SMOOTHING = 1e-9
+# Length [m] that a radian counts as in the length of a path (our choice).
+LEVER = 0.1
+# Number of points per span of a path at which the actuators are solved for.
+POINTS_PER_SPAN = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +50,9 @@ class _PlatformDynamics:
     """Dynamics along a path of the actuated joints: actuator torques for time-optimal planning.
 
     Attributes:
-        model: model of the robot; values: (p,) of its parameters.
-        carried: payloads carried.
+        model: model of the robot.
+        values: (p,) values of the model's parameters.
+        carried: labels of the payloads on board.
     """
 
     model: ParallelModel
@@ -56,18 +62,25 @@ class _PlatformDynamics:
     def along(
         self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return A, B, Γ, each (N, n), as `calib.dynamics.path_dynamics.PathDynamics.along`."""
+        """Return A, B, Γ, each (N, n), with the torque A s̈ + B ṡ² + Γ along a path with the parameter s.
+
+        Args:
+            q: (N, n) joint values at N points of the path.
+            slope, curvature: (N, n) first and second derivatives of the joint values by s.
+        """
         still = np.zeros_like(q)
         rigid = np.where(self._rubbing(), 0.0, self.values)
         gravity = self._torque(rigid, q, still, still)
+        inertial = self._torque(rigid, q, still, slope)
         torque = self._torque(rigid, q, slope, curvature)
-        return self._torque(rigid, q, still, slope) - gravity, torque - gravity, gravity
+        return inertial - gravity, torque - gravity, gravity
 
     def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the actuator torques (N, n) against friction, including that of passive joints."""
         rubbing = self._rubbing() & (self.values != 0.0)
         if rubbing.any():
-            return self._torque(np.where(rubbing, self.values, 0.0), q, v, a)
+            friction_values = np.where(rubbing, self.values, 0.0)
+            return self._torque(friction_values, q, v, a)
         return np.zeros_like(q)
 
     def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -75,11 +88,14 @@ class _PlatformDynamics:
         return self._torque(self.values, q, v, a)
 
     def _torque(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        return self.model.actuator_torques(values, self.model.moved(q, v, a), self.carried)
+        motion = self.model.moved(q, v, a)
+        return self.model.actuator_torques(values, motion, self.carried)
 
     def _rubbing(self) -> np.ndarray:
+        """Return whether each parameter is one of friction, (p,) bool."""
         rubs = [column.shape in ("velocity", "sign") for column in self.model.columns]
-        return np.array([False] * self.model.inertial + rubs)
+        inertial = [False] * self.model.inertial
+        return np.array(inertial + rubs)
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -108,11 +124,13 @@ class ParallelPlan(MotionPlan):
     def to_dict(self) -> dict[str, object]:
         """Return the metrics of ``metrics.json``."""
         track: Any = self.track
-        return super().to_dict() | {
-            "robot": self.robot.chain.name,
-            "peak_torque": np.abs(track.tau).max(axis=0).tolist(),
-            "peak_speed": np.abs(track.v).max(axis=0).tolist(),
-        }
+        peak_torque = np.abs(track.tau).max(axis=0)
+        peak_speed = np.abs(track.v).max(axis=0)
+        metrics = super().to_dict()
+        metrics["robot"] = self.robot.chain.name
+        metrics["peak_torque"] = peak_torque.tolist()
+        metrics["peak_speed"] = peak_speed.tolist()
+        return metrics
 
 
 def plan_parallel(
@@ -123,32 +141,46 @@ def plan_parallel(
     model: Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> ParallelPlan:
-    """Return the fastest motion of a parallel robot through the waypoints of a file.
+    """Return the fastest motion of a parallel robot through waypoints.
 
     Args:
+        robot: the robot.
+        waypoints: a CSV file (columns: see the module), or platform coordinates (m, r) [m, rad].
         settings: payloads, lines and rate; other settings apply to serial arms only.
-        model: folder of an identification of the same robot; None: the file's inertias, without friction.
+        model: folder of an identification of the same robot; None: the inertias of the robot's file, without friction.
+        progress: function called with a line of text; None: none.
 
     Raises:
         UsageError: for options that apply to serial arms only, waypoints outside the platform's box, or actuators
             without limits.
         NoPosture: for a path that leaves the workspace; the message names the position.
     """
-    say = progress or (lambda message: None)
     mechanism = robot.mechanism
     refuse_unread(settings, DEFAULT_PLAN, READ)
     law = _law(robot, model, settings.payloads)
     bounds = actuator_bounds(mechanism)
     limits = TimingLimits(bounds.velocity, bounds.acceleration, bounds.torque)
     points = _read_waypoints(waypoints, mechanism)
-    say("the path")
+    if progress is not None:
+        progress("the path")
     paths = _paths(mechanism, points, settings.lines)
     for path in paths:
         check_within(path, mechanism.robot.lower, mechanism.robot.upper, points)
     actuator_paths = [_of_actuators(mechanism, path) for path in paths]
-    say("timing")
-    timings = tuple(time_optimal(path, limits, law, rate=settings.rate) for path in actuator_paths)
-    motion = joined([track(timing.path, timing.profile, settings.rate, law.torque) for timing in timings])
+    if progress is not None:
+        progress("timing")
+    timings = []
+    tracks = []
+    for path in actuator_paths:
+        timing = time_optimal(path, limits, law, rate=settings.rate)
+        timings.append(timing)
+        tracks.append(track(timing.path, timing.profile, settings.rate, law.torque))
+    motion = joined(tracks)
+    posture = mechanism.locate(motion.q)
+    coordinates = coordinates_of(mechanism, posture)
+    notes: tuple[str, ...] = ()
+    if model is None:
+        notes = (FRICTIONLESS,)
     joints = joints_of(mechanism.robot)
     return ParallelPlan(
         chain=cast(Chain, mechanism.robot),
@@ -156,11 +188,11 @@ def plan_parallel(
         limits=limits,
         lower=joints.lower,
         upper=joints.upper,
-        timings=timings,
+        timings=tuple(timings),
         track=motion,
-        notes=() if model else (FRICTIONLESS,),
+        notes=notes,
         robot=robot,
-        coordinates=coordinates_of(mechanism, mechanism.locate(motion.q)),
+        coordinates=coordinates,
     )
 
 
@@ -182,33 +214,43 @@ def _read_waypoints(path: Path | np.ndarray, mechanism: ClosedRobot) -> np.ndarr
             f"({', '.join(mechanism.robot.joint_names)}) are among its columns: {', '.join(table.header)}",
         )
     try:
-        readings = read_rows(path, mechanism.robot)[:, : mechanism.robot.n]
-        return coordinates_of(mechanism, mechanism.locate(readings))
+        rows = read_rows(path, mechanism.robot)
+        readings = rows[:, : mechanism.robot.n]
+        posture = mechanism.locate(readings)
+        return coordinates_of(mechanism, posture)
     except NoPosture as error:
-        raise MeasurementError(f"waypoint out of reach: {error}", path) from error
+        raise MeasurementError(f"waypoint out of reach: {error}; move it", path) from error
 
 
 def _law(robot: ParallelMechanism, folder: Path | None, payloads: tuple[str, ...]) -> _PlatformDynamics:
-    """Return the identified dynamics, or those of the file's inertias, with the given payloads."""
+    """Return the dynamics for planning, with some payloads on board.
+
+    Args:
+        robot: the robot.
+        folder: folder of an identification; None: the inertias of the robot's file, without friction.
+        payloads: labels of the payloads on board.
+
+    Raises:
+        UsageError: for payloads that were not identified.
+    """
     if folder is None and payloads:
         raise UsageError(f"payloads {', '.join(payloads)}: only an identified model has payloads; give --model")
     model, values = read_model(robot, folder)
     unknown = sorted(set(payloads) - set(model.payloads))
     if unknown:
         refuse_option(folder, f"no payload '{unknown[0]}' was identified; known: {', '.join(model.payloads) or 'none'}")
-    # smoothing of Coulomb's sign: along a path its direction is known
-    smoothing = 1e-9
     terms = []
     for term in model.terms:
         if term.shape == "sign":
-            term = replace(term, settings=(smoothing,))
+            term = replace(term, settings=(SIGN_SMOOTHING,))
         terms.append(term)
-    return _PlatformDynamics(replace(model, terms=tuple(terms)), values, payloads)
+    path_model = replace(model, terms=tuple(terms))
+    return _PlatformDynamics(path_model, values, payloads)
 
 
-def _paths(mechanism: ClosedRobot, points: np.ndarray, lines: bool, lever: float = 0.1) -> list[JointPath]:
-    # lever: of the base's size that a radian counts as in the length of a path (our choice)
-    scale = np.where(mechanism.robot.selected < 3, 1.0, 1.0 / lever)
+def _paths(mechanism: ClosedRobot, points: np.ndarray, lines: bool) -> list[JointPath]:
+    """Return the path through waypoints (m, r) in platform coordinates: a spline, or with `lines` a line per span."""
+    scale = np.where(mechanism.robot.selected < 3, 1.0, 1.0 / LEVER)
     if not lines:
         return [spline(points, scale=scale)]
     if len(points) < 2:
@@ -216,13 +258,15 @@ def _paths(mechanism: ClosedRobot, points: np.ndarray, lines: bool, lever: float
     return [spline(points[k : k + 2], scale=scale) for k in range(len(points) - 1)]
 
 
-def _of_actuators(mechanism: ClosedRobot, path: JointPath, places_per_span: int = 100) -> JointPath:
+def _of_actuators(mechanism: ClosedRobot, path: JointPath) -> JointPath:
     """Return the path of the actuated joints that corresponds to a path in platform coordinates.
 
-    `places_per_span`: number of points per span at which the actuators are solved for.
+    Raises:
+        UsageError: if the path leaves the workspace.
     """
     spans = len(path.knots) - 1
-    s = np.interp(np.linspace(0.0, spans, places_per_span * spans + 1), np.arange(spans + 1), path.knots)
+    positions = np.linspace(0.0, spans, POINTS_PER_SPAN * spans + 1)
+    s = np.interp(positions, np.arange(spans + 1), path.knots)
     try:
         posture = mechanism.place(path(s))
     except NoPosture as error:

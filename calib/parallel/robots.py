@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from calib.identification.prediction import Dynamics
     from calib.parallel.mechanism.parallel_model import ParallelModel
 
+# Commands and arguments that parallel robots do not have, and what to do instead.
 INSTEAD = {
     "choosing poses": "choose poses manually, spread over its workspace",
     "diff": "compare the values and sigmas of both folders' estimate.csv",
@@ -32,7 +33,7 @@ INSTEAD = {
     "poses": "pose selection does not support it",
     "export to single files": "give --into FOLDER",
     "urdf": "robot.urdf is written anew",
-}  # of commands and arguments that there are not
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,7 +54,7 @@ class ParallelMechanism:
 
     @property
     def chain(self) -> ParallelRobot:
-        """The robot in place of a serial `Chain`: names, limits and number of the actuated joints."""
+        """The robot, which like a serial `Chain` has names, limits and number of the actuated joints."""
         return self.mechanism.robot
 
     def write(self, folder: Path) -> None:
@@ -68,13 +69,18 @@ class ParallelMechanism:
 
     def model_table(self, dynamics: Dynamics[ParallelModel], base: Base, unit: str) -> dict[str, object]:
         """Return the model as the content of ``dynamics.json``; `calib.parallel.design_goal.read_model` reads it."""
-        # slow to load, as are the others; finding a robot needs none
+        # These imports are slow, and `find` does not need them.
         from calib.dynamics.base import expressions
         from calib.dynamics.shapes import V0
         from calib.folders import COVARIANCE as OF_PARAMETERS
         from calib.identification.model_file import regrouping
 
         model = dynamics.model
+        sign_settings = [term.settings[0] for term in model.terms if term.shape == "sign"]
+        v0 = V0
+        if sign_settings:
+            v0 = sign_settings[0]
+        values = model.spread(dynamics.values).tolist()
         return {
             "robot": ROBOT,
             "kind": model.torque_rows.name,
@@ -82,8 +88,8 @@ class ParallelMechanism:
             "payloads": list(model.payloads),
             "preload": model.preload,
             "identical_legs": model.identical_legs,
-            "v0": next((term.settings[0] for term in model.terms if term.shape == "sign"), V0),
-            "values": dict(zip(model.single.names, model.spread(dynamics.values).tolist())),
+            "v0": v0,
+            "values": dict(zip(model.single.names, values)),
             "base": dict(zip(base.names, expressions(base))),
             "regrouping": regrouping(base),
             "covariance": OF_PARAMETERS,
@@ -108,29 +114,29 @@ def find(robot: object) -> ParallelMechanism | None:
     """
     if not isinstance(robot, (str, Path)):
         return None
-    if Path(robot).is_dir():
-        path = Path(robot) / ROBOT
-    else:
-        path = Path(robot)
+    path = Path(robot)
+    if path.is_dir():
+        path = path / ROBOT
     if not path.is_file():
         path = parallel_robot.library().get(str(robot))
     elif path.suffix != ".toml" or not parallel_robot.is_parallel(path):
         return None
     if path is None:
         return None
-    beside = path.with_name(COVARIANCE)
-    if path.name == ROBOT and beside.is_file():
-        covariance = LoopCovariance(*read_covariance(beside))
-    else:
-        covariance = None
+    covariance = None
+    covariance_file = path.with_name(COVARIANCE)
+    if path.name == ROBOT and covariance_file.is_file():
+        names, matrix = read_covariance(covariance_file)
+        covariance = LoopCovariance(names, matrix)
     return ParallelMechanism(closed(parallel_robot.read(path)), path, covariance)
 
 
 def refuse_unread(settings: DataclassInstance, plain: object, read: Collection[str], where: object = "") -> None:
-    """Raise an error for settings that a stage does not use, unless their values are default or False.
+    """Raise UsageError for settings that a stage does not read, unless their values are the default or False.
 
     Args:
-        settings, plain: dataclasses of one type: the given values, and the defaults.
+        settings: the settings.
+        plain: settings of the same type with the default values.
         read: names of the fields that the stage reads.
         where: the file that contains them.
 
@@ -140,6 +146,10 @@ def refuse_unread(settings: DataclassInstance, plain: object, read: Collection[s
     for field in fields(settings):
         value = getattr(settings, field.name)
         if field.name not in read and value is not False and value != getattr(plain, field.name):
-            prefix = f"{where}: " if where else ""
-            quoted = f" '{value}'" if isinstance(value, str) else ""
+            prefix = ""
+            if where:
+                prefix = f"{where}: "
+            quoted = ""
+            if isinstance(value, str):
+                quoted = f" '{value}'"
             raise UsageError(f"{prefix}{field.name}{quoted} is for serial arms only, not for this kind of robot")

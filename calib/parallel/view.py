@@ -15,6 +15,7 @@ from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.robot.chain import Joint
 from calib.robot.kinematics import forward, joint_frames
 
+# Dimension of each coordinate of the platform.
 DIMENSIONS: dict[str, str] = {}
 DIMENSIONS.update(dict.fromkeys(COORDINATES[:3], "length"))
 DIMENSIONS.update(dict.fromkeys(COORDINATES[3:], "angle"))
@@ -22,7 +23,10 @@ DIMENSIONS.update(dict.fromkeys(COORDINATES[3:], "angle"))
 
 @dataclass(frozen=True, eq=False)
 class MechanismPicture:
-    """A parallel robot to be drawn, as `calib.results.scene.Drawn`; q (m, n) are readings of its actuated joints."""
+    """A parallel robot in the form that the viewer draws (`calib.results.scene.Drawn`).
+
+    In all methods q (m, n) are readings of the actuated joints [rad or m].
+    """
 
     mechanism: ClosedRobot
 
@@ -42,9 +46,10 @@ class MechanismPicture:
         return self.mechanism.robot.joint_names
 
     def strips(self, q: np.ndarray) -> list[np.ndarray]:
-        """Return lines (m, k, 3) [m] in the base: each leg up to the platform's origin, and the platform's outline.
+        """Return lines (m, k, 3) [m] in the base's frame: one per leg, and the outline of the platform.
 
-        A leg's line passes its joints, its end and its attachment: where the loop does not close, these are apart.
+        A leg's line connects its joints, its end, its attachment on the platform, and the platform's origin. End and
+        attachment coincide if the loop closes.
         """
         robot = self.mechanism.robot
         posture = self.mechanism.locate(q)
@@ -52,13 +57,16 @@ class MechanismPicture:
         ends = []
         for leg, first in zip(robot.legs, robot.starts):
             q_leg = posture.q[:, first : first + leg.chain.n]
-            joints = joint_frames(leg.chain, q_leg)[:, :, :3, 3].transpose(1, 0, 2)
+            frames = joint_frames(leg.chain, q_leg)
+            joints = frames[:, :, :3, 3].transpose(1, 0, 2)
             end = forward(leg.chain, q_leg)[:, :3, 3]
             attachment = (posture.pose @ leg.attachment)[:, :3, 3]
-            beyond_joints = np.stack([end, attachment, posture.pose[:, :3, 3]], axis=1)
+            origin = posture.pose[:, :3, 3]
+            beyond_joints = np.stack([end, attachment, origin], axis=1)
             legs.append(np.concatenate([joints, beyond_joints], axis=1))
             ends.append(attachment)
-        return [*legs, np.stack([*ends, ends[0]], axis=1)]
+        outline = np.stack([*ends, ends[0]], axis=1)
+        return [*legs, outline]
 
     def torque_rows(self, kind: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Return titles and units of the torque rows of an identification: platform, motor or power."""
@@ -66,19 +74,23 @@ class MechanismPicture:
         if kind == "power":
             units = ("W",)
         else:
-            units = rows.units([joint.kind == "prismatic" for joint in self.joints])
+            prismatic = [joint.kind == "prismatic" for joint in self.joints]
+            units = rows.units(prismatic)
         return rows.titles(self.joint_names), units
 
     def measured(self, path: Path) -> tuple[np.ndarray, ...]:
         """Return the poses stored in a fit's folder, in the order of `calib.results.scene.Measured`.
 
-        Readings q (m, n); positions (m, 3) of the platform seen, by the nominal and by the calibrated robot [m];
-        mask (m,) of the held-out poses; rotation vectors from the calibrated to the measured orientation (m, 3) [rad],
-        NaN where no angle was measured. Without measured coordinates all positions are the calibrated robot's.
+        Returns:
+            Readings q (m, n); positions (m, 3) of the platform [m], measured, by the nominal and by the calibrated
+            robot; mask (m,) of the held-out poses; rotation vectors (m, 3) [rad] from the calibrated to the measured
+            orientation, NaN if no angle was measured. Without measured coordinates all three positions are the
+            calibrated robot's.
         """
         robot = self.mechanism.robot
         table = read_table(FitFolder(path).residuals)
-        q = np.column_stack([table.numbers(joint.name, "joint") for joint in robot.joints])
+        readings = [table.numbers(joint.name, "joint") for joint in robot.joints]
+        q = np.column_stack(readings)
         calibrated = self.mechanism.locate(q).pose
         turned = np.full((len(q), 3), np.nan)
         places = [calibrated[:, :3, 3]] * 3
@@ -94,12 +106,16 @@ class MechanismPicture:
             measured_pose = pose_of(self.mechanism, at)
             nominal = pose_of(self.mechanism, at - before)
             still = pose_of(self.mechanism, at - after)
-            poses = (measured_pose, nominal, still)
-            places = [pose[:, :3, 3] - still[:, :3, 3] + calibrated[:, :3, 3] for pose in poses]
+            places = []
+            for pose in (measured_pose, nominal, still):
+                error = pose[:, :3, 3] - still[:, :3, 3]
+                places.append(error + calibrated[:, :3, 3])
             if (robot.selected > 2).any():
-                rotation = measured_pose[:, :3, :3] @ still[:, :3, :3].transpose(0, 2, 1)
+                still_inverse = still[:, :3, :3].transpose(0, 2, 1)
+                rotation = measured_pose[:, :3, :3] @ still_inverse
                 turned = Rotation.from_matrix(rotation).as_rotvec()
-        return q, *places, np.array(table.texts("set")) != "fit", turned
+        held_out = np.array(table.texts("set")) != "fit"
+        return q, *places, held_out, turned
 
 
 def picture(robot: ParallelMechanism) -> MechanismPicture:

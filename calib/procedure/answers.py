@@ -1,4 +1,7 @@
-"""Answers to `calib new`, given as options or at a terminal. This module imports little: `calib` starts fast."""
+"""Answers to the questions of `calib new`, as command options or from a terminal.
+
+This module imports only small modules, so that `calib` starts fast.
+"""
 
 from dataclasses import dataclass, field
 from datetime import date
@@ -7,7 +10,7 @@ from typing import Annotated
 from unicodedata import category
 
 from calib.config import strict
-from calib.config_types import Checked, Expect, OneOf, Real, Text, Typed
+from calib.config_types import Checked, Expect, OneOf, Real, Text, Typed, Whole
 
 CAMERA = ("mounting", "lens", "board", "carried", "stands")
 CELL = ("instrument_at", "cone", "facing", "box", "obstacles", *CAMERA)
@@ -19,7 +22,16 @@ MAX_LETTERS = 200
 
 
 def _entry(value: object) -> object:
-    """Check an entry of a certificate (a text, number or date), and return it as a text of one line."""
+    """Return an entry of a certificate (text, number or date) as one line of printable text.
+
+    Values of other types are returned unchanged.
+
+    Args:
+        value: the entry.
+
+    Raises:
+        ValueError: for a text that is too long.
+    """
     if not isinstance(value, str | int | float | date) or isinstance(value, bool):
         return value
     # control characters and halves of surrogate pairs cannot be printed
@@ -36,7 +48,8 @@ StatedEntry = Annotated[Text, Checked(_entry, {"type": ["string", "number"]})]
 @strict
 @dataclass(frozen=True)
 class CertificateSection:
-    """Section ``[certificate]``: what the certificate states besides results; empty: a line to fill in by hand.
+    """Section ``[certificate]``: information on the certificate besides results; empty: a blank line to fill in by
+    hand.
 
     Attributes:
         certificate_number: certificate number
@@ -77,6 +90,8 @@ class Answers:
     Attributes:
         robot: a .urdf, an MDH .toml, a library name, or the folder of an earlier fit.
         instrument: cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position, none.
+        reference: a frame on the robot's base is measured beside the target, since instrument and base move against
+            each other.
         tool: x,y,z: approximate position of the target in the tip's frame [m].
         limits: TOML file that describes the cell: instrument or [camera], obstacles, speeds; or
             MoveIt's files (calib formats moveit); none: asked in questions.
@@ -94,8 +109,15 @@ class Answers:
         torques: which torques the log contains.
         payloads: label=kg of a payload for additional recordings, or 'label=kg at x,y,z' with its centre of mass in
             the tip's frame [m]; label alone if its mass is unknown; repeatable (in an answer: between semicolons).
+        goals: what the motion is for: torque (predict torques), parameters (small σ of parameters), or goals such as
+            raw=35 (condition number), wrist=0.1 (mean torque as a share of its limit), coverage=0.1; repeatable (in an
+            answer: between spaces); none: the best condition numbers.
+        period: of the motion [s].
+        front: number of trade-offs between condition number and torque goal to choose from; 0: none.
         tolerance_mm: largest accepted rms of the position on unseen poses [mm]; 0: none.
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none.
+        tolerance_torque: largest accepted rms torque error of each joint on unseen motion [N m or N]: one number for
+            all joints, or one per joint with commas (0: none); none.
         program: controller in whose language the poses are written, too: ur, krl … (calib program --list); or none.
         details: ask for the certificate's details: number, serial numbers, operator ….
         certificate: these details.
@@ -103,6 +125,7 @@ class Answers:
 
     robot: Text | None = None
     instrument: Text | None = None
+    reference: Annotated[bool, Typed("--reference/--no-reference")] | None = None
     tool: Annotated[tuple[Held, Held, Held], Expect("x,y,z in metres, at most 3 m from the flange")] | None = None
     limits: Path | None = None
     mounting: Text | None = None
@@ -118,13 +141,17 @@ class Answers:
     dynamics: Annotated[bool, Typed("--dynamics/--geometry-only")] | None = None
     torques: Torques | None = None
     payloads: tuple[str, ...] = ()
+    goals: tuple[str, ...] = ()
+    period: Annotated[float, Real(above=0.0, most=3600.0, unit="s")] | None = None
+    front: Annotated[int, Whole(0, 1000)] | None = None
     tolerance_mm: Tolerance | None = None
     tolerance_percent: Tolerance | None = None
+    tolerance_torque: Text | None = None
     program: Text | None = None
     details: Annotated[bool, Typed("--details/--no-details")] | None = None
     certificate: CertificateSection = field(default_factory=CertificateSection)
 
     @property
     def cell(self) -> dict[str, str | tuple[str, ...]]:
-        """Answers about the measuring cell: option name -> answer; questions without an answer are absent."""
+        """Answers about the measuring cell: option name -> answer; unanswered questions are absent."""
         return {name: value for name in CELL if (value := getattr(self, name)) is not None}

@@ -1,15 +1,16 @@
 """Findings as sentences, and verdicts from findings: all sentences and limits are in ``findings.toml``.
 
-A stage creates findings, ``finding("moved", times=…)`` (`calib.errors.Finding`). For each code, the catalogue states
+A stage creates a finding by ``finding("moved", times=…)`` (`calib.errors.Finding`). For each finding's code, the
+catalogue ``findings.toml`` states::
 
-    says     the sentence, number first; ``{rms:.3g mm}`` prints a value [SI] in a unit, ``{names:5}`` five of many,
-             ``<, …>`` an optional part, omitted if one of its values is None or empty
-    advice   what to do
+    says     the sentence, number first; ``{rms:.3g mm}`` prints a value [SI] in a unit, ``{names:5}`` the first five
+             of a list, ``<, …>`` an optional part, omitted if one of its values is None or empty
+    advice   what the user should do
     level    note, marginal or fail; or
-    limits   value -> level -> limit above which the value reaches the level; of several values the mildest level
-             counts; a finding that reaches no level is not reported
+    limits   value -> level -> limit above which the value reaches the level; if several values have limits, the
+             mildest of their levels counts; a finding that reaches no level is not reported
     accept   the name in the options' ``accept`` by which a user accepts the finding
-    means    additional explanation of `calib explain`
+    means    additional explanation for `calib explain`
 """
 
 from __future__ import annotations
@@ -42,7 +43,8 @@ OMITTED_VALUES = (None, "", (), [], False)
 class Verdict:
     """Verdict on a result: one of `LEVELS`, the reason in one sentence, the code of the deciding finding, and advice.
 
-    A verdict compares equal to the name of its level: ``fit.verdict == "pass"``.
+    A verdict compares equal to the name of its level: ``fit.verdict == "pass"``. The code is empty if no finding
+    decided.
     """
 
     level: str
@@ -63,7 +65,12 @@ class Verdict:
 
     @classmethod
     def of(cls, figures: str, findings: Iterable[Finding] = ()) -> Verdict:
-        """Return the verdict that follows from the worst finding; the reason begins with the text `figures`."""
+        """Return the verdict that follows from the worst finding; without findings above a note, it is pass.
+
+        Args:
+            figures: text with which the reason begins.
+            findings: findings on the result.
+        """
         worst = max(findings, key=_rank, default=None)
         if worst is None or level_of(worst) in ("", "note"):
             return cls("pass", figures)
@@ -72,7 +79,11 @@ class Verdict:
         return cls(level_of(worst), "; ".join(parts), worst.code, advice)
 
     def for_prediction(self, reason: str) -> Verdict:
-        """Return the verdict of a model that cannot be exported for the given reason: pass becomes prediction only."""
+        """Return the verdict on a model that cannot be exported: pass becomes pass (prediction only).
+
+        Args:
+            reason: why the model cannot be exported.
+        """
         if self.level != "pass":
             return self
         return Verdict(PREDICTION_ONLY, f"{self.reason}; {reason}")
@@ -86,9 +97,9 @@ class Verdicts:
     """Verdicts on the stages and deliverables of one robot.
 
     Attributes:
-        stages: name of a stage (``geometry``, ``dynamics``) → verdict on its result.
-        deliverables: ``urdf`` and ``corrections`` → verdict on this deliverable of the geometry; empty if there is only
-            one.
+        stages: name of a stage (``geometry``, ``dynamics``) -> verdict on its result.
+        deliverables: ``urdf`` or ``corrections`` -> verdict on this form of the geometry; empty if the forms are not
+            judged separately.
     """
 
     stages: Mapping[str, Verdict] = field(default_factory=dict)
@@ -96,19 +107,24 @@ class Verdicts:
 
     @property
     def level(self) -> str:
-        """Worst level among the stages' verdicts; empty without stages."""
+        """Worst level among the verdicts on the stages; empty without stages."""
         stage_levels = [verdict.level for verdict in self.stages.values()]
         return max(stage_levels, key=LEVELS.index, default="")
 
     def of(self, deliverable: str, dynamics: bool = False) -> Verdicts:
-        """Return the verdicts that apply to one deliverable, with or without the verdict on the dynamics."""
+        """Return the verdicts that apply to one deliverable.
+
+        Args:
+            deliverable: ``urdf`` or ``corrections``.
+            dynamics: whether the deliverable contains the dynamics, so that the verdict on them applies too.
+        """
         stages = {name: verdict for name, verdict in self.stages.items() if dynamics or name != "dynamics"}
         if deliverable in self.deliverables:
             stages["geometry"] = self.deliverables[deliverable]
         return Verdicts(stages)
 
     def __str__(self) -> str:
-        """Return the worst verdict, with the reasons of all stages that have it."""
+        """Return the worst level, with the reason of each stage whose verdict has this level."""
         level = self.level
         reasons = [f"{stage}: {verdict.reason}" for stage, verdict in self.stages.items() if verdict.level == level]
         text = f"verdict {level}: {'; '.join(reasons)}"
@@ -117,7 +133,7 @@ class Verdicts:
         return text
 
     def table(self) -> dict[str, object]:
-        """Return the worst verdict, and each stage's verdict and reason, as a table for JSON."""
+        """Return the worst level, and the level and reason of each stage, as a table for JSON."""
         table: dict[str, object] = {"verdict": self.level}
         for stage, verdict in self.stages.items():
             table[stage] = {"verdict": verdict.level, "reason": verdict.reason}
@@ -125,7 +141,7 @@ class Verdicts:
 
     @property
     def remark(self) -> str:
-        """Remark for files whose verdict is marginal or fail; else empty."""
+        """Remark to be written into delivered files if the worst level is marginal or fail; otherwise empty."""
         if self.level in ("marginal", "fail"):
             return str(self)
         return ""
@@ -133,7 +149,7 @@ class Verdicts:
 
 @dataclass(frozen=True)
 class CatalogueEntry:
-    """One entry of the catalogue; the module's docstring explains its fields."""
+    """One entry of ``findings.toml``; the module's docstring explains its fields."""
 
     says: str
     advice: str = ""
@@ -145,13 +161,13 @@ class CatalogueEntry:
 
 @cache
 def catalogue() -> Mapping[str, CatalogueEntry]:
-    """Return the catalogue, code -> entry."""
+    """Return the catalogue of findings: code -> entry."""
     text = Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
     return {code: CatalogueEntry(**entry) for code, entry in tomllib.loads(text).items()}
 
 
 def level_of(finding: Finding) -> str:
-    """Return the level of a finding (one of `RANKS`) from the catalogue's limits; an accepted finding is a note."""
+    """Return the level of a finding (one of `RANKS`) by the catalogue's limits; an accepted finding is a note."""
     entry = catalogue()[finding.code]
     levels = []
     for value, limits in entry.limits.items():
@@ -165,17 +181,28 @@ def level_of(finding: Finding) -> str:
 
 
 def _rank(finding: Finding) -> int:
-    """Return how serious a finding is: the position of its level in `RANKS`."""
+    """Return the position of a finding's level in `RANKS`, in which levels are sorted by severity."""
     return RANKS.index(level_of(finding))
 
 
 def limit(code: str, value: str, level: str = "fail") -> float:
-    """Return the limit above which a value of a finding reaches a level."""
+    """Return the limit in the catalogue above which a value of a finding reaches a level.
+
+    Args:
+        code: code of the finding.
+        value: name of the value.
+        level: the level.
+    """
     return catalogue()[code].limits[value][level]
 
 
 def settle(findings: Iterable[Finding], accepted: Collection[str] = ()) -> tuple[Finding, ...]:
-    """Return the findings that reach a level, worst first; those that the options accept are marked as accepted."""
+    """Return the findings that reach a level (note, marginal or fail) of the catalogue, worst first.
+
+    Args:
+        findings: findings of a stage.
+        accepted: names of findings that the options accept; these findings are returned marked as accepted.
+    """
     marked = []
     for finding in findings:
         is_accepted = catalogue()[finding.code].accept in accepted
@@ -187,14 +214,15 @@ def settle(findings: Iterable[Finding], accepted: Collection[str] = ()) -> tuple
 
 
 def sentence(finding: Finding) -> str:
-    """Return the sentence of a finding, without advice and full stop."""
+    """Return the sentence of a finding with its values inserted, without advice and without a full stop."""
     return _filled(catalogue()[finding.code].says, finding.values)
 
 
 @dataclass(frozen=True)
 class Note:
-    """A line for the user; `is_warning`: its finding prevents the verdict pass, so that commands always print the
-    line.
+    """A line of text for the user.
+
+    If `is_warning`, the line reports a finding that prevents the verdict pass; commands always print such lines.
     """
 
     text: str
@@ -205,7 +233,7 @@ class Note:
 
 
 def notes_of(findings: Iterable[Finding]) -> list[Note]:
-    """Return one note for each finding: its sentence, its advice, and how to accept it."""
+    """Return one note for each finding: its sentence, its advice, and how the user can accept it."""
     notes = []
     for finding in findings:
         line = _line(finding, catalogue()[finding.code])
@@ -214,12 +242,19 @@ def notes_of(findings: Iterable[Finding]) -> list[Note]:
 
 
 def lines_of(findings: Iterable[Finding]) -> list[str]:
-    """Return the text of the notes of findings."""
+    """Return a line of text for each finding: its sentence, its advice, and how the user can accept it."""
     return [note.text for note in notes_of(findings)]
 
 
 def as_notes(lines: Iterable[str], findings: Iterable[Finding]) -> list[Note]:
-    """Return lines as notes; those of the findings that prevent the verdict pass are warnings."""
+    """Return lines of text as notes.
+
+    A line that reports one of the findings that prevent the verdict pass is a warning.
+
+    Args:
+        lines: the lines.
+        findings: findings whose lines are among them.
+    """
     warnings = {note.text for note in notes_of(findings) if note.is_warning}
     return [Note(line, line in warnings) for line in lines]
 
@@ -236,12 +271,12 @@ def _line(finding: Finding, entry: CatalogueEntry) -> str:
 
 @cache
 def glossary() -> Mapping[str, str]:
-    """Return the technical terms of messages and reports, term -> meaning."""
+    """Return the glossary of technical terms in messages and reports: term -> meaning."""
     return tomllib.loads(Path(__file__).with_name("glossary.toml").read_text(encoding="utf-8"))
 
 
 def levels(entry: CatalogueEntry) -> str:
-    """Return as text the levels of a catalogue entry and their limits; a limit below zero is always exceeded."""
+    """Return a text on the levels of a catalogue entry and their limits; a limit below zero is always exceeded."""
     rules = []
     for value, limits in entry.limits.items():
         for level, limit in limits.items():
@@ -274,7 +309,7 @@ def explain(code: str) -> str:
 
 
 def in_words(template: str) -> str:
-    """Return a sentence template for reading: values as capitals with their units, optional parts in brackets.
+    """Return a sentence template in readable form: values as capitals with their units, optional parts in brackets.
 
     ``{rms:.3g mm} remain<, {rival} too>`` becomes ``RMS mm remain[, RIVAL too]``.
     """
@@ -289,14 +324,21 @@ def in_words(template: str) -> str:
 
 
 def _with_unit(text: str, unit: str) -> str:
-    """Return a printed value followed by its unit, with a space except before a degree sign."""
+    """Return a printed value `text` followed by its unit, with a space except before a degree sign."""
     if unit in ("", "°"):
         return text + unit
     return f"{text} {unit}"
 
 
 def _filled(template: str, values: Mapping[str, object]) -> str:
-    """Return a template with values inserted; an optional part ``<…>`` is omitted if its value is None or empty."""
+    """Return a template with the values inserted.
+
+    An optional part ``<…>`` is omitted if one of its values is None or empty.
+
+    Args:
+        template: sentence of the catalogue.
+        values: name -> value.
+    """
 
     def part(match: re.Match[str]) -> str:
         for _, name, _, _ in Formatter().parse(match[1]):

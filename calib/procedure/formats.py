@@ -84,12 +84,12 @@ _BOUNDS = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to"}
 
 
 def overview() -> list[str]:
-    """Return one line for each format: name and short description."""
+    """Return one line for each documented file format: name and short description."""
     return [f"{name:17} {description}" for name, (description, _) in TOPICS.items()]
 
 
 def describe(topic: str) -> str:
-    """Return the documentation of the format `topic`.
+    """Return the documentation of the file format `topic`.
 
     Raises:
         UsageError: for an unknown topic; the message lists the known topics.
@@ -115,7 +115,10 @@ def describe(topic: str) -> str:
 
 
 def json_schema(topic: str) -> str:
-    """Return the JSON schema (draft 2020-12) of a kind of TOML file; editors use it to complete and check keys.
+    """Return the JSON schema (draft 2020-12) of a TOML file format; editors use it to complete and check keys.
+
+    Args:
+        topic: name of the file format.
 
     Raises:
         UsageError: for a topic without a schema; the message lists the topics that have one.
@@ -131,7 +134,11 @@ def _schema(topic: str) -> ParsedTable:
 
 
 def keys(topic: str) -> Iterator[tuple[str, str, str, str]]:
-    """Yield path (``sigma.position``), allowed values, default and meaning of each key of a kind of TOML file."""
+    """Yield path (``sigma.position``), allowed values, default and explanation of each key of a TOML file format.
+
+    Args:
+        topic: name of a file format in `SCHEMAS`.
+    """
     table = _schema(topic)
     return _keys(table, table.get("$defs", {}))
 
@@ -154,7 +161,11 @@ def _keys(table: ParsedTable, tables: ParsedTable, prefix: str = "") -> Iterator
 
 
 def _allowed(value: ParsedTable) -> str:
-    """Return the allowed values of a key as text."""
+    """Return the allowed values of a key as text.
+
+    Args:
+        value: JSON schema of the key.
+    """
     if "anyOf" in value:
         alternatives = dict.fromkeys(_allowed(alternative) for alternative in value["anyOf"])
         return " or ".join(alternatives)
@@ -171,5 +182,5 @@ def _allowed(value: ParsedTable) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return a docstring without the code marks of reStructuredText."""
+    """Return a docstring without the markup of reStructuredText."""
     return text.replace("::\n", ":\n").replace("``", "")

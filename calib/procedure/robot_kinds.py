@@ -1,4 +1,4 @@
-"""Commands for robots other than serial arms: detection of the kind of robot, and its available commands."""
+"""Commands for robots other than serial arms: the kind of a robot, and the commands available for it."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ if TYPE_CHECKING:
 
 
 class RobotKind(Protocol):
-    """A kind of robot that is not a serial arm, as a package or module.
+    """A kind of robot that is not a serial arm; a package or module implements this protocol.
 
     Attributes:
-        KIND: `Mechanism.kind` of its robots.
-        LIBRARY: folder with the robots that can be named without a file.
+        KIND: name of the kind, equal to `Mechanism.kind` of its robots.
+        LIBRARY: folder with the robots that can be referred to by name instead of by file.
     """
 
     KIND: str
     LIBRARY: Path
 
     def find(self, robot: object) -> Mechanism | None:
-        """Return the robot that a name, file or object describes; None if it is not of this kind."""
+        """Return the robot that a name, file or object describes; None if the robot is not of this kind."""
         ...
 
     def stages(self) -> Mapping[str, CommandStage]:
-        """Return the implementation of each command."""
+        """Return the implementations of the commands: name of the command -> implementation."""
         ...
 
     def drive_gains(
@@ -44,7 +44,16 @@ class RobotKind(Protocol):
         known: Mapping[str, float],
         reference: int | None,
     ) -> Any:
-        """Return the drive gains (`calib.identification.gains.DriveGains`) of a robot's recordings in amperes."""
+        """Return the drive gains (`calib.identification.gains.DriveGains`) from recordings of motor currents [A].
+
+        Args:
+            robot: the robot.
+            cases: recordings with different payloads.
+            settings: settings of the identification.
+            known: known parameters of payloads: name -> value [SI].
+            reference: index of the joint relative to whose gain the other gains are identified; None: a payload is
+                known, and the gains are absolute.
+        """
         ...
 
 
@@ -58,7 +67,8 @@ class CommandStage:
     Attributes:
         run: takes the robot and the arguments of the `calib` command; returns the same result type as for an arm.
         check: takes the folder for the results and the files read; raises UsageError if an input would be overwritten.
-        judge: takes inputs, model and findings of an identification; returns its assessment on all recordings.
+        judge: takes inputs, model and findings of an identification; returns the assessment of the model on all
+            recordings.
     """
 
     run: Callable[..., Any]
@@ -68,13 +78,13 @@ class CommandStage:
 
 @runtime_checkable
 class Mechanism(Protocol):
-    """Robot that is not a serial arm, found by a `RobotKind`.
+    """A robot that is not a serial arm; `RobotKind.find` returns such robots.
 
     Attributes:
-        kind: name of the kind: ``parallel robot``.
-        source: file that it was read from.
-        chain: its actuated joints in the form of an arm's: name, n, joint_names, joints.
-        instead: command that it does not support → advice, as a clause.
+        kind: name of the kind, such as ``parallel robot``.
+        source: file from which the robot was read.
+        chain: the actuated joints with the attributes of a serial arm: name, n, joint_names, joints.
+        instead: name of a command that this robot does not support -> advice for the user, as a clause.
     """
 
     @property
@@ -87,27 +97,44 @@ class Mechanism(Protocol):
     def chain(self) -> Any: ...
 
     def write(self, folder: Path) -> None:
-        """Write ``robot.toml`` into a folder, so that the folder can be given as this robot."""
+        """Write ``robot.toml`` into a folder; commands then accept the folder as this robot."""
         ...
 
     def model_table(self, dynamics: Any, base: Any, unit: str) -> dict[str, object]:
-        """Return an identified model in the form of ``dynamics.json``."""
+        """Return an identified dynamic model of this robot in the form of ``dynamics.json``.
+
+        Args:
+            dynamics: the model.
+            base: its base parameters.
+            unit: unit of the torques.
+        """
         ...
 
 
 @runtime_checkable
 class MechanismResult(Protocol):
-    """Result of a fit or an identification of a robot that is not a serial arm."""
+    """Result of a fit or an identification for a robot that is not a serial arm."""
 
     @property
     def verdict(self) -> Verdict: ...
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the result folder in the form of `calib fit` or `calib identify`."""
+        """Write a result folder with the same files as `calib fit` or `calib identify`, and return its path.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
+        """
         ...
 
     def with_unseen(self, unseen: Sequence[object]) -> MechanismResult:
-        """Return the result with its verdict extended to more unseen files; nothing is fitted or identified again."""
+        """Return the result with a verdict that also covers further held-out files.
+
+        Nothing is fitted or identified again.
+
+        Args:
+            unseen: the files: measurements for a fit, recordings for an identification.
+        """
         ...
 
 
@@ -115,7 +142,7 @@ def mechanism(robot: object) -> Mechanism | None:
     """Return the robot given as object, name or file if it is not a serial arm; otherwise None.
 
     Raises:
-        RobotError: for a file that contradicts itself.
+        RobotError: for a robot file with contradictory content.
     """
     if isinstance(robot, Mechanism):
         return robot
@@ -127,20 +154,24 @@ def mechanism(robot: object) -> Mechanism | None:
 
 
 def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None = None) -> CommandStage | None:
-    """Return the implementation of a command for a robot (its `run` needs no robot argument); None for serial arms.
+    """Return the implementation of a command for a robot that is not a serial arm; None for serial arms.
+
+    The returned `run` has the robot already bound as its first argument.
 
     Args:
-        base, tip: links of a URDF; other robots have no such links.
+        robot: the robot as object, name or file.
+        verb: name of the command.
+        base, tip: names of links of a URDF; only serial arms have them; None: not stated.
 
     Raises:
-        UsageError: for a command that this kind of robot does not support, and for links.
+        UsageError: for a command that this kind of robot does not support, and if `base` or `tip` is stated.
     """
     machine = mechanism(robot)
     if machine is None:
         return None
     stages = next(kind for kind in ROBOTS.all() if machine.kind == kind.KIND).stages()
     if verb not in stages:
-        advice = machine.instead.get(verb, f"{', '.join(stages)} take it")
+        advice = machine.instead.get(verb, f"use {', '.join(stages)}")
         name = machine.source
         if isinstance(robot, (str, Path)):
             name = robot
@@ -153,7 +184,17 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
 
 
 def _run(run: Callable[..., object], machine: Mechanism, *args: object, **options: object) -> object:
-    """Return the result of a command; raise UsageError for an argument that is stated but only serial arms have."""
+    """Return the result of a command for a robot that is not a serial arm.
+
+    Args:
+        run: implementation of the command.
+        machine: the robot.
+        *args: further positional arguments of the command.
+        **options: arguments of the command by name.
+
+    Raises:
+        UsageError: for an argument with a value that applies to serial arms only.
+    """
     parameters = signature(run).parameters
     run_options = {}
     for key, value in options.items():
@@ -166,7 +207,11 @@ def _run(run: Callable[..., object], machine: Mechanism, *args: object, **option
 
 
 def joints_of(chain: Any) -> Joints:
-    """Return the names and limits of the joints of an arm or mechanism, for checking measurements and recordings."""
+    """Return names, kinds, position and torque limits of the joints, for checking measurements and recordings.
+
+    Args:
+        chain: the arm; for other robots, an object with its actuated joints.
+    """
     # slow to load, and the shell's completion asks this module for the kinds of robot
     import numpy as np
 

@@ -1,1 +1,4 @@
-"""Results read from the folders or files that commands wrote: one protocol for all kinds, and scenes for the viewer."""
+"""Results, read from the folders or files that commands wrote.
+
+All kinds of results implement one protocol. The modules on scenes prepare results for the viewer.
+"""

@@ -1,4 +1,4 @@
-"""Calibrated robots in their folders: fits, identifications, their exports, sessions."""
+"""Result folders that contain a calibrated robot: fits, identifications, their exports, and sessions."""
 
 from __future__ import annotations
 
@@ -29,14 +29,23 @@ if TYPE_CHECKING:
 
 
 class CalibratedRobot(Viewed):
-    """A folder with a robot that was calibrated from a nominal one (``robot.toml``)."""
+    """A folder that contains a robot calibrated from a nominal one (nominal and calibrated robot: ``robot.toml``)."""
 
     def check_arm(self, verb: str) -> None:
         stage_of(self.path, verb)
 
     def export(self, into: Path, settings: ExportSettings) -> Exported:
-        """Write the robot for other programs: all files into the folder `into`, or a ROS 2 package below it; return
-        remarks.
+        """Write the robot for other programs, in all file formats or as a ROS 2 package.
+
+        Args:
+            into: folder to write into, which is created if necessary.
+            settings: URDF to change (or the fit's robot), and format of the export.
+
+        Returns:
+            Messages on verdicts and files.
+
+        Raises:
+            UsageError, RobotError: if the robot cannot be exported, or files would be overwritten.
         """
         stage = stage_of(self.path, "export")
         if stage is not None:
@@ -62,7 +71,12 @@ class CalibratedRobot(Viewed):
         return Exported(delivery.mark(into, self.verdicts), lines)
 
     def _export_sources(self, settings: ExportSettings) -> delivery.Export:
-        """Return the sources of an export: the fit, and the nominal description (if not stated, the one of the fit)."""
+        """Return the sources of an export: this folder, and the nominal robot's description.
+
+        Args:
+            settings: the user's settings; ``urdf`` is the nominal robot's URDF, None takes the description that the fit
+                used.
+        """
         if settings.urdf is not None:
             return delivery.Export(settings.urdf, self.path)
         source = geometry.read(self.path).source
@@ -71,7 +85,7 @@ class CalibratedRobot(Viewed):
             return delivery.Export(resolve(source), self.path)
 
     def _refuse_in_session(self) -> None:
-        """Refuse to write a certificate for a step of a session, since the session has its own."""
+        """Raise a UsageError if the folder belongs to a session, since only the session has a certificate."""
         folder = self.path
         redo = command_line("redo", folder.parent, "certificate")
         words = f"{folder} belongs to a session, which has the certificate: {redo}"
@@ -79,11 +93,11 @@ class CalibratedRobot(Viewed):
 
 
 class StoredFit(CalibratedRobot):
-    """A fitted geometry, of `calib fit`, `tool`, `base` or `hand-eye`."""
+    """Folder of a fitted geometry, written by `calib fit`, `tool`, `base` or `hand-eye`."""
 
     @property
     def verdict(self) -> Verdict:
-        """The fit's verdict; within a session, that on its unseen poses."""
+        """The fit's verdict; within a session, the verdict on the held-out poses."""
         return self.verdicts.stages.get("geometry", super().verdict)
 
     @property
@@ -97,7 +111,15 @@ class StoredFit(CalibratedRobot):
         return FitFolder(self.path)
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
-        """Return certificate and report of the fit."""
+        """Return certificate and report of the fit.
+
+        Args:
+            details: certificate entries made by a person.
+            plots: whether to include figures.
+
+        Raises:
+            UsageError: if the folder belongs to a session, or has no data of a report.
+        """
         self._refuse_in_session()
         if not FitFolder(self.path).report.exists():
             self.refuse("certificate")
@@ -105,11 +127,11 @@ class StoredFit(CalibratedRobot):
 
 
 class StoredIdentification(CalibratedRobot):
-    """Identified dynamics, with the geometry that they were identified on."""
+    """Folder of identified dynamics, with the geometry that the identification used."""
 
     @property
     def verdict(self) -> Verdict:
-        """The identification's verdict; within a session, that on its unseen motion."""
+        """The identification's verdict; within a session, the verdict on the held-out motion."""
         return self.verdicts.stages.get("dynamics", super().verdict)
 
     @property
@@ -124,13 +146,21 @@ class StoredIdentification(CalibratedRobot):
         return delivery.Export(settings.urdf, identified=self.path, prior=settings.prior)
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
-        """Return certificate and report of the identification."""
+        """Return certificate and report of the identification.
+
+        Args:
+            details: certificate entries made by a person.
+            plots: whether to include figures.
+
+        Raises:
+            UsageError: if the folder belongs to a session.
+        """
         self._refuse_in_session()
         return certificates.read_model(self.path, plots, details)
 
 
 class StoredSession(Viewed):
-    """A session, with the fit and the identification that its steps have completed."""
+    """Folder of a session, with the fit and the identification that its steps have completed."""
 
     @cached_property
     def _session(self) -> Session:
@@ -141,7 +171,7 @@ class StoredSession(Viewed):
         return self._session
 
     def require_session(self) -> Session:
-        """Return the session."""
+        """Return the session; other kinds of results raise an error."""
         return self.session
 
     @property
@@ -151,7 +181,7 @@ class StoredSession(Viewed):
 
     @property
     def verdict(self) -> Verdict:
-        """The worst verdict of the session's stages."""
+        """The worst verdict among the stages of the session; not judged as long as the session is not finished."""
         verdicts = self.verdicts
         if not verdicts.level:
             return Verdict(NOT_JUDGED, f"no verdict yet: {command_line('next', self.path)}")
@@ -175,7 +205,7 @@ class StoredSession(Viewed):
         return folder if self.session.dynamic and judged else None
 
     def figures(self) -> dict[str, Picture]:
-        """Return the figures of the steps by name, as ``4-fit/map``."""
+        """Return the figures of fit and identification by name, such as ``4-fit/map``."""
         figures = {}
         for step in self._calibrations():
             for name, picture in step.figures().items():
@@ -183,7 +213,7 @@ class StoredSession(Viewed):
         return figures
 
     def tables(self) -> dict[str, Table]:
-        """Return the tables of the steps by name, as ``4-fit/estimate``."""
+        """Return the tables of fit and identification by name, such as ``4-fit/estimate``."""
         tables = {}
         for step in self._calibrations():
             for name, table in step.tables().items():
@@ -191,7 +221,7 @@ class StoredSession(Viewed):
         return tables
 
     def _calibrations(self) -> list[StoredResult]:
-        """Return the fit and the identification as far as the session has completed them."""
+        """Return the fit and the identification, if the session has completed them."""
         results: list[StoredResult] = []
         if self.fit is not None:
             results.append(StoredFit(self.fit.path, BY_NAME["fit"]))
@@ -200,13 +230,30 @@ class StoredSession(Viewed):
         return results
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
-        """Return certificate and report of a finished session."""
+        """Return certificate and report of a finished session.
+
+        Args:
+            details: ignored, since ``session.toml`` contains the details.
+            plots: whether to include figures.
+        """
         from calib.procedure.session import certificate
 
         return certificate.pages(replace(self.session, plots=plots))
 
     def certify(self, details: CertificateSection, plots: bool, svg: Path | None) -> list[str]:
-        """Write the report's figures as SVG; the certificate is the last step of the session."""
+        """Write the report's figures as SVG; the certificate itself is written by the last step of the session.
+
+        Args:
+            details: must be empty, since ``session.toml`` contains the details.
+            plots: ignored.
+            svg: folder for the figures.
+
+        Returns:
+            Messages on the written files.
+
+        Raises:
+            UsageError: if details are stated, or no folder for figures.
+        """
         from calib.procedure.report.certificate import rendering
 
         redo = command_line("redo", self.path, "certificate")
@@ -217,7 +264,7 @@ class StoredSession(Viewed):
         return [f"{rendering.write_figures(svg, report)} figures written to {svg}"]
 
     def status(self) -> Iterator[object]:
-        """Yield the state of each step, and the next command."""
+        """Yield the status of each step, and the next task or command."""
         from calib.procedure.session import commands
 
         return commands.status_lines(self.path)

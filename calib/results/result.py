@@ -1,8 +1,9 @@
-"""The protocol of results: `Result`, fulfilled by results in memory and by results in folders.
+"""The protocol of results: `Result`, which results in memory and stored results implement.
 
-Commands that take a result open it (`calib.results.registry.open_result`) and call its methods. `StoredResult` is the
-class of all kinds in folders; a kind with functions of its own has a subclass. A method that a kind does not
-support refuses with advice on the folder or command to use instead (`calib.result_kinds`).
+Commands that take a result open it (`calib.results.result_classes.open_result`) and call its methods.
+`StoredResult` is the class of all kinds in folders; a kind with additional functions has a subclass. If a kind does not
+support a method, the method raises an error with advice on the folder or command to use instead
+(`calib.result_kinds`).
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ PICTURES = "plot_*.png"
 
 @runtime_checkable
 class Result(Protocol):
-    """A result, in memory or in its folder.
+    """A result, in memory or stored in its folder.
 
     Attributes:
         kind: one of `calib.result_kinds.KINDS`.
@@ -46,23 +47,28 @@ class Result(Protocol):
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict; its level is `NOT_JUDGED` for results without a verdict, such as motions."""
+        """The verdict; the level is `NOT_JUDGED` for results without a verdict, such as motions."""
         ...
 
     def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
-        """Write the result's folder (for a list of poses, its files), and return its path."""
+        """Write the result into a folder (a list of poses: into files), and return the path.
+
+        Args:
+            out: the folder; for a list of poses, the CSV file.
+            plots: whether figures are drawn and written, too.
+        """
         ...
 
     def figures(self) -> Mapping[str, Picture]:
-        """Return the figures by name."""
+        """Return the figures: name -> figure."""
         ...
 
     def tables(self) -> Mapping[str, Table]:
-        """Return the tables by name, as in the files that `save` writes."""
+        """Return the tables, as in the files that `save` writes: name -> table."""
         ...
 
     def scene(self, robot: str | None = None) -> Scene:
-        """Return the scene that the viewer draws: robot, poses, motions, torques.
+        """Return the scene for the viewer: robot, poses, motions, torques.
 
         Args:
             robot: name or file of the robot to draw; None: the result's robot.
@@ -71,7 +77,16 @@ class Result(Protocol):
 
 
 class ExportSettings(NamedTuple):
-    """Source and format of an exported robot: the arguments of `calib.export`."""
+    """Source and format of an exported robot.
+
+    Attributes:
+        urdf: URDF of the nominal robot, to be changed; None: the fit's robot is used.
+        prior: prior for masses that the torques do not identify: ``entropic`` or ``euclidean``.
+        ros2: name of a ROS 2 package to write; empty: all file formats are written instead.
+        moveit: MoveIt files to copy into the package.
+        control: whether the package's URDF gets a ``<ros2_control>`` for mock hardware if it has none.
+        overwrite: whether existing files are replaced.
+    """
 
     urdf: Path | None = None
     prior: str = "entropic"
@@ -82,14 +97,14 @@ class ExportSettings(NamedTuple):
 
 
 class Exported(NamedTuple):
-    """Messages of an export: verdicts other than pass, and remarks on the files."""
+    """Messages of an export: verdicts that are not pass, and remarks on the files."""
 
     verdicts: Sequence[str]
     remarks: Sequence[str]
 
 
 def _has_rows(path: Path) -> bool:
-    """Return whether a table that this toolkit wrote has a row below its header."""
+    """Return whether the CSV table at `path` has a row below its header; comments are ignored."""
     with path.open(encoding="utf-8", errors="replace") as file:
         lines = (line for line in file if not line.startswith("#"))
         return next(lines, None) is not None and next(lines, None) is not None
@@ -97,7 +112,7 @@ def _has_rows(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class StoredResult:
-    """A result in its folder, or in its file.
+    """A result stored in a folder or a file.
 
     Attributes:
         path: path of the folder or file.
@@ -109,7 +124,7 @@ class StoredResult:
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict stated in ``metrics.json``; its level is `NOT_JUDGED` if none is stated."""
+        """The verdict in ``metrics.json``; the level is `NOT_JUDGED` if there is none."""
         metrics = self.to_dict()
         verdict = metrics.get("verdict")
         if isinstance(verdict, Mapping):
@@ -120,57 +135,61 @@ class StoredResult:
 
     @property
     def verdicts(self) -> Verdicts:
-        """The verdicts on the result's stages and deliverables; empty if it is not a calibration."""
+        """The verdicts on the result's stages and deliverables; empty if the result is not a calibration."""
         return Verdicts()
 
     @property
     def session(self) -> Session | None:
-        """The session; None for other kinds."""
+        """The session; None if the result is not a session."""
         return None
 
     @property
     def identification(self) -> IdentificationFolder | None:
-        """Folder of the identified dynamics; None without."""
+        """Folder of the identified dynamics; None if the result has no dynamics."""
         return None
 
     @property
     def fit(self) -> FitFolder | None:
-        """Folder of the fitted geometry; None without."""
+        """Folder of the fitted geometry; None if the result has no fit."""
         return None
 
     def check_arm(self, verb: str) -> None:
-        """Refuse results of robots that are not serial arms; the base class accepts all results."""
+        """Raise an error if the command `verb` does not support this result's robot; the base class never does."""
 
     def require_session(self) -> Session:
-        """Refuse, since the result is not a session; sessions return themselves."""
+        """Raise an error, since the result is not a session; the class of sessions returns the session instead."""
         self.refuse("session", SessionError)
 
     def motion(self) -> Path:
-        """Refuse, since there is no motion to play; motions return their file."""
+        """Raise an error, since there is no motion to play; the class of motions returns the path of a file instead."""
         self.refuse("program")
 
     def to_dict(self) -> ParsedTable:
-        """Return the content of ``metrics.json``; {} if there is no such file."""
+        """Return the content of ``metrics.json``; empty if there is no such file."""
         metrics = self.path / METRICS
         if not metrics.is_file():
             return {}
         return read_json(metrics, "make it again")
 
     def figures(self) -> dict[str, Picture]:
-        """Return the figures that were drawn when the result was written, by name."""
+        """Return the figures that were drawn when the result was written: name -> figure."""
         start = PICTURES.partition("*")[0]
         paths = sorted(self.path.glob(PICTURES))
         return {path.stem.removeprefix(start): Picture(path.read_bytes(), "") for path in paths}
 
     def tables(self) -> dict[str, Table]:
-        """Return the tables of the folder by name; those without rows are left out."""
+        """Return the tables in the folder by name; tables without rows are left out."""
         return {path.stem: read_table(path) for path in sorted(self.path.glob("*.csv")) if _has_rows(path)}
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Copy the folder, without its figures if `plots` is False, and return the path of the copy.
+        """Copy the folder, and return the path of the copy.
+
+        Args:
+            out: path of the copy.
+            plots: whether figures are copied, too.
 
         Raises:
-            UsageError: if other files exist at the target.
+            UsageError: if the target is not an empty folder.
         """
         out = Path(out)
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -181,19 +200,38 @@ class StoredResult:
         )
 
     def scene(self, robot: str | None = None) -> Scene:
-        """Refuse, since there is nothing to draw."""
+        """Raise an error, since there is nothing to draw; subclasses return a scene.
+
+        Args:
+            robot: name or file of the robot to draw; None: the result's robot.
+        """
         self.refuse("view")
 
     def export(self, into: Path, settings: ExportSettings) -> Exported:
-        """Refuse, since there is no calibrated robot to export."""
+        """Raise an error, since there is no calibrated robot to export; subclasses export it.
+
+        Args:
+            into: folder to write into.
+            settings: source and format of the export.
+        """
         self.refuse("export")
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
-        """Refuse, since the result has neither certificate nor report."""
+        """Raise an error, since the result has neither certificate nor report; subclasses return both.
+
+        Args:
+            details: certificate entries made by a person.
+            plots: whether to include figures.
+        """
         self.refuse("certificate")
 
     def certify(self, details: CertificateSection, plots: bool, svg: Path | None) -> list[str]:
-        """Write certificate and report again, and the report's figures as SVG into the folder `svg` (None: no SVG).
+        """Write certificate and report again, and the report's figures as SVG.
+
+        Args:
+            details: certificate entries made by a person.
+            plots: whether to include figures.
+            svg: folder for the SVG figures; None: no SVG figures.
 
         Returns:
             Messages on the written files.
@@ -209,19 +247,28 @@ class StoredResult:
         return lines
 
     def status(self) -> Iterable[object]:
-        """Refuse, since only a session has steps."""
+        """Raise an error, since the result has no steps; the class of sessions yields their status."""
         self.refuse("session", SessionError)
 
     def refuse(self, verb: str, kind: type[CalibError] = UsageError) -> NoReturn:
-        """Raise the error of a verb (`calib.result_kinds.TAKES`) that does not take this result."""
+        """Raise the error that a command does not support this kind of result.
+
+        Args:
+            verb: name of the command, a key of `calib.result_kinds.TAKES`.
+            kind: class of the error.
+        """
         raise kind(refusal(self.path, verb))
 
 
 class Viewed(StoredResult):
-    """A result that the viewer draws from its files."""
+    """A stored result that the viewer can draw."""
 
     def scene(self, robot: str | None = None) -> Scene:
-        """Return the scene that the viewer draws."""
+        """Return the scene for the viewer, read from the result's files.
+
+        Args:
+            robot: name or file of the robot to draw; None: the result's robot.
+        """
         from calib.results import scene_files
 
         return scene_files.read(self.path, robot)

@@ -1,7 +1,7 @@
-"""Reading of scenes (`calib.results.scene`) from folders of results, and from CSV files of poses.
+"""Reading of scenes (`calib.results.scene`) from result folders, and from CSV files of poses.
 
-A folder is that of a fit, an identification, an excitation, a planned motion, or a session that has several of them.
-The robot's meshes are those of the URDF's ``<visual>`` elements.
+A folder is that of a fit, an identification, an excitation, a planned motion, or a session that contains several of
+these. The robot's meshes are those of the URDF's ``<visual>`` elements.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from calib.geometry import installation
 from calib.geometry.installation import Installation, see
 from calib.identification import model_file
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
-from calib.procedure.excitation import coefficients
+from calib.procedure.excitation import coefficients, stored_front
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.robot_kinds import stage_of
 from calib.result_kinds import refusal
-from calib.results.scene import Drawn, ErrorSizes, Measured, Played, Scene, Torques, Visual
+from calib.results.scene import Drawn, ErrorSizes, Measured, Played, Scene, Torques, TradeOffs, Visual
 from calib.robot import calibrated, library
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.collision import find_mesh, urdf_meshes
@@ -35,16 +35,18 @@ from calib.transforms import invert
 
 # meshes that the viewer shows
 DRAWABLE = (".stl", ".obj", ".dae", ".glb", ".gltf")
+# column of the 95 % intervals in tables of errors, without its unit
+INTERVAL95 = "interval95"
 # of a run that is drawn [Hz] (our choice)
 REHEARSAL_RATE = 10.0
 
 
 def read(folder: str | Path, robot: str | None = None) -> Scene:
-    """Return the scene of a folder's results: robot, poses, motions, torques.
+    """Return the scene of the results in a folder: robot, poses, motions, torques.
 
     Args:
         folder: folder of a fit, an identification, an excitation, a plan, or a session; or a CSV of poses or of a run.
-        robot: name or file of the arm to draw; None: the folder's robot.
+        robot: name or file of the robot to draw; None: the robot in the folder.
 
     Raises:
         UsageError: if there is nothing to draw.
@@ -61,7 +63,9 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
     chosen, runs = _plans(pose_files, chain)
     motions = _motions(folder)
     torques = _all_torques(folder, chain)
-    require(measured or sizes or chosen or runs or motions or torques, refusal(folder, "view"), UsageError)
+    fronts, damaged = _fronts(folder)
+    notes += damaged
+    require(measured or sizes or chosen or runs or motions or torques or fronts, refusal(folder, "view"), UsageError)
     if chain is None:
         notes.append("no robot is shown: the folder does not name one; give --robot")
     resolved = folder.resolve()
@@ -74,12 +78,18 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         chosen=tuple(chosen),
         played=(*runs, *motions),
         torques=tuple(torques),
+        fronts=tuple(fronts),
         notes=tuple(notes),
     )
 
 
 def _robot(folder: Path, robot: str | None) -> tuple[Chain | Drawn | None, Path | None]:
-    """Return the robot to draw (None if unknown), and its URDF or other description (None if not found)."""
+    """Return the robot to draw (None: unknown), and the file of its description, such as a URDF (None: not found).
+
+    Args:
+        folder: the result folder.
+        robot: name or file of the robot; None: the robot in the folder.
+    """
     stage = stage_of(robot or folder, "view")
     if stage is not None:
         return stage.run(), None
@@ -105,7 +115,12 @@ def _robot(folder: Path, robot: str | None) -> tuple[Chain | Drawn | None, Path 
 
 
 def _meshes(chain: Chain | Drawn | None, source: Path | None) -> tuple[list[Visual], list[str]]:
-    """Return the meshes of the moving links, and a note on missing meshes."""
+    """Return the meshes of the moving links, and a note if mesh files are missing.
+
+    Args:
+        chain: the robot; None: unknown.
+        source: file of the robot's description; without a URDF of a serial arm there are no meshes.
+    """
     if not isinstance(chain, Chain) or source is None or not is_urdf(source) or not chain.links:
         return [], []
     meshes, missing = visuals(source)
@@ -113,15 +128,17 @@ def _meshes(chain: Chain | Drawn | None, source: Path | None) -> tuple[list[Visu
     moving = [mesh for mesh in meshes if mesh.link in links]
     notes = []
     if missing:
-        notes.append(f"{len(missing)} meshes of {source.name} were not found, e.g. {missing[0]}: links are lines")
+        notes.append(
+            f"{len(missing)} meshes of {source.name} were not found, e.g. {missing[0]}: their links are drawn as lines"
+        )
     return moving, notes
 
 
 def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
-    """Return the meshes of a URDF's ``<visual>`` elements, and the names of missing files.
+    """Return the meshes of a URDF's ``<visual>`` elements, and the names of missing mesh files, for the URDF at `path`.
 
-    The XML is parsed here and not by yourdfpy, which refuses a whole file for one capsule or one ``<visual>`` without
-    geometry (ValueError, TypeError). ``package://`` is resolved as for collision shapes, see `find_mesh`.
+    The XML is not parsed by yourdfpy, which raises an error (ValueError, TypeError) for a file with a capsule or with a
+    ``<visual>`` without geometry. ``package://`` is resolved as for collision shapes, see `find_mesh`.
     """
     search_folders = list(Path(path).resolve().parents)
     meshes = []
@@ -138,7 +155,15 @@ def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
 
 
 def _errors(folder: Path, chain: Chain | Drawn | None) -> tuple[list[Measured], list[ErrorSizes]]:
-    """Return the errors of a fit's rows, and of a session's unseen poses: with position, and magnitudes only."""
+    """Return the errors of a fit's rows and of a session's held-out poses.
+
+    Args:
+        folder: folder of a fit or of a session.
+        chain: the robot that is drawn; None: unknown.
+
+    Returns:
+        Errors with positions in the arm's base frame, and errors of which only the magnitudes are known.
+    """
     measured = []
     sizes = []
     for fit_folder in (folder, folder / IN_SESSION):
@@ -152,7 +177,14 @@ def _errors(folder: Path, chain: Chain | Drawn | None) -> tuple[list[Measured], 
 
 
 def _measured(folder: Path, chain: Chain | Drawn | None) -> Measured:
-    """Return the measured positions of ``residuals.csv``, with the predictions of both arms."""
+    """Return the measured positions in ``residuals.csv``, with the predictions of both arms.
+
+    The arms are the nominal and the calibrated one.
+
+    Args:
+        folder: folder of the fit.
+        chain: the robot that is drawn; None: unknown.
+    """
     if isinstance(chain, Drawn):
         return Measured(*chain.measured(folder))
     after, before = installation.read_arms(folder)
@@ -181,11 +213,23 @@ def _measured(folder: Path, chain: Chain | Drawn | None) -> Measured:
             nominal_cell = replace(after, chain=before.chain)
         nominal[rows] = _points(nominal_cell, q[rows], s, t) @ rotation + T_base_station[:3, 3]
     unseen = np.array(table.texts("set")) != "fit"
-    return Measured(q, seen, nominal, modelled, unseen, turned)
+    return Measured(q, seen, nominal, modelled, unseen, turned, _intervals(table))
+
+
+def _intervals(table: Table) -> np.ndarray | None:
+    """Return the radii (m,) [m] of the rows' 95 % intervals; None in a table of an earlier version."""
+    if INTERVAL95 not in table:
+        return None
+    return table.numbers(INTERVAL95, "length", gaps=True)
 
 
 def _unplaced(folder: Path, chain: Chain | Drawn | None) -> list[ErrorSizes]:
-    """Return the errors of the rows of ``residuals.csv`` without a position in the arm's base, by their kind."""
+    """Return the errors of those rows of ``residuals.csv`` that have no position in the arm's base frame, by kind.
+
+    Args:
+        folder: folder of the fit.
+        chain: the robot that is drawn; None: unknown.
+    """
     if isinstance(chain, Drawn):
         return []
     cell = installation.read(folder)
@@ -198,18 +242,30 @@ def _unplaced(folder: Path, chain: Chain | Drawn | None) -> list[ErrorSizes]:
         nominal = part.numbers("nominal size", "length", gaps=True)
         fitted = part.numbers("size", "length", gaps=True)
         unseen = np.array(part.texts("set")) != "fit"
-        result.append(ErrorSizes(kind, _joint_values(part, cell), nominal, fitted, unseen))
+        result.append(ErrorSizes(kind, _joint_values(part, cell), nominal, fitted, unseen, _intervals(part)))
     return result
 
 
 def _is_placed(table: Table, cell: Installation) -> np.ndarray:
-    """Return which rows (m,) of ``residuals.csv`` have a measured position that a station of the fit places."""
+    """Return flags (m,): whether a row's error can be drawn as an arrow at the measured position.
+
+    This requires a measured position and a station whose pose the fit contains.
+
+    Args:
+        table: content of ``residuals.csv`` (m rows).
+        cell: the calibrated arm with the poses of stations and tools.
+    """
     has_position = ~np.isnan(table.numbers("dx", "length", gaps=True))
     return has_position & np.isin(table.texts("station"), cell.station_names)
 
 
 def _with_unseen(fitted: Measured, errors: Path) -> Measured:
-    """Return the fitted poses followed by a session's unseen poses, if its file of errors exists."""
+    """Return the fitted poses, followed by the held-out poses of a session if there is a file of their errors.
+
+    Args:
+        fitted: the poses of the fit.
+        errors: path of the file of held-out poses; it need not exist.
+    """
     if not errors.is_file():
         return fitted
     table = read_table(errors)
@@ -229,26 +285,61 @@ def _with_unseen(fitted: Measured, errors: Path) -> Measured:
         np.concatenate([fitted.calibrated, modelled]),
         np.concatenate([fitted.unseen, np.ones(len(q), dtype=bool)]),
         np.concatenate([fitted.turned, np.full((len(q), 3), np.nan)]),
+        _joined(fitted.interval, _intervals(table)),
     )
 
 
+def _joined(fitted: np.ndarray | None, held_out: np.ndarray | None) -> np.ndarray | None:
+    """Return the intervals of fitted and of held-out rows; None where either is unknown."""
+    if fitted is None or held_out is None:
+        return None
+    return np.concatenate([fitted, held_out])
+
+
 def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.ndarray:
-    """Return the tool's positions (m, 3) in the station's frame, deflections included."""
+    """Return the tool's positions (m, 3) [m] in the station's frame at joint values q (m, n), deflections included.
+
+    Args:
+        cell: arm, stations and tools.
+        q: joint values [rad or m].
+        station, tool: indices (from 0) of the station and of the tool.
+    """
     return see(cell, q, station, tool).point.T
 
 
 def _joint_values(table: Table, cell: Installation) -> np.ndarray:
-    """Return the joint values (m, n) [rad or m] of ``residuals.csv``."""
+    """Return the joint values (m, n) [rad or m] in ``residuals.csv``.
+
+    Args:
+        table: content of the file.
+        cell: the arm, whose joint names are the columns' names.
+    """
     return np.column_stack([table.numbers(joint.name, "joint") for joint in cell.chain.joints])
 
 
 def _triples(table: Table, head: str, dimension: str) -> np.ndarray:
-    """Return the columns x, y, z of a table whose names begin with `head`, as (m, 3) in SI; NaN where empty."""
+    """Return three columns of a table, named `head` followed by x, y, z, as an array (m, 3) in SI units.
+
+    Empty cells are NaN.
+
+    Args:
+        table: the table.
+        head: beginning of the columns' names.
+        dimension: kind of quantity, such as "length", by which the column's unit is converted.
+    """
     return np.column_stack([table.numbers(f"{head}{axis}", dimension, gaps=True) for axis in "xyz"])
 
 
 def _plans(paths: list[Path], chain: Chain | Drawn | None) -> tuple[list[tuple[str, np.ndarray]], list[Played]]:
-    """Return the lists of poses (name and joint values), and the runs through poses; neither without a robot."""
+    """Return the lists of poses, and the measuring runs through poses, that CSV files contain.
+
+    Args:
+        paths: the CSV files.
+        chain: the robot; None: unknown, and both results are empty.
+
+    Returns:
+        Name and joint values (m, n) of each list, and the runs.
+    """
     chosen = []
     runs = []
     if chain is None:
@@ -264,13 +355,18 @@ def _plans(paths: list[Path], chain: Chain | Drawn | None) -> tuple[list[tuple[s
 
 
 def is_run(path: Path) -> bool:
-    """Return whether a CSV file contains a run."""
+    """Return whether the CSV file `path` contains a measuring run, which has times, instead of a list of poses."""
     with path.open(encoding="utf-8", errors="replace") as file:
         return file.readline().startswith(("t [s],pose,", "t,pose,"))
 
 
 def rehearsed_samples(path: Path, chain: Chain, rate: float = REHEARSAL_RATE) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) [s] and joint values (N, n) [rad or m] of a run's file at `rate` [Hz], for a rehearsal.
+    """Return times (N,) [s] and joint values (N, n) [rad or m] of a measuring run, interpolated at a rate.
+
+    Args:
+        path: file of the run.
+        chain: the arm.
+        rate: rate of the samples [Hz].
 
     Raises:
         MeasurementError: if a joint's column is missing.
@@ -300,7 +396,14 @@ def _motions(folder: Path) -> list[Played]:
 
 
 def _all_torques(folder: Path, chain: Chain | Drawn | None) -> list[Torques]:
-    """Return the measured and predicted torques of a folder and its subfolders."""
+    """Return the measured and predicted torques in a folder and its subfolders.
+
+    If there is held-out motion, only its torques are returned.
+
+    Args:
+        folder: the folder.
+        chain: the robot, which names the torques; None: unknown.
+    """
     result = []
     for path in _below(folder, "torques_*.csv"):
         # A folder that also holds unseen motions shows those alone.
@@ -311,16 +414,32 @@ def _all_torques(folder: Path, chain: Chain | Drawn | None) -> list[Torques]:
         predicted = _columns(table, "predicted", path)
         rows, units = _torque_rows(path.parent, chain, measured.shape[1])
         label = _label(path, folder)
-        result.append(Torques(label, rows, units, _seconds(table), measured, predicted, table.block("q")))
+        extra = {name: table.block(name) for name in ("q", "sigma", "nominal")}
+        result.append(Torques(label, rows, units, _seconds(table), measured, predicted, **extra))
     return result
 
 
+def _fronts(folder: Path) -> tuple[list[TradeOffs], list[str]]:
+    """Return the fronts of trade-offs in a folder and its subfolders, and notes on those that cannot be read."""
+    fronts = []
+    notes = []
+    for path in _below(folder, stored_front.TABLE):
+        try:
+            front = stored_front.read(path.parent).values
+        except CalibError as reason:
+            notes.append(f"{path.parent.name}: no front is shown: {reason}")
+            continue
+        name = path.parent.resolve().name
+        fronts.append(TradeOffs(name, tuple(front.names), front.values, front.best, front.designed))
+    return fronts, notes
+
+
 def _torque_rows(folder: Path, chain: Chain | Drawn | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the labels and units of an identification's torque rows.
+    """Return the labels and the units of an identification's torque rows.
 
     Args:
-        folder: folder of the table of torques: that of the identification, or its subfolder ``unseen``.
-        chain: the robot; None if unknown.
+        folder: folder with the table of torques: that of the identification, or its subfolder ``unseen``.
+        chain: the robot; None: unknown.
         count: number of torque rows.
     """
     if chain is not None:
@@ -338,7 +457,13 @@ def _torque_rows(folder: Path, chain: Chain | Drawn | None, count: int) -> tuple
 
 
 def _model_rows(model: dict, chain: Chain | Drawn, count: int) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
-    """Return labels and units of the torque rows by ``dynamics.json``; None if their number is not `count`."""
+    """Return labels and units of an identified model's torque rows; None if the model has not `count` rows.
+
+    Args:
+        model: content of ``dynamics.json``.
+        chain: the robot.
+        count: number of torque rows in the table.
+    """
     unit = model.get("unit", "N m")
     if isinstance(chain, Drawn):
         titles, units = chain.torque_rows(model.get("kind", ""))
@@ -357,7 +482,10 @@ def _model_rows(model: dict, chain: Chain | Drawn, count: int) -> tuple[tuple[st
 
 
 def _below(folder: Path, pattern: str) -> list[Path]:
-    """Return the files of a folder and of its subfolders down to two levels, the folder's files first."""
+    """Return the files that match a pattern in a folder and in subfolders down to two levels.
+
+    Files of the folder itself are first.
+    """
     paths = []
     for subfolders in ("", "*/", "*/*/"):
         paths += sorted(folder.glob(subfolders + pattern))
@@ -365,7 +493,7 @@ def _below(folder: Path, pattern: str) -> list[Path]:
 
 
 def _label(path: Path, folder: Path) -> str:
-    """Return the label under which a file of a folder or of its subfolders is shown."""
+    """Return the name under which the viewer shows the file `path`, which is in `folder` or in a subfolder of it."""
     parent = path.parent
     if parent == folder:
         return path.stem
@@ -379,7 +507,16 @@ def _seconds(table: Table) -> np.ndarray:
 
 
 def _columns(table: Table, letter: str, path: Path) -> np.ndarray:
-    """Return the required columns letter_joint of a file as (N, n)."""
+    """Return the columns of a quantity for all joints as an array (N, n).
+
+    Args:
+        table: the table.
+        letter: beginning of the columns' names, such as ``q``.
+        path: the file, for the message.
+
+    Raises:
+        UsageError: if the columns are missing.
+    """
     block = table.block(letter)
     if block is None:
         raise UsageError(f"{path} has no columns {letter}_joint …; was it written by this toolkit?")

@@ -1,1 +1,1 @@
-OFFERS = {"descriptions": "descriptions.reading:"}
+OFFERS = {"descriptions": "descriptions.urdf_conversion:"}

@@ -60,7 +60,14 @@ BASES = ("torque", "lever", "joint", "cos", "sin")
 
 @dataclass(frozen=True)
 class Term:
-    """One deflection effect: name of the moved element, basis, index of the source joint or link, order k (or axis)."""
+    """One deflection effect, which adds a displacement to an element of the chain.
+
+    Attributes:
+        element: name of the moved element.
+        basis: name of the basis function: torque, lever, joint, cos or sin.
+        source: index of the joint or link on which the basis function depends.
+        order: order k of sin and cos; axis of a lever (0 x, 1 y, 2 z).
+    """
 
     element: str
     basis: str
@@ -73,13 +80,13 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class Deflection:
-    """Deflection terms (joint corrections) with their coefficients (E,).
+    """Deflection terms (joint corrections) with their coefficients.
 
     Attributes:
         terms: the E effects.
-        coefficients: (E,) coefficients [unit of the element per unit of the basis].
-        reference: the chain on which levers (and gravity torques) are evaluated: the nominal one, so that a basis does
-            not change while the geometry is fitted.
+        coefficients: (E,) coefficients [unit of the element per unit of the basis function].
+        reference: the chain for which levers and gravity torques are computed. It is the nominal one, so that the basis
+            functions do not change while the geometry is fitted.
     """
 
     terms: tuple[Term, ...] = ()
@@ -90,7 +97,11 @@ class Deflection:
         return replace(self, coefficients=np.asarray(values, dtype=float))
 
     def names(self, chain: Chain) -> tuple[str, ...]:
-        """Return one name per term for tables, e.g. ``theta3 per N·m``, ``theta3 sin 2 q4``."""
+        """Return one name per term for tables, such as ``theta3 per N·m`` or ``theta3 sin 2 q4``.
+
+        Args:
+            chain: the arm, which provides names and kinds of joints and elements.
+        """
         return tuple(_name(term, chain) for term in self.terms)
 
 
@@ -106,16 +117,16 @@ def _name(term: Term, chain: Chain) -> str:
 
 
 def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = None) -> np.ndarray:
-    """Return the value of each term's basis function (E, m) at joint values q (m, n).
+    """Return the values (E, m) of the terms' basis functions at joint values q (m, n).
 
     Args:
         deflection: the terms, with their reference chain.
-        q: (m, n).
-        torque: (m, n) gravity torques [N m], for terms of basis ``torque``;
-            None: those computed from the reference chain's masses.
+        q: (m, n) joint values [rad or m].
+        torque: (m, n) gravity torques [N m], for terms with the basis ``torque``; None: computed from the reference
+            chain's masses.
 
     Raises:
-        CalibError: if a term needs gravity torques and the reference chain has no masses.
+        CalibError: a term needs gravity torques, and the reference chain has no masses.
     """
     if torque is None and any(term.basis == "torque" for term in deflection.terms):
         torque = _reference_torques(deflection, q)
@@ -141,7 +152,7 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
     if lever_terms:
         chain = deflection.reference
         if chain is None:
-            raise CalibError("sag terms need the chain that levers are taken from (reference)")
+            raise CalibError("sag terms need reference, the chain from which lever arms are computed")
         gravity = chain.gravity / np.linalg.norm(chain.gravity)
         # (z × u) · ĝ = (ĝ × z) · u
         gravity_cross_axis = np.cross(gravity, np.moveaxis(sweep(chain, q).directions, 1, -1))
@@ -155,7 +166,7 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
 
 
 def _reference_torques(deflection: Deflection, q: np.ndarray) -> np.ndarray:
-    """Return the gravity torques (m, n) [N m] of the deflection's reference chain at q (m, n)."""
+    """Return the gravity torques (m, n) [N m] of the deflection's reference chain at joint values q (m, n)."""
     chain = deflection.reference
     if chain is None or chain.inertias is None:
         raise CalibError("a compliance needs gravity torques: state the robot's masses, or have them fitted")
@@ -165,7 +176,14 @@ def _reference_torques(deflection: Deflection, q: np.ndarray) -> np.ndarray:
 def extra_displacements(
     chain: Chain, deflection: Deflection, q: np.ndarray, bases: np.ndarray | None = None
 ) -> np.ndarray | None:
-    """Return the displacement (K, m) that the deflection adds to each element; None without terms."""
+    """Return the displacements (K, m) [rad or m] that the deflection adds to the K elements; None without terms.
+
+    Args:
+        chain: the arm.
+        deflection: the terms with their coefficients.
+        q: (m, n) joint values [rad or m].
+        bases: (E, m) values of the basis functions at q; None to compute them.
+    """
     if not deflection.terms:
         return None
     if bases is None:
@@ -180,19 +198,20 @@ def extra_displacements(
 
 
 def target_elements(chain: Chain, deflection: Deflection) -> np.ndarray:
-    """Return the indices (E,) of the elements moved by the terms."""
+    """Return the index (E,) of the element of `chain` that each term of `deflection` moves."""
     table = {name: k for k, name in enumerate(chain.names)}
     return np.array([table[term.element] for term in deflection.terms], dtype=int)
 
 
 @dataclass(frozen=True, eq=False)
 class CorrectedChain:
-    """Geometry fitted together with joint corrections; valid only with these corrections.
+    """Geometry fitted together with joint corrections; it is valid only in combination with these corrections.
 
     Attributes:
         chain: the geometry.
         deflection: the corrections (at least one term).
-        covariance: (K + E, K + E) of the chain's element values and the corrections' coefficients; None if unknown.
+        covariance: (K + E, K + E) covariance of the chain's element values and the corrections' coefficients; None if
+            unknown.
     """
 
     chain: Chain
@@ -204,15 +223,15 @@ class CorrectedChain:
 class CalibratedChain:
     """Robot resulting from a geometric fit: input of identification, excitation, export and compensation.
 
-    ``print`` shows its joints and their limits.
+    ``print`` shows the robot's joints and their limits.
 
     Attributes:
         chain: the best geometry without joint corrections, for URDF export.
         nominal: the arm before calibration; None if unknown.
-        covariance: (K, K) of the chain's element values [m, rad], zero if an element was not fitted; None without a
-            fit.
-        corrections: joint corrections and the geometry fitted with them; None without any.
-        source: the calibrated robot description, as named by the user; empty if unknown.
+        covariance: (K, K) covariance of the chain's element values [m, rad], zero for elements that were not fitted;
+            None without a fit.
+        corrections: joint corrections and the geometry fitted with them; None without corrections.
+        source: the calibrated robot description, as the user named it; empty if unknown.
     """
 
     chain: Chain
@@ -264,7 +283,7 @@ class CalibratedChain:
 
     @property
     def moved(self) -> bool:
-        """Whether the nominal arm is known and calibration changed one of its elements."""
+        """Whether the nominal arm is known and the calibration changed one of its element values."""
         return self.nominal is not None and not np.array_equal(self.nominal.values, self.chain.values)
 
     def forward(self, q: ArrayLike, torque: np.ndarray | None = None) -> np.ndarray:
@@ -274,46 +293,58 @@ class CalibratedChain:
 
         Args:
             q: joint values (m, n), or (n,) for one pose.
-            torque: (m, n) gravity torques [N m] for corrections by compliance; None: those of the masses that the fit
-                used.
+            torque: (m, n) gravity torques [N m] for corrections by compliance; None: computed from the masses that the
+                fit used.
 
         Raises:
-            CalibError: for arrays of a wrong shape, and for corrections by compliance without torques or masses.
+            CalibError: an array of a wrong shape, or corrections by compliance without torques or masses.
         """
         values = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, self.chain.n), "q")
         bases = evaluate(self.deflection, values, torque) if self.deflection.terms else None
         return forward(self.complete, values, extra_displacements(self.complete, self.deflection, values, bases))
 
     def jacobian(self, q: ArrayLike) -> np.ndarray:
-        """Return the tip's Jacobian (m, 6, n) [v; ω] in the base frame at joint values q (m, n), without corrections.
+        """Return the tip's Jacobian (m, 6, n) [v; ω] in the base frame at joint values q (m, n) [rad or m].
+
+        v is the velocity of the tip, ω its angular velocity, per unit joint velocity. The derivatives of joint
+        corrections are not included.
 
         Raises:
-            CalibError: for joint values of a wrong shape.
+            CalibError: joint values of a wrong shape.
         """
         values = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, self.chain.n), "q")
         return tip_jacobian(self.complete, values)
 
     def without_corrections(self) -> CalibratedChain:
-        """Return the robot without its joint corrections, as a URDF describes it."""
+        """Return the robot without its joint corrections, as a URDF can describe it."""
         return replace(self, corrections=None)
 
 
 def as_calibrated(robot: Chain | CalibratedChain) -> CalibratedChain:
-    """Return a calibrated robot unchanged, and a plain chain as a robot without covariance and nominal geometry."""
+    """Return a calibrated robot unchanged; a plain chain becomes a robot without covariance and nominal geometry."""
     return robot if isinstance(robot, CalibratedChain) else CalibratedChain(robot)
 
 
 def read(path: str | Path) -> CalibratedChain:
-    """Return the calibrated robot of a fit's (or an identification's) folder, or of any ``robot.toml``.
+    """Return the calibrated robot in the folder of a fit or an identification, or in any ``robot.toml``.
+
+    Args:
+        path: the folder, or the file.
 
     Raises:
-        RobotError: for an invalid file; the message names the file and the fault.
+        RobotError: an invalid file; the message names the file and the error.
     """
     return read_whole(path)[0]
 
 
 def read_whole(path: str | Path) -> tuple[CalibratedChain, ParsedTable]:
-    """Return the calibrated robot, as `read`, and the extra tables of its file (`calib.robot.description.EXTRA`)."""
+    """Return the calibrated robot, as `read` does, and the extra tables of its file.
+
+    `calib.robot.description.EXTRA` names the extra tables.
+
+    Args:
+        path: the folder, or the file.
+    """
     path = Path(path)
     if path.is_dir():
         path = path / ROBOT
@@ -349,13 +380,13 @@ def write(
     record: Mapping[str, object] | None = None,
     comment: str = "",
 ) -> None:
-    """Write a calibrated robot to ``robot.toml`` and ``chain_covariance.csv``; `read` returns the same robot.
+    """Write a calibrated robot to ``robot.toml`` and ``chain_covariance.csv``; `read` returns an equal robot.
 
     Args:
         folder: an existing folder.
         robot: the calibrated robot.
-        tables: further tables of ``robot.toml`` (`calib.robot.description.EXTRA`).
-        record: further entries of the table ``[provenance]``.
+        tables: further tables of ``robot.toml`` (`calib.robot.description.EXTRA`); None for no such tables.
+        record: further entries of the table ``[provenance]``; None for no such entries.
         comment: source of the numbers, written as a comment.
     """
     nominal = None if robot.nominal is None else robot.nominal.values
@@ -377,7 +408,7 @@ def nominal_of(robot: CalibratedChain) -> Chain:
     """Return the nominal chain of a calibrated robot.
 
     Raises:
-        RobotError: if the nominal chain is unknown.
+        RobotError: the nominal chain is unknown.
     """
     if robot.nominal is None:
         raise RobotError(f"the nominal robot of '{robot.chain.name}' is unknown; fit again")
@@ -385,8 +416,13 @@ def nominal_of(robot: CalibratedChain) -> Chain:
 
 
 def _covariance(path: Path, names: tuple[str, ...]) -> np.ndarray | None:
-    """Return the covariance (k, k) of named values, zero for names that are not in the file's table; None without the
-    file.
+    """Return the covariance (k, k) of the values `names` from a file; None if the file does not exist.
+
+    The covariance is zero for names that the file does not contain.
+
+    Args:
+        path: CSV file of a covariance with names.
+        names: the k names of the wanted values, in order.
     """
     if not path.is_file():
         return None
@@ -432,7 +468,9 @@ def _deflection(table: ParsedTable, chain: Chain, where: str) -> Deflection:
         check_keys(entry, ("element", "basis", "joint", "order", "coefficient"), where)
         for key, names in (("element", chain.names), ("joint", chain.joint_names)):
             if entry.get(key) not in names:
-                refuse_robot(where, f"{key} {entry.get(key)!r} does not exist in the robot")
+                refuse_robot(
+                    where, f"{key} {entry.get(key)!r} does not exist in the robot; correct or remove this entry"
+                )
         source = chain.joint_names.index(entry["joint"])
         terms.append(Term(entry["element"], entry.get("basis", ""), source, int(entry.get("order", 0))))
         coefficients.append(number(entry.get("coefficient"), f"{where}, coefficient"))

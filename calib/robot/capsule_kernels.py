@@ -1,12 +1,17 @@
-"""Collision test of an arm of capsules, compiled (numba): each posture ends at the first pair in collision.
+"""Collision test of an arm made of capsules, compiled with numba: each posture ends at its first pair in collision.
 
-Path search tests a few postures at a time, thousands of times: NumPy's calls would cost more than the numbers.
+A path search tests a few postures at a time, thousands of times. The overhead of NumPy's calls would cost more than the
+arithmetic. The arguments are:
 
-    form      (K, 5): axis (0 to 5 as `calib.robot.chain.AXES`), sign, value, ratio, joint (-1: it does not move)
-    fixed     (K + 1, 12): rotation by rows and origin before each element; row K the tail
-    attached  (E, 7): links outside the chain: number of moving elements before the link; start and end in the frame of
-    the last of these targets   (T, 3) in the tip's frame [m] pairs     (P, 2) capsules compared with each other, radii
-    (C,) [m] faces     (W, 5): capsule, normal, offset of a wall
+    form      (K, 5) elements of the chain: axis (0 to 5 as `calib.robot.chain.AXES`), sign, value, ratio, joint
+              (-1: constant)
+    fixed     (K + 1, 12) fixed transforms: rotation by rows and origin before each element; row K is the tail
+    attached  (E, 7) links outside the chain: number of moving elements before the link; start and end of its capsule
+              in the frame of the last of these elements [m]
+    targets   (T, 3) measured targets in the tip's frame [m]
+    pairs     (P, 2) indices of capsules to compare with each other
+    radii     (C,) radii of the capsules [m]
+    faces     (W, 5) walls to compare with a capsule: index of the capsule, normal, offset
 """
 
 from math import cos, sin, sqrt
@@ -19,10 +24,14 @@ OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 @njit(**OPTIONS)
 def clear(q, form, fixed, stand, attached, targets, pairs, radii, faces, margin):
-    """Return the mask (m,) of joint values q (m, n) with all distances of `pairs` and `faces` above `margin` [m].
+    """Return at which joint values q (m, n) all distances of `pairs` and `faces` exceed `margin` [m], (m,) bool.
 
     Args:
-        stand: height [m] of the lower end of the base's capsule. Other arguments: see the module.
+        q: (m, n) joint values [rad or m].
+        form, fixed, attached, targets, pairs, radii, faces: arrays of the capsule model, described in the module's
+            docstring.
+        stand: height [m] of the lower end of the base's capsule.
+        margin: least distance [m].
     """
     count, moving = len(form), 0
     for k in range(count):
@@ -50,7 +59,14 @@ def clear(q, form, fixed, stand, attached, targets, pairs, radii, faces, margin)
 
 @njit(**OPTIONS)
 def _lines(q, form, fixed, stand, attached, targets, lines):
-    """Write the lines of all capsules (base, moving bodies, links outside the chain, targets) into `lines`."""
+    """Write the centre lines of all capsules into `lines`: base, moving bodies, links outside the chain, targets.
+
+    Args:
+        q: (n,) joint values of one posture [rad or m].
+        form, fixed, attached, targets: arrays of the capsule model, described in the module's docstring.
+        stand: height [m] of the lower end of the base's capsule.
+        lines: array to write, one row per capsule: start and end (6) [m].
+    """
     r, x, rotated = np.zeros((3, 3)), np.zeros(3), np.empty((3, 3))
     r[0, 0] = r[1, 1] = r[2, 2] = 1.0
     lines[0] = 0.0
@@ -99,7 +115,15 @@ def _lines(q, form, fixed, stand, attached, targets, lines):
 
 @njit(**OPTIONS)
 def _carry(r, x, body, attached, lines, first):
-    """Write the lines of the links fixed to a body with rotation r and origin x into `lines`, from row `first` on."""
+    """Write the centre lines of the links fixed to a body into `lines`, from row `first` on.
+
+    Args:
+        r, x: rotation (3, 3) and origin (3,) of the body's frame in the base.
+        body: number of moving elements before the body.
+        attached: links outside the chain, as in the module's docstring.
+        lines: array to write, one row per capsule: start and end (6) [m].
+        first: row of the first link.
+    """
     for e in range(len(attached)):
         if attached[e, 0] == body:
             for a in range(3):
@@ -112,14 +136,17 @@ def _carry(r, x, body, attached, lines, first):
 
 @njit(**OPTIONS)
 def _put(x, lines, row, first):
-    """Write x (3,) into a row of `lines`, starting at column `first` (numba compiles slices slowly)."""
+    """Write x (3,) into row `row` of `lines`, starting at column `first` (numba compiles slices slowly)."""
     for a in range(3):
         lines[row, first + a] = x[a]
 
 
 @njit(**OPTIONS)
 def _apart(first, second):
-    """Return the distance of two line segments (6,), given by start and end (Ericson 2005, 5.1.9)."""
+    """Return the distance [m] between the line segments `first` and `second` (6,), each given by start and end.
+
+    The method is that of Ericson (2005), 5.1.9.
+    """
     uu = vv = uv = uw = vw = 0.0
     for a in range(3):
         u, v, w = first[3 + a] - first[a], second[3 + a] - second[a], first[a] - second[a]

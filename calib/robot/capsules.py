@@ -1,9 +1,9 @@
-"""Distances between an arm of capsules, the floor and obstacles, in batches of poses without a loop.
+"""Distances between an arm made of capsules, walls and obstacles, computed for many poses at once.
 
-Each body is a capsule along the line from its joint's frame to the next one, the last one's to the tip, and each target
-is a thin capsule from the tip to the target: coarse where links bend away from these lines. Distances between capsules
-are the distances of their centre lines (Ericson 2005, Real-Time Collision Detection, 5.1.9) less the radii. Obstacles
-and their signed distances are in `calib.robot.obstacles`.
+Each body is a capsule along the line from its joint's frame to the next joint's frame, for the last body to the tip.
+Each target is a thin capsule from the tip to the target. This is coarse where links deviate from these lines. The
+distance of two capsules is the distance of their centre lines (Ericson 2005, Real-Time Collision Detection, 5.1.9)
+minus the radii. `calib.robot.obstacles` defines obstacles and signed distances from them.
 """
 
 from __future__ import annotations
@@ -42,12 +42,15 @@ MIN_SQUARE = 1e-18
 
 @dataclass(frozen=True, eq=False)
 class Attached:
-    """Link outside the chain: a capsule fixed to a body of the arm, or to its base; a sphere where it has no length.
+    """Link outside the chain, as a capsule fixed to a body of the arm or to the base.
+
+    A link whose start and end coincide is a sphere.
 
     Attributes:
+        name: name of the link.
         body: number of moving elements before the link; 0 for a link fixed to the base.
-        start, end: (3,) ends of the capsule's line [m], in the frame of the last of these elements or in the base
-            frame.
+        start, end: (3,) ends of the capsule's centre line [m], in the frame of the last of these elements, or in the
+            base frame.
     """
 
     name: str
@@ -59,23 +62,23 @@ class Attached:
 def inseparable(
     pairs: Sequence[tuple[str, str]], distances: np.ndarray, fixed: np.ndarray, margin: float, slack: float = 0.0
 ) -> tuple[np.ndarray, tuple[tuple[str, str], ...]]:
-    """Return the mask (pairs,) of pairs that touch in nearly every posture, and their names.
+    """Return which pairs touch in nearly every posture, (pairs,) bool, and the names of these pairs.
 
-    Two parts of the arm count if they are nearer than `margin` in at least 95 % of the postures (as in MoveIt's setup
-    assistant), or never further apart than margin + slack: neighbours, whose shapes overlap by construction. A part of
-    the arm and an object fixed in the world count only if no joint changes their distance: an obstacle that the arm
-    nearly always hits remains an obstacle. Such a fixed link, the turret of an arm, may overlap what it stands on by
-    the resolution of the shapes.
+    Two parts of the arm are such a pair if they are nearer than `margin` in at least 95 % of the postures (as in
+    MoveIt's setup assistant), or never further apart than margin + slack: neighbours, whose shapes overlap by
+    construction. A part of the arm and an object fixed in the world are such a pair only if no joint changes their
+    distance, since an obstacle that the arm nearly always hits remains an obstacle. A part of the arm that no joint
+    moves relative to the object, such as a turret, may overlap the object by the resolution of the shapes.
 
     Args:
         pairs: names of link and link, or of link and object.
-        distances: (N, pairs) [m] in N random postures, signed.
+        distances: (N, pairs) signed distances in N random postures [m].
         fixed: (pairs,) whether the second of the pair is fixed in the world.
         margin: the least distance that will be required [m].
         slack: distance that shapes as coarse as capsules cannot resolve [m].
 
     Raises:
-        RobotError: for a floor or obstacle in permanent collision with a link (wrong size or position).
+        RobotError: a floor or obstacle in permanent collision with a link (wrong size or position).
     """
     nearly_always = (distances <= margin).mean(axis=0) >= ALWAYS
     highest = distances.max(axis=0)
@@ -97,9 +100,13 @@ def inseparable(
 
 
 def usual_radius(chain: Chain) -> float:
-    """Return the default radius [m] of the capsules that represent an arm's links.
+    """Return the default radius of the capsules that represent an arm's links [m].
 
-    A base below the first joint counts at most as long as the longest link, so that a pillar does not thicken the arm.
+    The radius is a share of the arm's length. A base below the first joint counts at most as long as the longest link,
+    so that a pillar does not thicken the arm.
+
+    Args:
+        chain: the arm.
     """
     lines = _lines_of(chain, np.zeros((1, chain.n)), np.empty((0, 3)))
     lengths = np.linalg.norm(lines.end - lines.start, axis=2)[0]
@@ -111,10 +118,10 @@ def usual_radius(chain: Chain) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Lines:
-    """Centre lines of the capsules in m postures.
+    """Centre lines of C capsules, and axes of the moving elements, in m postures.
 
     Attributes:
-        start, end: (m, C, 3) ends of the lines of C capsules [m].
+        start, end: (m, C, 3) ends of the centre lines [m].
         axes, origins: (m, K, 3) direction and origin [m] of the axis of each of K moving elements.
     """
 
@@ -124,13 +131,15 @@ class _Lines:
     origins: np.ndarray
 
     def of_postures(self, chosen: np.ndarray) -> _Lines:
-        """Return the lines in the postures `chosen`, a mask (m,) or indices."""
+        """Return the lines in only the postures `chosen`, a mask (m,) or indices."""
         return _Lines(self.start[chosen], self.end[chosen], self.axes[chosen], self.origins[chosen])
 
 
 @dataclass(frozen=True, eq=False)
 class Capsules:
-    """Collision model of an arm of capsules, walls and obstacles; same methods as `calib.robot.collision.Collision`.
+    """Collision model of an arm made of capsules, with walls and obstacles.
+
+    It has the same methods as `calib.robot.collision.Collision`.
 
     Attributes:
         chain: the arm.
@@ -139,12 +148,12 @@ class Capsules:
         radii: (C,) radii of the capsules [m].
         solid: (S,) indices of the capsules with a length; others are ignored.
         targets: (T, 3) positions of the targets in the tip's frame [m]; their capsules are the last T.
-        beside: links outside the chain; their capsules come before those of the targets.
         arm_pairs: (P, 2) pairs of capsules to compare.
-        world_pairs: (W, 2) pairs of capsule and wall or obstacle (walls first) to compare.
+        world_pairs: (W, 2) pairs of a capsule and a wall or obstacle (walls first) to compare.
         walls: planes that the arm must not cross, including the floor.
         obstacles: obstacles in the base frame.
         excluded: pairs that are not compared, since they touch in nearly every posture.
+        beside: links outside the chain; their capsules precede those of the targets.
     """
 
     chain: Chain
@@ -170,11 +179,17 @@ class Capsules:
         return (*arm_pairs, *world_pairs)
 
     def distances(self, q: np.ndarray) -> np.ndarray:
-        """Return the distances (m, pairs) [m] at joint values q (m, n); negative: depth of penetration."""
+        """Return the distances (m, pairs) [m] at joint values q (m, n); negative values are depths of penetration."""
         return self._pair_distances(self.lines_at(q))[0]
 
     def gradients(self, q: np.ndarray) -> np.ndarray:
-        """Return the derivatives (m, pairs, n) of `distances`: normal times the velocities of the nearest points."""
+        """Return the derivatives (m, pairs, n) of `distances` by the joint values.
+
+        They are the relative velocities of the nearest points along the normal.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+        """
         lines = self.lines_at(q)
         _, normal, first_point, second_point = self._pair_distances(lines)
         count = len(self.arm_pairs)
@@ -185,7 +200,7 @@ class Capsules:
         return slope
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Return the mask (m,) of joint values q (m, n) with all distances larger than `margin` [m]."""
+        """Return at which joint values q (m, n) all distances are larger than `margin` [m], (m,) bool."""
         from calib.robot.capsule_kernels import clear  # numba
 
         q = shaped(q, (None, self.chain.n), f"joint values of '{self.chain.name}'")
@@ -204,7 +219,7 @@ class Capsules:
 
     @cached_property
     def _compiled(self) -> tuple[object, object, float, object, object, object, object, object]:
-        """Arguments of `calib.robot.capsule_kernels.clear` between q and margin."""
+        """Arguments of `calib.robot.capsule_kernels.clear` between `q` and `margin`."""
         motions = []
         transforms = []
         for element in self.chain.elements:
@@ -232,18 +247,21 @@ class Capsules:
 
     @cached_property
     def _with_obstacles(self) -> Capsules | None:
-        """This model reduced to the pairs of arm and obstacles; None without obstacles."""
+        """This model with only the pairs of arm and obstacles; None without obstacles."""
         obstacle_pairs = self.world_pairs[self.world_pairs[:, 1] >= len(self.walls)]
         if not len(obstacle_pairs):
             return None
         return replace(self, arm_pairs=self.arm_pairs[:0], world_pairs=obstacle_pairs)
 
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the links' distances from the lines of sight to a target on the last body, and the derivatives.
+        """Return the links' distances from lines of sight to a target on the last body, with derivatives.
+
+        A line of sight goes from the target to the instrument.
 
         Args:
             q: (m, n) joint values [rad or m].
-            start: (m, 3) position of the target [m], and slope: (m, 3, n) its derivative by the joint values.
+            start: (m, 3) position of the target [m].
+            slope: (m, 3, n) derivative of `start` by the joint values.
             end: (3,) or (m, 3), position of the instrument in the base frame [m].
 
         Returns:
@@ -264,16 +282,19 @@ class Capsules:
         return distance - self.radii[links], link_speed - sight_speed
 
     def lines_at(self, q: np.ndarray) -> _Lines:
-        """Return the lines along the middles of the capsules at postures q (m, n)."""
+        """Return the centre lines of the capsules at joint values q (m, n)."""
         return _lines_of(self.chain, q, self.targets, self.beside)
 
     def _pair_distances(
         self, lines: _Lines, rough: bool = False
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return distances (m, P + W), normals (m, P + W, 3) towards the second body, and the nearest points.
+        """Return distances (m, P + W), normals (m, P + W, 3) towards the second body, and the pairs of nearest points.
 
-        In the W pairs with walls or obstacles the second body is the arm's. `rough`: use a lower bound of the distance
-        to obstacles, from the midpoints of the lines.
+        In the W pairs with walls or obstacles, the second body is the arm's.
+
+        Args:
+            lines: centre lines of the capsules.
+            rough: use a lower bound of the distance to obstacles, computed from the midpoints of the lines.
         """
         m = len(lines.start)
         count = len(self.arm_pairs) + len(self.world_pairs)
@@ -319,10 +340,13 @@ class Capsules:
 def closing_speed(
     chain: Chain, axes: np.ndarray, origins: np.ndarray, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray
 ) -> np.ndarray:
-    """Return the speed along the normals (m, P, n) of points (m, P, 3) on bodies (P,), per unit of each joint.
+    """Return the speed (m, P, n) of P points along normals in m postures, per unit speed of each joint.
 
     Args:
+        chain: the arm.
         axes, origins: (m, K, 3) direction and origin [m] of the axis of each of K moving elements.
+        normal: (m, P, 3) unit normals.
+        point: (m, P, 3) positions of the points [m].
         bodies: (P,) number of moving elements before each point.
     """
     z = axes.transpose(0, 2, 1)
@@ -350,7 +374,7 @@ def from_chain(
     beside: Sequence[Attached] = (),
     seed: int = 0,
 ) -> Capsules:
-    """Return the collision model of an arm with capsules from each joint frame to the next.
+    """Return the collision model of an arm with capsules from each joint frame to the next one.
 
     A body whose frame coincides with the next one (in a spherical wrist) has no capsule.
 
@@ -361,9 +385,10 @@ def from_chain(
         obstacles: obstacles in the base frame.
         walls: planes that the arm must not cross.
         targets: (T, 3) positions of the measured targets in the tip's frame [m].
-        margin: the least distance that will be required [m]; pairs that are always nearer are excluded.
+        margin: the least distance that will be required [m]; pairs that are nearer in nearly all postures are excluded
+            (`inseparable`).
         within: whether parts of the arm are compared with each other.
-        ignored: pairs of links that are not compared.
+        ignored: pairs of names of links that are not compared.
         beside: links outside the chain, compared with every link that moves relative to them.
         seed: seed of the random postures that determine the excluded pairs.
     """
@@ -430,7 +455,11 @@ def from_chain(
 
 
 def _body_names(chain: Chain) -> list[str]:
-    """Return the names of the base and of the body after each moving element."""
+    """Return the names of the base and of the body after each moving element.
+
+    Args:
+        chain: the arm.
+    """
     links = chain.links
     if not links:
         links = tuple(f"{name}_link" for name in chain.joint_names)
@@ -446,7 +475,14 @@ def _body_names(chain: Chain) -> list[str]:
 
 
 def _lines_of(chain: Chain, q: np.ndarray, targets: np.ndarray, beside: Sequence[Attached] = ()) -> _Lines:
-    """Return the centre lines of base (from its foot), moving bodies, links beside and targets at q (m, n)."""
+    """Return the centre lines of base, moving bodies, links outside the chain and targets at joint values q (m, n).
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+        targets: (T, 3) positions of the targets in the tip's frame [m].
+        beside: the links outside the chain.
+    """
     walk = sweep(chain, q)
     axes = walk.directions[chain.driven].transpose(2, 0, 1)
     origins = walk.origins[chain.driven].transpose(2, 0, 1)
@@ -469,7 +505,13 @@ def _lines_of(chain: Chain, q: np.ndarray, targets: np.ndarray, beside: Sequence
 
 
 def _attached_ends(chain: Chain, q: np.ndarray, beside: Sequence[Attached]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first and last points (m, E, 3) [m] of the links outside the chain at joint values q (m, n)."""
+    """Return start and end points (m, E, 3) [m] of the links outside the chain, in the base, at q (m, n).
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+        beside: the E links.
+    """
     if not beside:
         return np.empty((len(q), 0, 3)), np.empty((len(q), 0, 3))
     base = np.broadcast_to(np.eye(4), (1, len(q), 4, 4))
@@ -484,7 +526,10 @@ def _attached_ends(chain: Chain, q: np.ndarray, beside: Sequence[Attached]) -> t
 
 
 def _nearest(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nearest positions (...), from 0 to 1, on the lines a to b and c to d (..., 3)."""
+    """Return the positions (...) of the nearest points on the segments a to b and c to d: 0 at a or c, 1 at b or d.
+
+    The ends a, b, c, d of the segments are (..., 3).
+    """
     u, v, w = b - a, d - c, a - c
     uu = np.maximum((u * u).sum(-1), MIN_SQUARE)
     vv = np.maximum((v * v).sum(-1), MIN_SQUARE)
@@ -501,7 +546,7 @@ def _nearest(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tupl
 
 
 def _point_distances(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances (...) of points (..., 3), and the unit vectors from the first to the second."""
+    """Return the distances (...) from points `start` to `end` (..., 3), and the unit vectors in this direction."""
     difference = end - start
     distance = np.linalg.norm(difference, axis=-1)
     return distance, difference / np.maximum(distance, TINY)[..., None]

@@ -2,7 +2,7 @@
 
     T(q) = Π_k  placement_k · exp(sign_k · axis_k · (value_k + ratio_k · q_{joint_k})) · tail
 
-``axis_k`` is one of the six elementary motions tx ty tz rx ry rz. A calibrated robot is a Chain too.
+``axis_k`` is one of the six elementary motions tx ty tz rx ry rz. A calibrated robot is a chain, too.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ MIN_STRETCHED_LENGTH = 0.1
 
 
 def check_gravity(gravity: np.ndarray, where: str = "") -> None:
-    """Refuse an implausible gravity vector (3,) [m/s²]; the message begins with `where`.
+    """Raise RobotError for an implausible gravity vector (3,) [m/s²]; the message begins with the text `where`.
 
     Raises:
-        RobotError: for a vector longer than `MAX_GRAVITY`, or not finite.
+        RobotError: a vector longer than `MAX_GRAVITY`, or not finite.
     """
     if not math.hypot(*gravity) < MAX_GRAVITY:
         raise RobotError(f"{where}gravity {gravity.tolist()} is not plausible: expected about 9.81 m/s²")
@@ -41,9 +41,14 @@ def check_gravity(gravity: np.ndarray, where: str = "") -> None:
 
 @dataclass(frozen=True)
 class Joint:
-    """One actuated joint: its name, kind and limits (SI; infinite where none are given).
+    """One actuated joint.
 
-    `unstated` lists limits below `MIN_LIMIT` as written (``velocity 0``); they count as not stated, with a remark.
+    Attributes:
+        name: name of the joint.
+        kind: ``revolute`` or ``prismatic``.
+        lower, upper: position limits [rad or m]; infinite if unknown.
+        velocity, effort: limits [rad/s or m/s], [N m or N]; infinite if unknown.
+        unstated: texts of limits below `MIN_LIMIT` in the description (``velocity 0``), which count as unknown.
     """
 
     name: str
@@ -73,7 +78,7 @@ class Joint:
 
     @property
     def unlimited(self) -> bool:
-        """Whether the joint is revolute without limits."""
+        """Whether the joint is revolute without position limits."""
         return self.kind == "revolute" and not np.isfinite([self.lower, self.upper]).any()
 
 
@@ -82,14 +87,14 @@ class Element:
     """One elementary transform ``placement · exp(sign · axis · (value + ratio · q))``.
 
     Attributes:
-        name: name in tables, e.g. ``alpha3`` or ``elbow_joint.x``.
+        name: name in tables, such as ``alpha3`` or ``elbow_joint.x``.
         axis: one of `AXES`.
         value: constant part of the displacement [m or rad].
-        owner: index of the joint whose placement it helps to describe; n for what follows the last joint.
-        joint: index of the joint that moves the element, None for a constant element.
+        owner: index of the joint whose frame the element helps to place; n for elements after the last joint.
+        joint: index of the joint that moves the element; None for a constant element.
         ratio: 1, or the multiplier of a mimic joint.
-        sign: +1 or -1, for a joint axis that points against the elementary one.
-        placement: (4, 4), fixed transform before the element; None for the identity.
+        sign: +1; -1 for a joint axis opposite to the elementary axis.
+        placement: (4, 4) fixed transform before the element; None for the identity.
     """
 
     name: str
@@ -120,14 +125,15 @@ class Chain:
     Attributes:
         joints: the n actuated joints, in the order of q.
         elements: the K elementary transforms, base to tip.
-        tail: (4, 4), constant transform after the last element.
-        inertias: (n, 10) standard parameters XX XY XZ YY YZ ZZ MX MY MZ M of the body after each joint, about the
-            frame right after the joint's moving element [kg m², kg m, kg]; None where unknown.
-        gravity: (3,) in the base frame [m/s²].
+        tail: (4, 4) constant transform after the last element.
+        inertias: (n, 10) standard parameters XX XY XZ YY YZ ZZ MX MY MZ M of the body after each joint, about the frame
+            right after the joint's moving element [kg m², kg m, kg]; None if unknown.
+        gravity: (3,) gravity in the base frame [m/s²].
         links: names of the n links after the joints (URDF), for messages and export.
         floor: height of the floor under the arm, in the base frame [m]; the default for collision tests.
-        remarks: suspicious values in its description, found by the reader.
-        ends: remarks on how the tip was chosen, if the description left it open (URDF), and on joints outside the arm.
+        remarks: remarks on suspicious values in the arm's description.
+        ends: remarks on how the tip was chosen if the description (URDF) left the choice open, and on joints outside
+            the arm.
     """
 
     name: str
@@ -195,13 +201,13 @@ class Chain:
 
     @cached_property
     def driven(self) -> np.ndarray:
-        """Indices of the elements moved by joints, including followers of mimic joints."""
+        """Indices of the elements that joints move, including mimic followers."""
         indices = [k for k, element in enumerate(self.elements) if element.joint is not None]
         return np.array(indices, dtype=int)
 
     @cached_property
     def moving(self) -> np.ndarray:
-        """Indices (n,) of the first element moved by each joint (followers of mimic joints come later)."""
+        """Index (n,) of the first element that each joint moves (mimic followers are further elements)."""
         first: dict[int | None, int] = {}
         for k in self.driven.tolist():
             first.setdefault(self.elements[k].joint, k)
@@ -209,18 +215,20 @@ class Chain:
 
     @cached_property
     def rates(self) -> np.ndarray:
-        """Displacement of each `driven` element per unit of each joint, (driven, n)."""
+        """Derivative (driven, n) of the displacement of each `driven` element by each joint value."""
         rates = np.zeros((len(self.driven), self.n))
         for row, k in zip(rates, self.driven):
             row[self.elements[k].joint] = self.elements[k].ratio
         return rates
 
     def with_values(self, values: np.ndarray | Mapping[str, float]) -> Chain:
-        """Return the chain with new element values: all K of them, or some by name."""
+        """Return the chain with new element values: an array of all K, or some by name."""
         if isinstance(values, Mapping):
             unknown = set(values) - set(self.names)
             if unknown:
-                raise RobotError(f"robot '{self.name}' has no element '{sorted(unknown)[0]}'")
+                raise RobotError(
+                    f"robot '{self.name}' has no element '{sorted(unknown)[0]}': give one of its element names"
+                )
             values = np.array([values.get(element.name, element.value) for element in self.elements])
         elements = []
         for element, value in zip(self.elements, values, strict=True):
@@ -228,7 +236,7 @@ class Chain:
         return replace(self, elements=tuple(elements))
 
     def stretched_length(self) -> float:
-        """Return the largest length of the stretched arm [m]: the sum of its constant offsets."""
+        """Return an upper bound of the stretched arm's length [m]: the sum of its constant translations."""
         translations = 0.0
         placements = 0.0
         for element in self.elements:
@@ -248,16 +256,26 @@ class Chain:
 
 
 def random_joints(chain: Chain, count: int, seed: int | np.random.Generator = 0) -> np.ndarray:
-    """Return random joint values (count, n), uniform within the limits [rad or m]."""
+    """Return random joint values (count, n) [rad or m], uniformly distributed within the limits.
+
+    Args:
+        chain: the arm, which provides the limits (`Chain.sampling_limits`).
+        count: number of poses.
+        seed: seed, or generator of random numbers.
+    """
     lower, upper = chain.sampling_limits()
     return np.random.default_rng(seed).uniform(lower, upper, (count, chain.n))
 
 
 def element_length(chain: Chain, k: int) -> float:
-    """Return the constant displacement along translation k [m], including the part from its joint's placement.
+    """Return the constant displacement along the translation element k [m], including its part of the placement.
 
-    A URDF's joint origin is a placement followed by zero-valued elements, so that its lengths are in the placement.
-    Zero for rotations and for elements that a joint moves.
+    A URDF's joint origin is a placement followed by zero-valued elements, so that its lengths are in the placement. The
+    result is zero for rotations and for elements that a joint moves.
+
+    Args:
+        chain: the arm.
+        k: index of the element.
     """
     element = chain.elements[k]
     if element.axis[0] != "t" or element.joint is not None:
@@ -274,5 +292,8 @@ def element_length(chain: Chain, k: int) -> float:
 
 
 def joint_kinds(chain: Chain) -> list[str]:
-    """Return the URDF types of the joints; a revolute joint of a URDF without limits is continuous."""
+    """Return the URDF type of each joint of `chain`.
+
+    In a chain from a URDF, a revolute joint without limits is continuous.
+    """
     return ["continuous" if chain.links and joint.unlimited else joint.kind for joint in chain.joints]

@@ -1,11 +1,11 @@
 """Distances between the links of an arm, the floor and obstacles, computed by Pinocchio and coal.
 
-Shapes come from the URDF's ``<collision>``: boxes, spheres, cylinders, capsules, and meshes by their convex hull (our
-choice: faster and on the safe side). A robot without shapes is made of capsules (`calib.robot.capsules`).
+Shapes are those in the URDF's ``<collision>``: boxes, spheres, cylinders, capsules, and the convex hulls of meshes (our
+choice: faster and conservative). A robot without shapes is made of capsules (`calib.robot.capsules`).
 
-Not compared: parts of one body, bodies joined by a joint, the fixed base with floor and obstacles, and pairs that
-touch in nearly every posture (`calib.robot.capsules.inseparable`, listed in `Collision.excluded`). A floor or an
-obstacle that a link never leaves is refused.
+Some pairs are not compared: parts of one body, bodies connected by a joint, the fixed base with floor and obstacles,
+and pairs that touch in nearly every posture (`calib.robot.capsules.inseparable`, listed in `Collision.excluded`). A
+floor or an obstacle that collides with a link in every posture is refused.
 """
 
 import os
@@ -38,10 +38,10 @@ SIGHT_RADIUS = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Collision:
-    """Collision model of a URDF: pairs of shapes whose distances are computed by coal.
+    """Collision model of a URDF: pairs of shapes whose distances coal computes.
 
     Attributes:
-        pairs: names of the shapes compared, in the order of the columns of `distances`.
+        pairs: names of the compared shapes, in the order of the columns of `distances`.
         excluded: pairs that are not compared, since they touch in nearly every posture.
         missing: meshes of the URDF that were not found or not readable; their shapes are ignored.
     """
@@ -62,18 +62,18 @@ class Collision:
         return {self._model.frames[shape.parentFrame].name for shape in shapes}
 
     def distances(self, q: np.ndarray) -> np.ndarray:
-        """Return the distances (m, pairs) [m] at joint values q (m, n); negative: depth of penetration."""
+        """Return the distances (m, pairs) [m] at joint values q (m, n); negative values are depths of penetration."""
         distances: list[float] = []
         for results in self._distance_results(q):
             distances += [result.min_distance for result in results]
         return np.array(distances).reshape(len(q), len(self.pairs))
 
     def gradients(self, q: np.ndarray) -> np.ndarray:
-        """Return the derivatives (m, pairs, n) of `distances` with respect to q (m, n).
+        """Return the derivatives (m, pairs, n) of `distances` by the joint values, at q (m, n).
 
-        With the normal u from the first shape's nearest point to the second's: d' = u · (velocity of the second point -
-        velocity of the first), the effect of the shapes' curvature being of second order. Where nearest points jump,
-        the derivative is one-sided.
+        With the unit normal u from the first shape's nearest point to the second's, d' = u · (velocity of the second
+        point - velocity of the first). The effect of the shapes' curvature is of second order. Where nearest points
+        jump, the derivative is one-sided.
         """
         shape = (len(q), len(self.pairs), 3)
         normals = np.empty(shape)
@@ -96,8 +96,15 @@ class Collision:
         return second_speed - first_speed
 
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the links' distances from the lines of sight to a target, and the derivatives; see
-        `calib.robot.capsules.Capsules.beam`.
+        """Return the links' distances from the lines of sight to a target, with derivatives.
+
+        The result is that of `calib.robot.capsules.Capsules.beam`: distances (m, L) [m] of L links, and derivatives.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+            start: (m, 3) position of the target [m].
+            slope: (m, 3, n) derivative of `start` by the joint values.
+            end: (3,) or (m, 3), position of the instrument in the base frame [m].
         """
         pin, coal = _libraries()
         data = self._model.createData()
@@ -132,7 +139,7 @@ class Collision:
         return distances, link_speed - sight_speed
 
     def _distance_results(self, q: np.ndarray) -> Iterator[Sequence[NativeShape]]:
-        """Yield coal's distance results of all pairs, for each row of joint values q (m, n)."""
+        """Yield coal's distance results for all pairs, for each row of joint values q (m, n)."""
         pin, _ = _libraries()
         data = self._model.createData()
         geometry_data = self._geometry.createData()
@@ -142,13 +149,20 @@ class Collision:
             yield geometry_data.distanceResults
 
     def _configurations(self, q: np.ndarray) -> np.ndarray:
-        """Return Pinocchio's configurations (m, nq) at q (m, n), joints outside the chain at the model's posture."""
+        """Return Pinocchio's configurations (m, nq) at q (m, n); joints outside the chain have their fixed values."""
         result = configurations(self._model, self._chain, q)
         set_still(self._model, result, self._posture)
         return result
 
     def _closing_speed(self, q: np.ndarray, normal: np.ndarray, point: np.ndarray, shapes: list[int]) -> np.ndarray:
-        """Return the speed along normals (m, P, n) of points (m, P, 3) on shapes (P,), per unit of each joint."""
+        """Return the speed (m, P, n) of points along normals, per unit speed of each joint.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+            normal: (m, P, 3) unit normals.
+            point: (m, P, 3) positions of the points [m].
+            shapes: (P,) index of the shape to which each point belongs.
+        """
         walk = sweep(self._chain, q)
         axes = walk.directions[self._chain.driven].transpose(2, 0, 1)
         origins = walk.origins[self._chain.driven].transpose(2, 0, 1)
@@ -156,7 +170,7 @@ class Collision:
 
     @cached_property
     def _base_pose(self) -> NativeShape:
-        """Pose of the base in Pinocchio's world."""
+        """Pose of the arm's base in Pinocchio's world, as Pinocchio's SE3."""
         return _link_pose(self._model, self._chain.base, self._posture)
 
     @cached_property
@@ -170,7 +184,7 @@ class Collision:
         return np.array(counts, dtype=int)
 
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Return the mask (m,) of joint values q (m, n) with all distances larger than `margin` [m]."""
+        """Return at which joint values q (m, n) all distances are larger than `margin` [m], (m,) bool."""
         return np.all(self.distances(q) > margin, axis=1)
 
 
@@ -198,21 +212,22 @@ def from_urdf(
 
     Args:
         path: the URDF.
-        base, tip: see `calib.robot.formats.arm_ends`.
+        base, tip: links at the ends of the arm; None: chosen by `calib.robot.formats.arm_ends`.
         floor: height of a floor in the base frame [m]; None for no floor.
         obstacles: obstacles in the base frame.
         mesh_folders: folders in which ``package://name/...`` is searched, besides the URDF's folder and its parents.
         walls: planes that the arm must not cross.
-        targets: (T, 3) positions of the measured targets in the tip's frame [m]: each becomes a thin capsule from the
-            tip.
-        margin: the least distance that will be required [m]; pairs that are always nearer are excluded.
+        targets: (T, 3) positions of the measured targets in the tip's frame [m]; each is represented by a thin capsule
+            from the tip.
+        margin: the least distance that will be required [m]; pairs that are nearer in nearly all postures are excluded
+            (`calib.robot.capsules.inseparable`).
         within: whether parts of the arm are compared with each other.
-        ignored: pairs of links that are not compared.
-        posture: values of joints outside the chain [rad or m] that are not at zero.
+        ignored: pairs of names of links that are not compared.
+        posture: values of joints outside the chain [rad or m]; all others are zero. None: all are zero.
         seed: seed of the random postures that determine the excluded pairs.
 
     Raises:
-        RobotError: if the URDF has no usable collision shape.
+        RobotError: the URDF has no usable collision shape.
     """
     pin, _ = _libraries()
     source = text(path)[0]
@@ -259,7 +274,14 @@ def from_urdf(
 def _add_targets(
     model: NativeModel, geometry: NativeShape, chain: Chain, targets: np.ndarray | Sequence[Sequence[float]]
 ) -> None:
-    """Attach targets (T, 3) [m] to the tip's frame, as thin capsules."""
+    """Add thin capsules from the tip to each target to `geometry`; `targets` (T, 3) are in the tip's frame [m].
+
+    Args:
+        model: Pinocchio's model of the arm.
+        geometry: coal's shapes, to which is added.
+        chain: the arm.
+        targets: (T, 3) positions of the targets in the tip's frame [m].
+    """
     _, coal = _libraries()
     for number, position in enumerate(np.asarray(targets, dtype=float).reshape(-1, 3), 1):
         length = float(np.linalg.norm(position))
@@ -271,7 +293,13 @@ def _add_targets(
 
 
 def _without_inseparable(collision: Collision, margin: float, seed: int) -> Collision:
-    """Return the collision model without the pairs that touch in nearly every posture."""
+    """Return the collision model without the pairs that touch in nearly every posture.
+
+    Args:
+        collision: the model.
+        margin: the least distance that will be required [m].
+        seed: seed of the random postures.
+    """
     geometry = collision._geometry
     fixed = np.array([pair.second >= collision._links for pair in geometry.collisionPairs])
     distances = collision.distances(random_joints(collision._chain, SAMPLES, seed))
@@ -289,7 +317,15 @@ def _pair_names(geometry: NativeShape) -> tuple[tuple[str, str], ...]:
 def _attach(
     model: NativeModel, geometry: NativeShape, link: str, name: str, placed: np.ndarray, shape: NativeShape
 ) -> None:
-    """Add a shape to `geometry`, attached to a link's frame."""
+    """Add a shape to `geometry`, fixed to a link's frame.
+
+    Args:
+        model, geometry: Pinocchio's models.
+        link: name of the link.
+        name: name of the shape.
+        placed: (4, 4) pose of the shape in the link's frame.
+        shape: the shape.
+    """
     pin, _ = _libraries()
     index = link_frame(model, link)
     frame = model.frames[index]
@@ -300,7 +336,13 @@ def _attach(
 def _surround(
     geometry: NativeShape, base_pose: NativeShape, walls: Sequence[Wall], obstacles: Sequence[Obstacle]
 ) -> None:
-    """Add walls and obstacles to `geometry`, fixed relative to the base."""
+    """Add walls and obstacles to `geometry`, fixed in the world, from their poses in the arm's base.
+
+    Args:
+        geometry: coal's shapes, to which is added.
+        base_pose: pose of the arm's base in the world, as Pinocchio's SE3.
+        walls, obstacles: walls and obstacles in the base frame.
+    """
     pin, coal = _libraries()
 
     def add(name: str, shape: NativeShape, T_base_shape: np.ndarray) -> None:
@@ -320,7 +362,13 @@ def _solid(kind: str, sizes: Sequence[float]) -> NativeShape:
 
 
 def set_still(model: NativeModel, configurations: np.ndarray, posture: Mapping[str, float]) -> None:
-    """Write the values of joints outside the chain [rad or m], by name, into Pinocchio's configurations (m, nq)."""
+    """Write the values of joints outside the chain [rad or m], by name, into Pinocchio's configurations (m, nq).
+
+    Args:
+        model: Pinocchio's model.
+        configurations: (m, nq), changed in place.
+        posture: values of joints outside the chain [rad or m], by name.
+    """
     for name, value in posture.items():
         joint = model.joints[model.getJointId(name)]
         values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
@@ -328,7 +376,13 @@ def set_still(model: NativeModel, configurations: np.ndarray, posture: Mapping[s
 
 
 def _link_pose(model: NativeModel, link: str, posture: Mapping[str, float]) -> NativeShape:
-    """Return the pose of a link in Pinocchio's world, with all joints at zero except those of `posture`."""
+    """Return the pose of a link in Pinocchio's world; joints have the values in `posture`, or else zero.
+
+    Args:
+        model: Pinocchio's model.
+        link: name of the link.
+        posture: values of joints by name [rad or m].
+    """
     pin, _ = _libraries()
     data = model.createData()
     configuration = pin.neutral(model)[None]
@@ -338,10 +392,17 @@ def _link_pose(model: NativeModel, link: str, posture: Mapping[str, float]) -> N
 
 
 def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], where: str) -> NativeShape | None:
-    """Return the coal shape of a <geometry>; None, with an entry in `missing`, for an unreadable mesh."""
+    """Return the coal shape of a <geometry> node; for an unreadable mesh None, and its name is added to `missing`.
+
+    Args:
+        node: the XML element; None for a missing one, which has no shape.
+        folders: folders in which meshes are searched.
+        missing: names of unreadable meshes, extended in place.
+        where: name of the link in messages.
+    """
     kind = node.children[0] if node is not None and node.children else None
     if kind is None:
-        refuse_robot(where, "<collision> without a shape")
+        refuse_robot(where, "<collision> without a shape: add a <geometry>")
     if kind.tag == "mesh":
         return _hull(kind, folders, missing, where)
     if kind.tag == "box":
@@ -355,7 +416,14 @@ def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], where
 
 
 def _hull(node: Node, folders: Sequence[Path], missing: list[str], where: str) -> NativeShape | None:
-    """Return the scaled convex hull of a mesh file; None, with an entry in `missing`, if unreadable."""
+    """Return the scaled convex hull of a mesh file; if it is unreadable None, and its name is added to `missing`.
+
+    Args:
+        node: the XML element <mesh>.
+        folders: folders in which the mesh is searched.
+        missing: names of unreadable meshes, extended in place.
+        where: name of the link in messages.
+    """
     _, coal = _libraries()
     name = node.attributes.get("filename", "")
     path = find_mesh(name, folders)
@@ -373,7 +441,12 @@ def _hull(node: Node, folders: Sequence[Path], missing: list[str], where: str) -
 
 
 def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
-    """Return the path of a mesh by its name in a URDF; None if no folder contains it."""
+    """Return the file of a mesh that a URDF names (a path, ``file://`` or ``package://``); None if it is not found.
+
+    Args:
+        name: the mesh as named in the URDF.
+        folders: folders in which it is searched.
+    """
     if name.startswith("file://"):
         name = name.removeprefix("file://")
     variants = [name]
@@ -389,7 +462,7 @@ def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
 
 
 def package_folders() -> list[Path]:
-    """Return the folders that hold ROS packages: those of ``ROS_PACKAGE_PATH``, and of the installed ROS."""
+    """Return the folders with ROS packages: those of ``ROS_PACKAGE_PATH``, and those of the installed ROS."""
     sources = os.environ.get(PACKAGE_PATH, "").split(os.pathsep)
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     folders = [Path(source) for source in sources if source]
@@ -398,9 +471,10 @@ def package_folders() -> list[Path]:
 
 
 def meshes_beside(path: Path) -> dict[str, Path | str]:
-    """Return the mesh files of a URDF's collision shapes, by their paths next to its copy in ``1-robot``.
+    """Return the mesh files of a URDF's collision shapes, by the paths that they need next to a copy of the URDF.
 
-    Absolute names, and names that lead out of the URDF's folder, are left out.
+    The copy is in ``1-robot``. Meshes with absolute names, or with names that lead out of the URDF's folder, are left
+    out.
     """
     if not is_urdf(path):
         return {}
@@ -417,7 +491,12 @@ def meshes_beside(path: Path) -> dict[str, Path | str]:
 
 
 def urdf_meshes(path: str | Path, tag: str) -> list[tuple[Node, Node, Node]]:
-    """Return each mesh of a URDF's ``<visual>`` or ``<collision>`` elements, with its link and its element."""
+    """Return each mesh in a URDF's ``<visual>`` or ``<collision>`` elements (`tag`): link, that element, and mesh.
+
+    Args:
+        path: the URDF.
+        tag: ``visual`` or ``collision``.
+    """
     meshes: list[tuple[Node, Node, Node]] = []
     for link in parse(text(path)[0], str(path)).all("link"):
         for node in link.all(tag):
@@ -427,7 +506,7 @@ def urdf_meshes(path: str | Path, tag: str) -> list[tuple[Node, Node, Node]]:
 
 
 def _libraries() -> tuple[ModuleType, ModuleType]:
-    """Return the modules pinocchio and coal, imported only when collisions are computed."""
+    """Return the modules pinocchio and coal; they are imported only here, when collisions are computed."""
     import coal
     import pinocchio
 

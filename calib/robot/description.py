@@ -128,7 +128,8 @@ def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
     """Return remarks on suspicious values in a chain's description, by joint; () if there are none.
 
     Args:
-        bodies: whether to include impossible bodies.
+        chain: the arm.
+        bodies: whether physically impossible bodies are included.
     """
     result = list(chain.remarks)
     unstated: dict[str, list[str]] = {}
@@ -157,11 +158,14 @@ def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
 
 
 def impossible_bodies(chain: Chain) -> tuple[str, ...]:
-    """Return a sentence per group of physically impossible bodies, with their joints; () if there are none.
+    """Return sentences on physically impossible bodies, one per kind of error, with the joints; () if there are none.
 
-    A body has M > 0 and, about its centre of mass, positive principal moments of which none exceeds the sum of the
-    others (triangle inequality; Wensing, Kim and Slotine, 2018, eq. 7). Its radius of gyration and its centre of mass
-    lie within the stretched arm's length L, and the whole arm weighs no more than `MAX_DENSITY` L³.
+    A possible body has M > 0 and, about its centre of mass, positive principal moments of which none exceeds the sum of
+    the others (triangle inequality; Wensing, Kim and Slotine, 2018, eq. 7). Its radius of gyration and the distance of
+    its centre of mass are at most the stretched arm's length L. The whole arm weighs at most `MAX_DENSITY` L³.
+
+    Args:
+        chain: the arm, with the bodies' standard parameters; without them the result is ().
     """
     if chain.inertias is None:
         return ()
@@ -187,7 +191,12 @@ def impossible_bodies(chain: Chain) -> tuple[str, ...]:
 
 
 def _impossible(body: np.ndarray, length: float) -> str:
-    """Return the reason why a body (10,) is physically impossible; "" if it is possible."""
+    """Return why a body with standard parameters (10,) is physically impossible; "" if it is possible.
+
+    Args:
+        body: standard parameters XX XY XZ YY YZ ZZ MX MY MZ M about the joint's frame.
+        length: length of the stretched arm [m].
+    """
     mass = float(body[9])
     first_moment = body[6:9]
     if mass == 0.0:
@@ -212,20 +221,25 @@ def _impossible(body: np.ndarray, length: float) -> str:
 
 
 def read(path: str | Path, propose_beta: bool = True) -> Chain:
-    """Return the robot of a TOML file: an MDH table, or elements.
+    """Return the robot in a TOML file, which is an MDH table or a list of elements.
 
     Args:
         path: the file.
-        propose_beta: see `calib.robot.mdh`; a file may switch it off itself.
+        propose_beta: whether `calib.robot.mdh` adds rotations beta; a file may switch this off itself.
 
     Raises:
-        RobotError: for an invalid file; the message names the table, the key and the fault.
+        RobotError: an invalid file; the message names the table, the key and the error.
     """
     return read_whole(path, propose_beta)[0]
 
 
 def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, ParsedTable]:
-    """Return the robot of a file and its extra tables, as `read` and `read_extra` do."""
+    """Return the robot in a file, as `read` does, and the file's extra tables, as `read_extra` does.
+
+    Args:
+        path: the file.
+        propose_beta: whether `calib.robot.mdh` adds rotations beta; a file may switch this off itself.
+    """
     table = tables.load(path)
     if "leg" in table or table.get("kind") == "parallel":
         raise RobotError(
@@ -243,17 +257,21 @@ def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, Pars
 
 
 def read_extra(path: str | Path) -> ParsedTable:
-    """Return the extra tables of a robot file (`EXTRA`) as plain dictionaries."""
+    """Return the extra tables of a robot file (those named in `EXTRA`) as plain dictionaries.
+
+    Args:
+        path: the file.
+    """
     return {key: value for key, value in tables.load(path).items() if key in EXTRA}
 
 
 def write(path: str | Path, chain: Chain, extra: Mapping[str, object] | None = None, source: str = "") -> Path:
-    """Write a chain to a file from which `read` returns exactly the same chain.
+    """Write a chain to a file, from which `read` returns exactly the same chain; return the path.
 
     Args:
         path: the file.
         chain: any chain.
-        extra: further tables by name (those of `EXTRA`), written unchanged.
+        extra: further tables by name (those named in `EXTRA`), written unchanged; None for no such tables.
         source: source of the numbers, written as a comment.
     """
     tables.check_keys(extra or {}, EXTRA, f"robot '{chain.name}', extra tables")
@@ -269,11 +287,11 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, object] | None = N
 
 
 def from_elements(table: Mapping[str, object], where: str) -> Chain:
-    """Return the chain of a parsed table of elements; `where` names it in messages."""
+    """Return the chain for a parsed TOML table of elements; `where` names the table in messages."""
     file = parse(ElementsFile, table, where, RobotError)
     for key, entries in (("joint", file.joint), ("element", file.element)):
         if not entries:
-            refuse_robot(where, f"no [[{key}]] tables found")
+            refuse_robot(where, f"no [[{key}]] tables found; a robot needs one per {key}")
     joints = []
     for entry in file.joint:
         limits = {key: getattr(entry, key) for key in tables.LIMITS}
@@ -297,7 +315,13 @@ def from_elements(table: Mapping[str, object], where: str) -> Chain:
 
 
 def _element(entry: ElementTable, n: int, where: str) -> Element:
-    """Return the element of a table, for a robot of n joints."""
+    """Return the element for a parsed table; `n` is the robot's number of joints, and `where` is used in messages.
+
+    Args:
+        entry: the parsed table.
+        n: number of the robot's joints.
+        where: name of the table in messages.
+    """
     if entry.owner > n:
         refuse_robot(where, f"owner {entry.owner} is not an integer from 0 to {n}")
     if entry.joint is not None and entry.joint >= n:

@@ -1,7 +1,7 @@
-"""Forward kinematics and the Jacobian of every element, in batch: no Python loop over poses.
+"""Forward kinematics and the Jacobian of every element, for many poses at once, without a Python loop over poses.
 
-The sample axis runs last inside (structure of arrays), so that each elementary transform is a handful of vector
-operations over all poses, and so that a stacked observation matrix is column-major without a copy.
+Internally, the sample axis is the last one (structure of arrays). Each elementary transform is then a few vector
+operations over all poses, and a stacked observation matrix is column-major without a copy.
 """
 
 from collections.abc import Iterator
@@ -17,12 +17,12 @@ from calib.transforms import pose
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Result of one pass along the chain for m poses.
+    """Axes, origins and flange poses from one pass along the chain, for m poses.
 
     Attributes:
         directions: (K, 3, m) unit vector of each element's motion, in the reference frame, sign included.
         origins: (K, 3, m) origin of each element's frame [m].
-        rotation: (3, 3, m), ``rotation[c]`` being column c of the flange's rotation.
+        rotation: (3, 3, m) rotation of the flange; ``rotation[c]`` is column c of the matrix.
         position: (3, m) position of the flange [m].
     """
 
@@ -39,11 +39,13 @@ class Sweep:
 def _walk(
     chain: Chain, q: np.ndarray, start: tuple[np.ndarray, np.ndarray], extra: np.ndarray | None = None
 ) -> Iterator[tuple[Element, np.ndarray, np.ndarray, np.ndarray]]:
-    """Yield each element, the origin of its frame (3, m) [m], and the rotation and position after it.
+    """Yield each element, the origin of its frame (3, m) [m], and rotation and position of the frame after it.
 
     Args:
-        start: rotation and position of the base (`_start`).
-        extra: as in `sweep`.
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+        start: rotation and position of the base, as `_start` returns them.
+        extra: (K, m) displacements added to those of the elements [m or rad]; None without.
     """
     rotation, position = start
     for k, element in enumerate(chain.elements):
@@ -65,12 +67,12 @@ def _walk(
 
 
 def sweep(chain: Chain, q: np.ndarray, base: np.ndarray | None = None, extra: np.ndarray | None = None) -> Sweep:
-    """Return axes and origins of all elements and the flange poses, in one pass for all poses.
+    """Return axes and origins of all K elements and the flange poses, in one pass along the chain for all poses.
 
     Args:
         chain: the arm.
         q: (m, n) joint values [rad or m].
-        base: (4, 4) or (m, 4, 4), the pose of the arm's base in the reference; None for the identity.
+        base: (4, 4) or (m, 4, 4), pose of the arm's base in the reference frame; None for the identity.
         extra: (K, m) displacements added to those of the elements (deflections) [m or rad]; None without.
     """
     q = shaped(q, (None, chain.n), f"joint values of '{chain.name}'")
@@ -85,18 +87,25 @@ def sweep(chain: Chain, q: np.ndarray, base: np.ndarray | None = None, extra: np
 
 
 def forward(chain: Chain, q: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
-    """Return the tip's poses (m, 4, 4) in the base frame for joint values q (m, n)."""
+    """Return the tip's poses (m, 4, 4) [m] in the base frame at joint values q (m, n) [rad or m].
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+        extra: (K, m) displacements added to those of the chain's K elements (deflections) [m or rad]; None without.
+    """
     return sweep(chain, q, extra=extra).poses()
 
 
 def element_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, index: np.ndarray | None = None) -> np.ndarray:
     """Return the Jacobian (K, 6, m) of `point`, fixed to the flange, with respect to the elements' values.
 
-    For a rotation about z through o: [z × (point - o); z]; for a translation along z: [z; 0].
+    For a rotation about z through o it is [z × (point - o); z]; for a translation along z, [z; 0].
 
     Args:
+        chain: the arm.
         walked: the result of `sweep`.
-        point: (3, m) [m], in the reference frame.
+        point: (3, m) position in the reference frame [m].
         index: indices of the elements; None for all K.
 
     Returns:
@@ -119,13 +128,26 @@ def element_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, index: np.n
 
 
 def jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the observation Jacobian of all elements at the tip, (m, 6, K): [v; ω] per unit of each value."""
+    """Return the tip's Jacobian [v; ω] with respect to the values of all elements (observation Jacobian), (m, 6, K).
+
+    v is the velocity of the tip, ω its angular velocity, both in the base frame and per unit of an element's value.
+
+    Args:
+        chain: the arm, with K elements.
+        q: (m, n) joint values [rad or m].
+    """
     walked = sweep(chain, q)
     return element_jacobian(chain, walked, walked.position).transpose(2, 1, 0)
 
 
 def jacobian_product(chain: Chain, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-    """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, 6, K) of the observation Jacobian J = `jacobian`."""
+    """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, 6, K), with J the result of `jacobian`.
+
+    Args:
+        chain: the arm, with K elements.
+        q: (m, n) joint values [rad or m].
+        G: (m, 6, K) weights of the entries of J.
+    """
     walked = sweep(chain, q)
     columns = element_jacobian(chain, walked, walked.position)
     return twist_product(chain, columns, columns, np.arange(len(columns)), G.transpose(2, 1, 0)).T
@@ -134,19 +156,20 @@ def jacobian_product(chain: Chain, q: np.ndarray, G: np.ndarray) -> np.ndarray:
 def twist_product(
     chain: Chain, elements: np.ndarray, columns: np.ndarray, places: np.ndarray, G: np.ndarray
 ) -> np.ndarray:
-    """Return Σ_k G_k · ∂J_k/∂q (n, m) of columns J_k = [v; ω] on the chain: the arm's Hessian times G.
+    """Return Σ_k G_k · ∂J_k/∂q (n, m) for columns J_k = [v; ω] of a Jacobian of the arm.
 
-    A joint e turns every column behind it as a whole, and moves the point for every column before it (and its own):
+    v and ω are velocity and angular velocity of a point per unit of an element's value. Joint e rotates every column of
+    a later element as a whole. For earlier elements (and for its own), it moves the point:
 
-        ∂J_k = [ω_e × v_k; ω_e × ω_k]  for k behind e,   ∂J_k = [ω_k × v_e; 0]  otherwise
+        ∂J_k = [ω_e × v_k; ω_e × ω_k]  for k after e,   ∂J_k = [ω_k × v_e; 0]  otherwise
 
-    (Hourtash 2005, IJRA, with translations as ω = 0), so that two sums of cross products serve all joints.
+    (Hourtash 2005, IJRA, with translations as ω = 0). Two sums of cross products therefore serve all joints.
 
     Args:
         chain: the arm.
         elements: (K, 6, m) `element_jacobian` of all elements, at the point of the columns.
         columns: (p, 6, m) the columns J_k.
-        places: (p,) index of each column's element; -1 before the arm, K behind it.
+        places: (p,) index of each column's element; -1 for a column before the arm, K for one after it.
         G: (p, 6, m) weights.
 
     Returns:
@@ -166,13 +189,14 @@ def twist_product(
 
 
 def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int | None = None) -> np.ndarray:
-    """Return the Jacobian (m, 6, n) of `point` with respect to the joints, including mimic followers.
+    """Return the Jacobian (m, 6, n) of `point` with respect to the joints, including the motion of mimic followers.
 
     Args:
+        chain: the arm.
         walked: the result of `sweep`.
-        point: (3, m) [m], in the reference frame.
-        before: index of the first element behind the point, from which on elements do not move it; None for a point on
-            the flange.
+        point: (3, m) position in the reference frame [m].
+        before: index of the first element after the point; this element and later ones do not move the point. None for
+            a point on the flange.
 
     Returns:
         (m, 6, n): linear velocity of the point, then angular velocity, both in the reference frame.
@@ -188,13 +212,25 @@ def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int |
 
 
 def tip_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the tip's Jacobian (m, 6, n) [v; ω] with respect to the joints, at joint values q (m, n)."""
+    """Return the tip's Jacobian (m, 6, n) [v; ω] with respect to the joints, at joint values q (m, n).
+
+    v is the velocity of the tip, ω its angular velocity, both in the base frame and per unit joint velocity.
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+    """
     walked = sweep(chain, q)
     return joint_jacobian(chain, walked, walked.position)
 
 
 def moving_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the frames (moving, m, 4, 4) after all moving elements, including mimic followers."""
+    """Return the frames (moving, m, 4, 4) after all moving elements, including mimic followers, in the base.
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+    """
     q = shaped(q, (None, chain.n), f"joint values of '{chain.name}'")
     frames = np.zeros((len(chain.driven), len(q), 4, 4))
     frames[..., 3, 3] = 1.0
@@ -208,7 +244,14 @@ def moving_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the frames (n, m, 4, 4) right after each joint's moving element, as used by `Chain.inertias`."""
+    """Return the frames (n, m, 4, 4) right after each joint's moving element, in the base.
+
+    `Chain.inertias` refers to these frames.
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+    """
     frames = moving_frames(chain, q)
     if np.array_equal(chain.driven, chain.moving):
         return frames
@@ -216,17 +259,17 @@ def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the torques (m, n) [N m or N] that hold an arm of known masses still against gravity, g(q) = ∂U/∂q.
+    """Return the torques g(q) = ∂U/∂q (m, n) [N m or N] that balance gravity in an arm of known masses.
 
-    With m_j and s_j the mass and the first moment of all bodies from joint j on, o_j its origin and z_j its axis:
-    -g · (z_j × (s_j - m_j o_j)) for a revolute joint, -g · z_j m_j for a prismatic one.
+    With m_j and s_j the mass and the first moment of all bodies from joint j on, o_j the joint's origin and z_j its
+    axis, the torque is -g · (z_j × (s_j - m_j o_j)) for a revolute joint and -g · z_j m_j for a prismatic one.
 
     Args:
         chain: the arm, with `inertias` and without mimic joints.
         q: (m, n) joint values [rad or m].
 
     Raises:
-        RobotError: if masses are unknown, or one joint moves several elements.
+        RobotError: masses are unknown, or one joint moves several elements.
     """
     if len(chain.driven) != chain.n:
         refuse_robot(f"robot '{chain.name}'", "gravity torques of mimic joints are not implemented")
@@ -252,7 +295,7 @@ def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the cross products of (K, 3, m) arrays along their middle axis."""
+    """Return the cross products a × b of two arrays (K, 3, m) along their middle axis."""
     x = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
     y = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
     z = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
@@ -260,7 +303,12 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _start(base: np.ndarray | None, m: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return rotation columns (3, 3, m) and position (3, m) of the base placement."""
+    """Return rotation columns (3, 3, m) and positions (3, m) of the base in m poses.
+
+    Args:
+        base: (4, 4) or (m, 4, 4) pose of the base in the reference frame; None for the identity.
+        m: number of poses.
+    """
     if base is None:
         base = np.eye(4)
     placement = np.broadcast_to(base, (m, 4, 4))
@@ -270,7 +318,12 @@ def _start(base: np.ndarray | None, m: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _place(rotation: np.ndarray, position: np.ndarray, placement: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return frames multiplied by a fixed placement from the right."""
+    """Return frames multiplied from the right by a fixed transform (4, 4).
+
+    Args:
+        rotation, position: rotation columns (3, 3, m) and positions (3, m) of the frames.
+        placement: the transform.
+    """
     flat = rotation.reshape(3, -1)
     position = position + (placement[:3, 3] @ flat).reshape(position.shape)
     if not np.array_equal(placement[:3, :3], np.eye(3)):
@@ -279,7 +332,13 @@ def _place(rotation: np.ndarray, position: np.ndarray, placement: np.ndarray) ->
 
 
 def _rotate(rotation: np.ndarray, axis: int, angle: np.ndarray | float) -> np.ndarray:
-    """Return frames rotated about one of their axes by an angle."""
+    """Return rotation columns (3, 3, m) of frames after a rotation about one of the frames' own axes.
+
+    Args:
+        rotation: rotation columns of the frames.
+        axis: 0, 1 or 2 for x, y or z.
+        angle: angle (m,), or one for all frames [rad].
+    """
     cosine, sine = np.cos(angle), np.sin(angle)
     next_axis, last_axis = (axis + 1) % 3, (axis + 2) % 3
     result = np.empty_like(rotation)

@@ -63,7 +63,19 @@ _ELEMENT = re.compile(r"(alpha|d|beta|r|theta)(\d+)")
 
 @dataclass(frozen=True)
 class Row:
-    """Row of an MDH table; `beta` is None without that element, `inertia` is (10,) or None."""
+    """Row of an MDH table.
+
+    Attributes:
+        name: name of the joint.
+        index: number in the elements' names.
+        kind: ``revolute``, ``prismatic`` or ``fixed``.
+        alpha, theta: angles [rad].
+        d, r: lengths [m].
+        beta: rotation about y [rad]; None for a row without this element.
+        lower, upper: position limits [rad or m]; infinite if unknown.
+        velocity, effort: limits [rad/s or m/s], [N m or N]; infinite if unknown.
+        inertia: (10,) standard parameters of the body, about the row's frame; None if unknown.
+    """
 
     name: str
     index: int
@@ -131,7 +143,13 @@ class MdhFile(tables.RobotTable):
 
 
 def from_table(table: Mapping[str, object], where: str, propose_beta: bool = True) -> Chain:
-    """Return the chain of a parsed table; `where` names it in messages."""
+    """Return the chain for a parsed TOML table; `where` names the table in messages.
+
+    Args:
+        table: the parsed table.
+        where: name of the table in messages.
+        propose_beta: whether rotations beta are added to rows with nearly parallel axes; the table may switch this off.
+    """
     file = parse(MdhFile, table, where, RobotError)
     if not file.joint:
         refuse_robot(where, "no [[joint]] rows found; an MDH table needs one per axis")
@@ -145,11 +163,12 @@ def from_table(table: Mapping[str, object], where: str, propose_beta: bool = Tru
 
 
 def chain(name: str, rows: Sequence[Row], propose_beta: bool = True, **fields: Any) -> Chain:
-    """Return the chain of MDH rows.
+    """Return the chain for MDH rows.
 
     Args:
-        rows: base to tip.
-        propose_beta: add ``beta`` to moving rows whose axis is nearly parallel to the moving one before.
+        name: name of the robot.
+        rows: the rows, base to tip.
+        propose_beta: add ``beta`` to moving rows whose axis is nearly parallel to the axis of the moving row before.
         fields: other fields of `Chain`: base, tip, tail, gravity, floor.
     """
     moving = [row for row in rows if row.kind != "fixed"]
@@ -165,7 +184,7 @@ def chain(name: str, rows: Sequence[Row], propose_beta: bool = True, **fields: A
         owner += row.kind != "fixed"
     massless = [row.name for row in moving if row.inertia is None]
     if massless and len(massless) < len(moving):
-        refuse_robot(f"robot '{name}'", f"row '{massless[0]}' has no inertia while others have")
+        refuse_robot(f"robot '{name}'", f"row '{massless[0]}' has no inertia while others have: state all, or none")
     inertias = None
     if not massless:
         inertias = np.array([row.inertia for row in moving], dtype=float)
@@ -177,14 +196,16 @@ def rows(chain: Chain) -> tuple[Row, ...]:
     """Return the MDH rows of a chain that has the form of an MDH table.
 
     Raises:
-        RobotError: if an element does not belong to an MDH table, or is in the wrong place.
+        RobotError: an element is not one of an MDH table, or is not in the right order.
     """
     groups: dict[int, list[Element]] = {}
     for element in chain.elements:
         match = _ELEMENT.fullmatch(element.name)
         plain = element.placement is None and element.sign == 1.0 and element.ratio == 1.0
         if not match or not plain or AXES[match[1]] != element.axis:
-            raise RobotError(f"robot '{chain.name}' is not an MDH table: element '{element.name}' does not fit")
+            raise RobotError(
+                f"robot '{chain.name}' is not an MDH table: element '{element.name}' does not fit; export it as a URDF"
+            )
         groups.setdefault(int(match[2]), []).append(element)
     result = tuple(_regroup(chain, index, group) for index, group in groups.items())
     owner = 0
@@ -193,7 +214,10 @@ def rows(chain: Chain) -> tuple[Row, ...]:
         expected += _elements(row, row.beta, owner)
         owner += row.kind != "fixed"
     if tuple(expected) != chain.elements:
-        raise RobotError(f"robot '{chain.name}' is not an MDH table: its elements do not form complete rows in order")
+        raise RobotError(
+            f"robot '{chain.name}' is not an MDH table: its elements do not form complete rows in order; export it "
+            "as a URDF"
+        )
     return result
 
 
@@ -206,13 +230,19 @@ def is_table(chain: Chain) -> bool:
 
 
 def to_table(chain: Chain) -> dict[str, object]:
-    """Return the table (schema above) that `from_table` reads back exactly."""
+    """Return a chain as a TOML table (schema in the module's docstring), which `from_table` reads back exactly."""
     entries = [_entry(row, index + 1) for index, row in enumerate(rows(chain))]
     return tables.chain_table(chain, propose_beta=False, joint=entries)
 
 
 def _elements(row: Row, beta: float | None, owner: int) -> list[Element]:
-    """Return the elements of one row, in the order of the product."""
+    """Return the elements of one row, in the order of the product of transforms.
+
+    Args:
+        row: the row.
+        beta: rotation about y [rad]; None: no such element.
+        owner: index of the joint whose frame the elements place.
+    """
     values = {"alpha": row.alpha, "d": row.d}
     if beta is not None:
         values["beta"] = beta
@@ -227,7 +257,7 @@ def _elements(row: Row, beta: float | None, owner: int) -> list[Element]:
 
 
 def _parallel(rows: Iterable[Row]) -> set[int]:
-    """Return the indices of moving rows with an axis nearly parallel to the previous moving axis, at zero joints."""
+    """Return the indices of moving rows whose axis is nearly parallel to the previous moving axis, at q = 0."""
     indices: set[int] = set()
     # Rotation since the last moving row.
     rotation: Rotation | None = None
@@ -244,7 +274,13 @@ def _parallel(rows: Iterable[Row]) -> set[int]:
 
 
 def _row(entry: RowTable, next_index: int, where: str) -> Row:
-    """Return the row of one [[joint]] table, its limits in SI units by the kind of joint."""
+    """Return the row for one [[joint]] table, with limits converted to SI by the kind of joint.
+
+    Args:
+        entry: the table.
+        next_index: number of the row if the table has none.
+        where: name of the file in messages.
+    """
     index = next_index if entry.index is None else entry.index
     name = f"joint{index}" if entry.name is None else entry.name
     where = f"{where} ('{name}')"
@@ -277,7 +313,13 @@ def _row(entry: RowTable, next_index: int, where: str) -> Row:
 
 
 def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
-    """Return the MDH row of a group of elements with one number; the caller checks order and completeness."""
+    """Return the MDH row for the elements `group` that share one number; the caller checks order and completeness.
+
+    Args:
+        chain: the arm.
+        index: number in the elements' names.
+        group: the elements, in order.
+    """
     values: FieldValues = {element.name.removesuffix(str(index)): element.value for element in group}
     moving = [element for element in group if element.joint is not None]
     if not moving:
@@ -290,7 +332,12 @@ def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
 
 
 def _entry(row: Row, expected: int) -> dict[str, object]:
-    """Return the [[joint]] table for a row, without default values (the four parameters are always written)."""
+    """Return the [[joint]] table for a row, without default values; the four MDH parameters are always included.
+
+    Args:
+        row: the row.
+        expected: number that the row has by default.
+    """
     entry: dict[str, object] = {"name": row.name}
     if row.kind != "revolute":
         entry["kind"] = row.kind

@@ -1,7 +1,7 @@
 """Obstacles in an arm's base frame: boxes, spheres, cylinders and walls, with signed distances.
 
-Distances are signed: negative is the depth inside. The distance from a convex body is a convex function of the point,
-so that golden-section search finds the nearest point of a line, inside the body as well as outside.
+A negative distance is the depth inside an obstacle. The signed distance from a convex body is a convex function of the
+point. Golden-section search therefore finds the point of a line that is nearest to the body, inside as well as outside.
 """
 
 from __future__ import annotations
@@ -27,8 +27,10 @@ class Obstacle:
     """Fixed obstacle in the arm's base frame: box, sphere or cylinder.
 
     Attributes:
-        kind: "box" (size: three edges), "sphere" (radius) or "cylinder" (radius, length along its z) [m].
-        placement: (4, 4), pose of its centre.
+        name: name of the obstacle.
+        kind: "box", "sphere" or "cylinder".
+        size: three edges of a box, radius of a sphere, or radius and length (along z) of a cylinder [m].
+        placement: (4, 4) pose of the obstacle's centre.
     """
 
     name: str
@@ -46,7 +48,13 @@ class Obstacle:
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """Half-space allowed for the arm: normal · x ≥ offset, with a unit normal (3,) in the base frame."""
+    """Wall: the arm must stay in the half-space normal · x ≥ offset.
+
+    Attributes:
+        name: name of the wall.
+        normal: (3,) unit normal in the base frame.
+        offset: distance of the wall's plane from the base's origin along the normal [m].
+    """
 
     name: str
     normal: np.ndarray
@@ -54,7 +62,12 @@ class Wall:
 
 
 def signed_distance(obstacle: Obstacle, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances (...) [m] of points (..., 3) from an obstacle, and the outward normals (..., 3)."""
+    """Return the signed distances (...) [m] of points (..., 3) from an obstacle, and the outward normals (..., 3).
+
+    Args:
+        obstacle: the obstacle.
+        points: positions in the arm's base frame [m].
+    """
     rotation = obstacle.placement[:3, :3]
     local = _in_obstacle_frame(obstacle, points)
     if obstacle.kind == "sphere":
@@ -88,7 +101,12 @@ def _in_obstacle_frame(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
 
 
 def _face_distances(obstacle: Obstacle, local: np.ndarray) -> np.ndarray:
-    """Return the signed distances (..., k) of points (..., 3) in the obstacle's frame from its faces."""
+    """Return the signed distances (..., k) [m] of points (..., 3) in the obstacle's frame from its k faces.
+
+    Args:
+        obstacle: the obstacle; k depends on its kind.
+        local: the points.
+    """
     if obstacle.kind == "box":
         return np.abs(local) - np.array(obstacle.size) / 2
     radius, length = obstacle.size
@@ -98,7 +116,12 @@ def _face_distances(obstacle: Obstacle, local: np.ndarray) -> np.ndarray:
 
 
 def _distance(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
-    """Return the signed distances (...) [m] of points (..., 3) from an obstacle, without normals."""
+    """Return the signed distances (...) [m] of points (..., 3) from an obstacle, without normals.
+
+    Args:
+        obstacle: the obstacle.
+        points: positions in the arm's base frame [m].
+    """
     local = _in_obstacle_frame(obstacle, points)
     if obstacle.kind == "sphere":
         return np.linalg.norm(local, axis=-1) - obstacle.size[0]
@@ -111,7 +134,10 @@ def _distance(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
 
 
 def nearest_on_lines(obstacle: Obstacle, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Return the positions (...) from 0 to 1 on lines from start to end (..., 3) that are nearest to an obstacle."""
+    """Return the position (...), from 0 to 1, of the point nearest to an obstacle on each line from `start` to `end`.
+
+    Both ends are (..., 3) [m].
+    """
     low = np.zeros(start.shape[:-1])
     high = np.ones(start.shape[:-1])
     direction = end - start

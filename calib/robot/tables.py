@@ -60,7 +60,7 @@ class PlacementTable:
     matrix: tuple[tuple[Plain, Plain, Plain, Plain], ...] | None = None
 
     def transform(self, where: str) -> np.ndarray:
-        """Return the transform (4, 4); `where` names the table in complaints."""
+        """Return the transform (4, 4); `where` names the table in messages."""
         if self.matrix is None:
             return from_xyz_rpy(np.array(self.xyz), np.array(self.rpy))
         if len(self.matrix) not in (3, 4):
@@ -70,7 +70,7 @@ class PlacementTable:
         rotation = result[:3, :3]
         error = np.abs(rotation.T @ rotation - np.eye(3)).max()
         if not error < 1e-6 or np.linalg.det(rotation) < 0:
-            refuse_robot(where, f"the upper left 3 x 3 of matrix is not a rotation (R'R - 1 = {error:.2g})")
+            refuse_robot(where, f"the upper left 3 x 3 of matrix is not a rotation (R'R - 1 = {error:.2g}): correct it")
         return result
 
 
@@ -110,7 +110,7 @@ class RobotTable:
     provenance: Foreign = None
 
     def chain_fields(self, where: str) -> FieldValues:
-        """Return the fields of a `Chain` that these keys give; `where` names the file in complaints."""
+        """Return the fields of a `Chain` that these keys define, by name; `where` names the file in messages."""
         result: FieldValues = {"name": self.name, "floor": self.floor}
         if self.base is not None:
             result["base"] = self.base
@@ -131,8 +131,14 @@ number = partial(config_types.number, error=RobotError)
 def word(table: Mapping[str, object], key: str, where: str, default: str | None = None) -> str:
     """Return a non-empty text from a table.
 
+    Args:
+        table: the table.
+        key: key of the text.
+        where: name of the table in messages.
+        default: text for a missing key; None: the key is required.
+
     Raises:
-        RobotError: if the value is no text or empty, or missing without a default.
+        RobotError: the value is not a text or is empty, or the required key is missing.
     """
     value = table.get(key, default)
     if value is None:
@@ -143,19 +149,34 @@ def word(table: Mapping[str, object], key: str, where: str, default: str | None 
 
 
 def vector(value: object, count: int, where: str, quantity: str = "") -> np.ndarray:
-    """Return (count,) numbers in SI units from a TOML list."""
+    """Return `count` numbers (count,) in SI from a TOML list.
+
+    Args:
+        value: the list.
+        count: number of numbers.
+        where: name of the list in messages.
+        quantity: quantity whose units are accepted, such as ``length``; empty for plain numbers.
+    """
     return np.array(config_types.numbers(value, count, where, quantity, RobotError))
 
 
 def placement(table: object, where: str) -> np.ndarray:
-    """Return a transform (4, 4) from a table ``{xyz, rpy}`` [m, rad] or ``{matrix}`` (three or four rows)."""
+    """Return a transform (4, 4) from a table ``{xyz, rpy}`` [m, rad] or ``{matrix}`` (three or four rows).
+
+    Args:
+        table: the parsed TOML table.
+        where: name of the table in messages.
+    """
     if not isinstance(table, Mapping):
         refuse_robot(where, f"expected xyz and rpy, or matrix; found {shown(table)}")
     return config.parse(PlacementTable, table, where, RobotError).transform(where)
 
 
 def placement_table(transform: np.ndarray) -> dict[str, list]:
-    """Return the table that `placement` reads back exactly: xyz and rpy where they are exact, else the matrix."""
+    """Return a table that `placement` reads back exactly as `transform` (4, 4) [m].
+
+    It has xyz [m] and rpy [rad] if these are exact, else the matrix.
+    """
     xyz, rpy = to_xyz_rpy(transform)
     if np.array_equal(from_xyz_rpy(xyz, rpy), transform):
         table = {"xyz": xyz.tolist()}
@@ -166,12 +187,12 @@ def placement_table(transform: np.ndarray) -> dict[str, list]:
 
 
 def spelled(angle: float) -> float | str:
-    """Return an angle as text if it is ±pi or ±pi/2, else unchanged."""
+    """Return an angle as text (such as ``pi/2``) if it is ±pi or ±pi/2, else unchanged."""
     return _PI.get(angle, angle)
 
 
 def chain_table(chain: Chain, **rows: object) -> dict[str, object]:
-    """Return the table of a chain that `RobotTable` reads back exactly; `rows` stand before its tail."""
+    """Return the table of a chain that `RobotTable` reads back exactly; the tables `rows` precede the chain's tail."""
     table: dict[str, object] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
     table["gravity"] = chain.gravity.tolist()
     if chain.floor:
@@ -183,11 +204,11 @@ def chain_table(chain: Chain, **rows: object) -> dict[str, object]:
 
 
 def finite_limits(joint: object) -> dict[str, float]:
-    """Return the known (finite) limits of a joint or MDH row, by name."""
+    """Return the known (finite) limits of a joint or an MDH row, by name."""
     limits = {key: getattr(joint, key) for key in LIMITS}
     return {key: limit for key, limit in limits.items() if np.isfinite(limit)}
 
 
 def dumps(table: Mapping[str, object]) -> str:
-    """Return a table as TOML text, with floats in full precision; None is left out."""
+    """Return a table as TOML text, with floats in full precision; keys with the value None are omitted."""
     return rtoml.dumps(config.plain_values(table), none_value=None)

@@ -37,21 +37,21 @@ if TYPE_CHECKING:
     from calib.simulation.rendered_camera import Imaging
 
 CHARUCO = Board("charuco", 9, 7, 0.03, 0.021)
-# corners in view of a board that need not be fully in view
+# Smallest number of visible corners of a board that need not be fully in view.
 MIN_CORNERS = 12
 
-# intrinsics fx, fy, cx, cy [px] and distortion k1, k2, p1, p2, k3 of an 8 mm lens before 3.45 µm pixels, about
+# Intrinsics fx, fy, cx, cy [px] and distortion k1, k2, p1, p2, k3, about those of an 8 mm lens and 3.45 µm pixels.
 FIVE_MEGAPIXEL_INTRINSICS = np.array([2400.0, 2405.0, 1220.0, 1010.0, -0.12, 0.05, 4e-4, -3e-4, 0.0])
 FIVE_MEGAPIXEL = Lens("pinhole", FIVE_MEGAPIXEL_INTRINSICS, (2448, 2048))
 
-# distance [m] and largest tilt [rad] of the board; our choice
+# Distances [m] and largest tilt [rad] of the board in random views (our choice).
 RANGE = (0.35, 0.8)
 TILT = 0.7
 
-# 1.3 megapixels with the distortion of the lens above
+# Intrinsics of a 1.3-megapixel camera, with the distortion of the lens above.
 DEMO_INTRINSICS = np.array([1250.0, 1252.0, 640.0, 508.0, -0.12, 0.05, 4e-4, -3e-4, 0.0])
 DEMO_LENS = Lens("pinhole", DEMO_INTRINSICS, (1280, 1024))
-# digits to which placements are stated [m, rad]
+# Decimals to which the constraints file states the camera's placement [m, rad]: it is known only roughly.
 DIGITS = 2
 LIMITS = """[camera]
 mounting = "in hand"
@@ -116,6 +116,7 @@ def camera_cell(
         reach_of_arm: largest distance of the arm's workspace from its base [m]; None to compute it.
     """
     arm = cell.truth.chain
+    deflection = cell.truth.deflection
     reach = reach_of_arm or _reach(arm)
     middle = 0.5 * np.array([*board.extent, 0.0])
     from_middle = pose(None, -middle)
@@ -124,7 +125,8 @@ def camera_cell(
         facing_up = Rotation.from_euler("x", np.pi)
         table = np.array([0.55 * reach, 0.0, 0.0])
         station = invert(pose(facing_up, table) @ from_middle)
-        station_name, tool_name = "board", "camera"
+        station_name = "board"
+        tool_name = "camera"
         camera_turn = Rotation.from_euler("xyz", [0.05, -0.1, 0.6])
         tool = pose(camera_turn, [0.04, 0.02, 0.06])
     else:
@@ -132,12 +134,14 @@ def camera_cell(
         eye = reach * np.array([1.2, -0.15, 0.65])
         target = reach * np.array([0.35, 0.0, 0.35])
         station = invert(_looking(eye, target))
-        station_name, tool_name = "camera", "board"
+        station_name = "camera"
+        tool_name = "board"
         board_turn = Rotation.from_euler("xyz", [0.1, 0.15, 0.3])
         tool = pose(board_turn, [0.02, 0.03, 0.05]) @ from_middle
-    optics = Optics((lens,), ("camera",), (shape or BoardShape(),), ("board",))
+    board_shape = shape or BoardShape()
+    optics = Optics((lens,), ("camera",), (board_shape,), ("board",))
     truth = Installation(
-        arm, station[None], tool[None], (station_name,), (tool_name,), deflection=cell.truth.deflection, optics=optics
+        arm, station[None], tool[None], (station_name,), (tool_name,), deflection=deflection, optics=optics
     )
     note = f"{cell.note}; a camera {mounting} sees a {board.words}"
     seen_cell = replace(cell, truth=truth, note=note)
@@ -145,7 +149,9 @@ def camera_cell(
 
 
 def _reach(chain: Chain) -> float:
-    poses = forward(chain, random_joints(chain, 500, 0))
+    """Return the distance [m] from the base within which the tip is in 90 % of random postures."""
+    q = random_joints(chain, 500, 0)
+    poses = forward(chain, q)
     distances = np.linalg.norm(poses[:, :3, 3], axis=1)
     return float(np.quantile(distances, 0.9))
 
@@ -161,7 +167,7 @@ def _looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def board_poses(camera: CameraCell, q: np.ndarray) -> np.ndarray:
-    """Return the board's true poses (m, 4, 4) in the camera's frame."""
+    """Return the board's true poses (m, 4, 4) in the camera's frame, at joint values q (m, n)."""
     poses = true_poses(camera.cell, q)
     if camera.mounting == IN_HAND:
         return invert(poses)
@@ -186,7 +192,8 @@ def views(
     min_distance, max_distance = sought.distance
     if camera.mounting != IN_HAND:
         # a camera beside the arm stands farther away
-        min_distance, max_distance = 2.0 * min_distance, 3.0 * max_distance
+        min_distance = 2.0 * min_distance
+        max_distance = 3.0 * max_distance
     min_corners = MIN_CORNERS
     if sought.whole:
         min_corners = len(corners(camera.board))
@@ -209,14 +216,16 @@ def visible(camera: CameraCell, q: np.ndarray) -> np.ndarray:
     poses = board_poses(camera, q)
     points = _points(camera, poses)
     in_sight = camera.lens.in_sight(points.reshape(-1, 3), 6.0)
-    normals, positions = poses[:, :3, 2], poses[:, :3, 3]
+    normals = poses[:, :3, 2]
+    positions = poses[:, :3, 3]
     facing = np.einsum("mi,mi->m", normals, positions) > 0.0
     return in_sight.reshape(points.shape[:2]) & facing[:, None]
 
 
 def _points(camera: CameraCell, poses: np.ndarray) -> np.ndarray:
     """Return the corners (m, K, 3) [m] of the printed board in the camera's frame."""
-    table = shaped_points(camera.board, camera.shape, corners(camera.board))
+    nominal = corners(camera.board)
+    table = shaped_points(camera.board, camera.shape, nominal)
     turned = np.einsum("mij,kj->mki", poses[:, :3, :3], table)
     return turned + poses[:, None, :3, 3]
 
@@ -224,9 +233,16 @@ def _points(camera: CameraCell, poses: np.ndarray) -> np.ndarray:
 def photograph(
     camera: CameraCell, q: np.ndarray, noise: float = 0.05, seed: int | np.random.Generator = 0, file: str = "images"
 ) -> Pixels:
-    """Return simulated images at q (m, n): projected corners with white noise [px]; the lens is left unknown.
+    """Return simulated images at joint values q (m, n): projected corners with white noise.
 
-    The recorded joints carry the encoders' noise.
+    The result states no lens, so that a fit has to estimate it. Its joint values contain the encoders' noise.
+
+    Args:
+        camera: the cell.
+        q: (m, n) true joint values [rad or m].
+        noise: standard deviation of each pixel coordinate [px].
+        seed: seed of all noise.
+        file: file name that messages about these images give.
     """
     rng = np.random.default_rng(seed)
     in_view = visible(camera, q)
@@ -237,6 +253,7 @@ def photograph(
     pixel = pixel.reshape(*in_view.shape, 2)
     pixel = pixel + rng.normal(0.0, noise, pixel.shape)
     pixel = np.where(in_view[:, :, None], pixel, np.nan)
+    sigma = np.full(in_view.shape, max(noise, 1e-3))
     recorded = _recorded(camera, q, rng)
     truth = camera.cell.truth
     return Pixels(
@@ -245,7 +262,7 @@ def photograph(
         pixel,
         camera.board,
         None,
-        sigma=np.full(in_view.shape, max(noise, 1e-3)),
+        sigma=sigma,
         station=truth.station_names[0],
         tool_names=truth.tool_names,
         size=camera.lens.size,
@@ -257,7 +274,8 @@ def photograph(
 
 def _recorded(camera: CameraCell, q: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return joint values (m, n) with the encoders' noise [rad or m]."""
-    return q + rng.normal(0.0, camera.cell.instrument.encoder_sigma, q.shape)
+    sigma = camera.cell.instrument.encoder_sigma
+    return q + rng.normal(0.0, sigma, q.shape)
 
 
 def _image_names(count: int) -> list[str]:
@@ -282,7 +300,10 @@ def take_pictures(
         imaging: light, focus and noise.
         seed: seed of all noise.
         moving: (m, n) motion of the joints during the exposure [rad or m]; None: the arm stands still.
-        say: called with a line on each image.
+        say: function called with a line of text before each image is rendered; None: no function.
+
+    Returns:
+        The folder.
     """
     from calib.data.images.images import write_image
     from calib.simulation.rendered_camera import render
@@ -295,8 +316,8 @@ def take_pictures(
             say(f"rendering {folder.name}/{name}")
         exposure_joints = q[k : k + 1]
         if moving is not None and moving[k].any():
-            share_of_exposure = np.linspace(-0.5, 0.5, 7)[:, None]
-            exposure_joints = q[k] + share_of_exposure * moving[k]
+            share_of_exposure = np.linspace(-0.5, 0.5, 7)
+            exposure_joints = q[k] + share_of_exposure[:, None] * moving[k]
         poses = board_poses(camera, exposure_joints)
         noise = np.random.default_rng([seed, k])
         image = render(camera.board, camera.lens, poses, imaging, noise, camera.shape)
@@ -322,14 +343,20 @@ def seen_by_camera(cell: Cell) -> CameraCell:
 
 @contextmanager
 def limits_of(camera: CameraCell) -> Iterator[Path]:
-    """Yield a constraints file with the camera's approximate placement, next to its lens and board files."""
+    """Yield the path of a constraints file with the camera's approximate placement, beside its lens and board files.
+
+    The files are deleted at the end of the context.
+    """
     truth = camera.cell.truth
-    middle = pose(None, 0.5 * np.array([*camera.board.extent, 0.0]))
+    board_middle = 0.5 * np.array([*camera.board.extent, 0.0])
+    middle = pose(None, board_middle)
     frames = {"carried": truth.tools[0], "stands": invert(truth.stations[0]) @ middle}
     placements = {}
     for name, frame in frames.items():
         xyz, rpy = to_xyz_rpy(frame)
-        placements[name] = [np.round(xyz, DIGITS).tolist(), np.round(rpy, DIGITS).tolist()]
+        rounded_xyz = np.round(xyz, DIGITS)
+        rounded_rpy = np.round(rpy, DIGITS)
+        placements[name] = [rounded_xyz.tolist(), rounded_rpy.tolist()]
     with tempfile.TemporaryDirectory(prefix="calib-demo-", ignore_cleanup_errors=True) as folder:
         write_lens(camera.lens, Path(folder, "camera.yaml"))
         boards.write_board(camera.board, Path(folder, BOARD))

@@ -23,22 +23,31 @@ from calib.robot import description, library
 def _fourier(
     centre: np.ndarray, sines: np.ndarray, cosines: np.ndarray, base: float, duration: float, rate: float
 ) -> Reference:
-    """Return q_i = q_i0 + Σ_k [a_ik sin(k ω t) + b_ik cos(k ω t)] (Swevers et al. 1997; Kolyubin et al. 2019, eq. 23).
+    """Return the sampled motion q_i(t) = q_i0 + Σ_k [a_ik sin(k ω t) + b_ik cos(k ω t)] of n joints.
+
+    Source: Swevers et al. (1997); Kolyubin et al. (2019), eq. 23.
 
     Args:
-        centre: (n,) q_i0.
-        sines, cosines: (n, h) coefficients a and b.
-        base: ω [rad/s].
-        duration, rate: [s], [Hz].
+        centre: (n,) centres q_i0 [rad or m].
+        sines, cosines: (n, h) coefficients a and b of h harmonics [rad or m].
+        base: angular frequency ω of the first harmonic [rad/s].
+        duration: duration of the motion [s].
+        rate: samples per second [Hz].
     """
-    t = np.arange(round(duration * rate) + 1) / rate
+    intervals = round(duration * rate)
+    t = np.arange(intervals + 1) / rate
     harmonics = np.arange(1, sines.shape[1] + 1)
     speed = base * harmonics
     phase = np.outer(t, speed)
-    sin, cos = np.sin(phase), np.cos(phase)
+    sin = np.sin(phase)
+    cos = np.cos(phase)
+    sin_rate = sin * speed
+    cos_rate = cos * speed
+    sin_change = sin * speed**2
+    cos_change = cos * speed**2
     q = np.asarray(centre) + sin @ sines.T + cos @ cosines.T
-    v = (cos * speed) @ sines.T - (sin * speed) @ cosines.T
-    a = -(sin * speed**2) @ sines.T - (cos * speed**2) @ cosines.T
+    v = cos_rate @ sines.T - sin_rate @ cosines.T
+    a = -sin_change @ sines.T - cos_change @ cosines.T
     return Reference(t, q, v, a)
 
 
@@ -54,12 +63,18 @@ def random_fourier(
 ) -> Reference:
     """Return one period of a random Fourier motion inside the limits, at rest at both ends.
 
-    Coefficients fall with the harmonic's number and are projected to rest (Σ k a_k = Σ k² b_k = 0); each joint is
-    scaled until its first limit is met, then centred. A stand-in for designed excitation, not a replacement.
+    The amplitude of a harmonic is inversely proportional to its number. Conditions Σ k a_k = Σ k² b_k = 0 put both ends
+    at rest. Each joint's motion is scaled up until it meets one of the limits, then centred. The motion is not
+    optimised for identification.
 
     Args:
-        lower, upper, velocity: (n,) limits, kept everywhere on the grid of `rate`.
+        lower, upper: (n,) position limits [rad or m], met at all samples.
+        velocity: (n,) speed limits [rad/s or m/s], met at all samples.
+        duration: duration of the period [s].
+        rate: samples per second [Hz].
+        harmonics: number of harmonics.
         acceleration: largest acceleration of any joint [rad/s² or m/s²].
+        seed: seed of the coefficients.
     """
     lower = np.asarray(lower, dtype=float)
     upper = np.asarray(upper, dtype=float)
@@ -73,15 +88,18 @@ def random_fourier(
     _project_out(cosines, order**2)
     base = 2 * np.pi / duration
     raw = _fourier(np.zeros(n), sines, cosines, base, duration, rate)
-    low, high = raw.q.min(axis=0), raw.q.max(axis=0)
+    low = raw.q.min(axis=0)
+    high = raw.q.max(axis=0)
     # how far each joint may be scaled up before it meets each of its limits
     travel_share = (upper - lower) / (high - low)
     velocity_share = velocity / np.abs(raw.v).max(axis=0)
     acceleration_share = acceleration / np.abs(raw.a).max(axis=0)
     scale = np.min([travel_share, velocity_share, acceleration_share], axis=0)
-    centre = 0.5 * (lower + upper) - 0.5 * scale * (low + high)
-    amplitude = scale[:, None]
-    return _fourier(centre, amplitude * sines, amplitude * cosines, base, duration, rate)
+    middle = 0.5 * (lower + upper)
+    centre = middle - 0.5 * scale * (low + high)
+    scaled_sines = scale[:, None] * sines
+    scaled_cosines = scale[:, None] * cosines
+    return _fourier(centre, scaled_sines, scaled_cosines, base, duration, rate)
 
 
 def _project_out(coefficients: np.ndarray, direction: np.ndarray) -> None:
@@ -104,10 +122,14 @@ def trapezoidal(
     """
     points = shaped(points, (None, None), "points")
     n = points.shape[1]
-    velocity = np.broadcast_to(np.asarray(velocity, dtype=float), n)
-    acceleration = np.broadcast_to(np.asarray(acceleration, dtype=float), n)
+    velocity_limits = np.asarray(velocity, dtype=float)
+    acceleration_limits = np.asarray(acceleration, dtype=float)
+    velocity = np.broadcast_to(velocity_limits, n)
+    acceleration = np.broadcast_to(acceleration_limits, n)
     still = np.zeros((round(pause * rate), n))
-    positions, velocities, accelerations = [still + points[0]], [still], [still]
+    positions = [still + points[0]]
+    velocities = [still]
+    accelerations = [still]
     for start, stop in pairwise(points):
         q, v, a = _move(start, stop, velocity, acceleration, rate)
         positions += [q, still + stop]
@@ -115,13 +137,18 @@ def trapezoidal(
         accelerations += [a, still]
     q = np.concatenate(positions)
     t = np.arange(len(q)) / rate
-    return Reference(t, q, np.concatenate(velocities), np.concatenate(accelerations))
+    v = np.concatenate(velocities)
+    a = np.concatenate(accelerations)
+    return Reference(t, q, v, a)
 
 
 def _move(
     start: np.ndarray, stop: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, rate: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return one move with s(t) from 0 to 1: ramps of r seconds, T seconds in all, peak velocity 1 / (T - r)."""
+    """Return positions, velocities and accelerations (N, n) of a move between two points, without its first sample.
+
+    The share of the way s(t) goes from 0 to 1 in T seconds, with ramps of r seconds and the peak velocity 1 / (T - r).
+    """
     distance = np.abs(stop - start)
     ramp_times = velocity / acceleration
     ramp = float(np.max(ramp_times, where=distance > 0, initial=1.0 / rate))
@@ -130,28 +157,39 @@ def _move(
     cruise = max(cruise_at_velocity, cruise_at_acceleration)
     ramp = max(ramp, 2.0 / rate)
     total = max(cruise, ramp) + ramp
-    t = np.arange(1, int(np.ceil(total * rate)) + 1) / rate
+    intervals = int(np.ceil(total * rate))
+    t = np.arange(1, intervals + 1) / rate
     peak = 1.0 / (total - ramp)
     remaining = np.maximum(total - t, 0.0)
     starting = t < ramp
     stopping = remaining < ramp
-    # share of the way, its speed and its acceleration: without the ramp at the start, then with it
-    share = np.where(stopping, 1 - 0.5 * peak * remaining**2 / ramp, peak * (t - ramp / 2))
-    share = np.where(starting, 0.5 * peak * t**2 / ramp, share)
+    # share of the way: ramp at the start, constant speed, ramp at the end
+    share_at_start = 0.5 * peak * t**2 / ramp
+    share_between = peak * (t - ramp / 2)
+    share_at_end = 1 - 0.5 * peak * remaining**2 / ramp
+    share = np.where(stopping, share_at_end, share_between)
+    share = np.where(starting, share_at_start, share)
+    # its speed
     speed = np.where(stopping, peak * remaining / ramp, peak)
     speed = np.where(starting, peak * t / ramp, speed)
-    change = np.where(stopping & (remaining > 0), -peak / ramp, 0.0)
+    # its acceleration, zero at the end
+    braking = stopping & (remaining > 0)
+    change = np.where(braking, -peak / ramp, 0.0)
     change = np.where(starting, peak / ramp, change)
     distances = stop - start
-    return start + np.outer(share, distances), np.outer(speed, distances), np.outer(change, distances)
+    q = start + np.outer(share, distances)
+    v = np.outer(speed, distances)
+    a = np.outer(change, distances)
+    return q, v, a
 
 
-SIDED = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")  # drive terms of a joint with a torque sensor
+# Drive terms of a joint with a torque sensor: motor inertia, then friction and offset on the link's and motor's side.
+SIDED = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")
 
 
 @cache
 def truth(name: str) -> ParsedTable:
-    """Return the true parameters of ``tx40``, ``rv2sq`` or ``lwr4plus``."""
+    """Return the true parameters of ``tx40``, ``rv2sq`` or ``lwr4plus``, as a table read from the library's file."""
     return description.read_extra(library.path(f"{name}_truth"))["truth"]
 
 
@@ -172,27 +210,35 @@ def plant(name: str, coupled: bool = False, offset: np.ndarray | None = None) ->
     amounts = []
     for joint in range(chain.n):
         amounts += [rows[shape][joint] for shape in shapes]
-    terms = list(drives.standard([" ".join(shapes)] * chain.n, drive_rows["v0"]))
+    joint_terms = " ".join(shapes)
+    terms = list(drives.standard([joint_terms] * chain.n, drive_rows["v0"]))
     if coupled:
         coupling = true_values["coupling"]
-        first, second = (joint - 1 for joint in coupling["joints"])
+        first_number, second_number = coupling["joints"]
+        first = first_number - 1
+        second = second_number - 1
         # one motor inertia: Iam6 is Ia6, which acts on row 5 by a6 and on row 6 by a5 + a6
-        both_rows = ((first, ((second, 1.0),)), (second, ((first, 1.0), (second, 1.0))))
+        on_first = (first, ((second, 1.0),))
+        on_second = (second, ((first, 1.0), (second, 1.0)))
+        both_rows = (on_first, on_second)
         for k, term in enumerate(terms):
             if term.shape == "acceleration" and term.joint == second:
                 terms[k] = replace(term, acts=both_rows)
         gear = drives.coupled(first, second, drive_rows["v0"])
         terms += gear[1:]
         amounts += [coupling["Fvm"], coupling["Fcm"]]
-    parameters = np.concatenate([standard_parameters(chain), amounts])
+    inertial = standard_parameters(chain)
+    parameters = np.concatenate([inertial, amounts])
     return Plant(bodies_of(chain), tuple(terms), parameters)
 
 
 def controller(name: str) -> LoopController:
     """Return the published PD controller of the TX40 or RV-2SQ."""
     gains = truth(name)["control"]
+    kp = np.array(gains["kp"])
+    kd = np.array(gains["kd"])
     limit = np.array(gains.get("limit", np.inf))
-    return pd(np.array(gains["kp"]), np.array(gains["kd"]), limit)
+    return pd(kp, kd, limit)
 
 
 def model(plant: Plant) -> IdentificationModel:

@@ -15,13 +15,17 @@ from calib.robot.kinematics import forward, joint_jacobian, sweep
 from calib.transforms import invert, pose
 
 COLUMNS = ("alpha", "d", "theta", "r")
+# Table 3: errors of the nominal and of the calibrated arm on poses outside the fit.
 NOMINAL_ERRORS = {"position_mm": {"max": 9.6806, "mean": 5.9019}, "orientation_deg": {"max": 0.8058, "mean": 0.5636}}
 CALIBRATED_ERRORS = {"position_mm": {"max": 1.7592, "mean": 0.7965}, "orientation_deg": {"max": 0.2268, "mean": 0.1042}}
 TABLE_3 = {"nominal": NOMINAL_ERRORS, "calibrated": CALIBRATED_ERRORS}
-POSES, BASE_PARAMETERS, CONDITION = 17, 32, 11.1878
-# frames moved by joints 2 to 7, whose rows of Table 2 the library's arm has
+# Numbers of measured poses and of base parameters, and the condition number of the poses' regressor.
+POSES = 17
+BASE_PARAMETERS = 32
+CONDITION = 11.1878
+# Frames of Table 2 that joints 2 to 7 move: the frames of the library's arm.
 ARM_FRAMES = range(2, 8)
-# of the paper's Table 1: joint limits [rad]
+# Joint limits of Table 1 [rad].
 JOINT_LIMITS = np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
 
 
@@ -60,20 +64,30 @@ def station(table: np.ndarray) -> np.ndarray:
 
 def tool(table: np.ndarray) -> np.ndarray:
     """Return the pose (4, 4) of the LED fixture in the frame of the library arm's flange, from frame 8."""
-    return invert(nominal_chain().tail) @ transform(*table[8])
+    flange = nominal_chain().tail
+    return invert(flange) @ transform(*table[8])
 
 
 def constraint_values(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the constraints of Table 1 (m, 6), satisfied if >= 0: roll and pitch above and below, distance, height.
+    """Return the values (m, 6) of the constraints of Table 1, which are satisfied where they are >= 0.
 
-    The paper leaves open how roll and pitch are defined and where z is measured from; our reading: R = Rz Ry Rx of the
-    fixture in the camera's frame; distance from axis 1 and height above the floor plate, 0.31 m below the shoulder.
+    Columns: lower and upper bound of roll, lower and upper bound of pitch [rad], distance from axis 1, height [m]. The
+    paper does not define roll, pitch and the origin of z. We take them from R = Rz Ry Rx of the LED fixture in the
+    camera's frame, and the height above the floor plate, 0.31 m below the shoulder.
+
+    Args:
+        chain: the arm.
+        station: (4, 4) pose of the arm's base in the camera's frame.
+        tool: (4, 4) pose of the fixture in the frame of the arm's flange.
+        q: (m, n) joint values [rad].
     """
     fixture = forward(chain, q) @ tool
     rotation = station[:3, :3] @ fixture[:, :3, :3]
-    roll = np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2])
-    cosine_of_pitch = np.hypot(rotation[:, 0, 0], rotation[:, 1, 0])
-    pitch = np.arctan2(-rotation[:, 2, 0], cosine_of_pitch)
+    x_axis = rotation[:, :, 0]
+    z_row = rotation[:, 2]
+    roll = np.arctan2(z_row[:, 1], z_row[:, 2])
+    cosine_of_pitch = np.hypot(x_axis[:, 0], x_axis[:, 1])
+    pitch = np.arctan2(-z_row[:, 0], cosine_of_pitch)
     x, y, z = fixture[:, :3, 3].T
     across = np.hypot(x, y)
     height = z + 0.31
@@ -89,7 +103,7 @@ def constraint_values(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np
 
 
 def constraint_gradients(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the derivatives of `constraint_values` with respect to q, (m, 6, 7).
+    """Return the derivatives (m, 6, 7) of `constraint_values` with respect to the joint values q (m, 7).
 
     With R = Rz(ψ) Ry(θ) Rx(φ) and the angular velocity ω in the camera's frame: φ' = (ω_x cos ψ + ω_y sin ψ) / cos θ,
     θ' = ω_y cos ψ - ω_x sin ψ.
@@ -99,17 +113,21 @@ def constraint_gradients(chain: Chain, station: np.ndarray, tool: np.ndarray, q:
     position = fixture[:, :3, 3]
     slope = joint_jacobian(chain, walked, position.T)
     # direction (m, 2) from axis 1 to the fixture
-    distance = np.maximum(np.hypot(position[:, 0], position[:, 1]), 1e-9)
+    from_axis = np.hypot(position[:, 0], position[:, 1])
+    distance = np.maximum(from_axis, 1e-9)
     across = position[:, :2] / distance[:, None]
     away = np.einsum("mi,min->mn", across, slope[:, :2])
     rotation = station[:3, :3]
     turn = rotation @ slope[:, 3:]
     fixture_axis = rotation @ fixture[:, :3, 0].T
     x, y = fixture_axis[:2, :, None]
+    omega_x = turn[:, 0]
+    omega_y = turn[:, 1]
     cosine = np.maximum(np.hypot(x, y), 1e-9)
-    roll = (x * turn[:, 0] + y * turn[:, 1]) / cosine**2
-    pitch = (x * turn[:, 1] - y * turn[:, 0]) / cosine
-    return np.stack([roll, -roll, pitch, -pitch, away, slope[:, 2]], axis=1)
+    roll = (x * omega_x + y * omega_y) / cosine**2
+    pitch = (x * omega_y - y * omega_x) / cosine
+    height = slope[:, 2]
+    return np.stack([roll, -roll, pitch, -pitch, away, height], axis=1)
 
 
 def feasible(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np.ndarray) -> np.ndarray:

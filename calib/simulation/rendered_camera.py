@@ -17,14 +17,18 @@ from calib.data.images.board_print import raster
 from calib.data.images.lens import Lens, rays
 from calib.data.images.optics import BoardShape, shaped_points
 
-# sub-pixels in each direction
+# Number of sub-pixels per pixel in each direction.
 SUB = 3
-# pixels between the nodes at which rays are computed; cubic in between
+# Distance [px] of the nodes at which rays are computed; between nodes the board points are interpolated.
 NODES = 16
-# white margin around the pattern [m]
+# White margin around the pattern [m].
 PAPER = 0.02
-# to meet a bent board with a ray
+# Number of iterations that intersect a ray with a bent board.
 BENT_ITERATIONS = 4
+# Smallest distance [m] of the paper's edge from the camera; a nearer board is not drawn.
+MIN_DEPTH = 0.02
+# Ratio of the resolutions at which drawings of a board are made: a drawing serves similar distances.
+RESOLUTION_RATIO = 1.25
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class Imaging:
 
     Attributes:
         exposure: grey level of white paper in full light, as a share of 255; above 1 it saturates.
-        uneven: how much darker the light is at the image's dark side, as a share.
+        uneven: share by which the light is weaker at the darkest side of the image.
         defocus: standard deviation of the blur [px].
         read: noise of the sensor [grey levels].
         shot: variance of the photon noise per grey level [grey levels].
@@ -83,8 +87,10 @@ def render(
     light = 1.0 - imaging.uneven * (0.5 + 0.7 * across + 0.3 * down)
     grey = 255.0 * imaging.exposure * light * image
     noise_sigma = np.sqrt(imaging.read**2 + imaging.shot * grey)
-    grey += rng.standard_normal(grey.shape, dtype=np.float32) * noise_sigma
-    return np.clip(np.round(grey), 0, 255).astype(np.uint8)
+    standard_noise = rng.standard_normal(grey.shape, dtype=np.float32)
+    grey += standard_noise * noise_sigma
+    rounded = np.clip(np.round(grey), 0, 255)
+    return rounded.astype(np.uint8)
 
 
 def _reflectance(board: Board, lens: Lens, pose: np.ndarray, background: float, shape: BoardShape) -> np.ndarray:
@@ -93,33 +99,40 @@ def _reflectance(board: Board, lens: Lens, pose: np.ndarray, background: float, 
     outline = shaped_points(board, shape, _outline(board))
     outline_camera = outline @ pose[:3, :3].T + pose[:3, 3]
     depth = outline_camera[:, 2]
-    if np.any(depth < 0.02):
+    if np.any(depth < MIN_DEPTH):
         return result
     # window of the image that the paper fills
     pixel = lens.project(outline_camera)
-    low = np.maximum(np.floor(pixel.min(axis=0)) - 2, 0).astype(int)
-    high = np.minimum(np.ceil(pixel.max(axis=0)) + 3, lens.size).astype(int)
+    before = np.floor(pixel.min(axis=0)) - 2
+    behind = np.ceil(pixel.max(axis=0)) + 3
+    low = np.maximum(before, 0).astype(int)
+    high = np.minimum(behind, lens.size).astype(int)
     if np.any(high <= low):
         return result
     # drawing of the board that is at least as fine as the sub-pixels
-    scale = SUB * float(np.max(lens.values[:2]) / depth.min())
-    level = int(np.ceil(np.log(scale) / np.log(1.25)))
-    per_metre = 1.25**level
+    focal = np.max(lens.values[:2])
+    scale = SUB * float(focal / depth.min())
+    steps = np.log(scale) / np.log(RESOLUTION_RATIO)
+    level = int(np.ceil(steps))
+    per_metre = RESOLUTION_RATIO**level
     sheet = _sheet_at(board, level)
     board_points = _on_sheet(board, lens, pose, shape, low, high)
-    sheet_pixels = ((board_points + PAPER) * per_metre - 0.5).astype(np.float32)
+    sheet_pixels = (board_points + PAPER) * per_metre - 0.5
+    sheet_pixels = sheet_pixels.astype(np.float32)
     x = np.ascontiguousarray(sheet_pixels[:, :, 0])
     y = np.ascontiguousarray(sheet_pixels[:, :, 1])
     fine = cv2.remap(sheet, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=background)
     size = tuple((high - low).tolist())
-    window = (slice(low[1], high[1]), slice(low[0], high[0]))
-    result[window] = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
+    left, top = low
+    right, bottom = high
+    result[top:bottom, left:right] = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
     return result
 
 
 @lru_cache(maxsize=4)
 def _sheet_at(board: Board, level: int) -> np.ndarray:
-    return raster(board, 1.25**level, PAPER)
+    """Return the drawing of a board at ``RESOLUTION_RATIO**level`` pixels per metre."""
+    return raster(board, RESOLUTION_RATIO**level, PAPER)
 
 
 def _outline(board: Board) -> np.ndarray:
@@ -141,20 +154,28 @@ def _on_sheet(
 ) -> np.ndarray:
     """Return the board points (h·SUB, w·SUB, 2) [m] seen by the sub-pixels of an image window."""
     # rays through nodes around the window
-    columns = np.arange(low[0] - NODES, high[0] + 2 * NODES, NODES, dtype=float)
-    rows = np.arange(low[1] - NODES, high[1] + 2 * NODES, NODES, dtype=float)
+    first = low - NODES
+    last = high + 2 * NODES
+    columns = np.arange(first[0], last[0], NODES, dtype=float)
+    rows = np.arange(first[1], last[1], NODES, dtype=float)
     grid = np.stack(np.meshgrid(columns, rows), axis=-1)
     direction = rays(lens, grid.reshape(-1, 2))
     ray = np.column_stack([direction, np.ones(len(direction))])
-    # where they meet the sheet; a bent one is met by iteration
-    turn, position = pose[:3, :3], pose[:3, 3]
+    # points at which the rays meet the sheet, by iteration if the sheet is bent
+    turn = pose[:3, :3]
+    position = pose[:3, 3]
     normal = pose[:3, 2]
     hit = np.zeros((len(ray), 2))
-    for _ in range(BENT_ITERATIONS if shape.bent else 1):
+    iterations = 1
+    if shape.bent:
+        iterations = BENT_ITERATIONS
+    for _ in range(iterations):
         flat = np.column_stack([hit, np.zeros(len(hit))])
         rise = shaped_points(board, shape, flat)[:, 2]
-        depth = (normal @ position + rise) / (ray @ normal)
-        on_board = (ray * depth[:, None] - position) @ turn
+        distance = normal @ position + rise
+        depth = distance / (ray @ normal)
+        from_origin = ray * depth[:, None] - position
+        on_board = from_origin @ turn
         hit = on_board[:, :2] / shape.scale
     # single precision is 1e-4 px
     nodes = hit.reshape(grid.shape).astype(np.float32)
@@ -168,14 +189,19 @@ def _on_sheet(
 
 def _cubic(count: int, columns: int) -> np.ndarray:
     """Return the matrix that interpolates from nodes to the sub-pixels of `count` pixels (Catmull & Rom 1974)."""
-    # pixels after the first node
-    position = (np.arange(count * SUB) + 0.5) / SUB - 0.5 + NODES
+    # position of each sub-pixel [px], counted from the first node
+    sub_pixels = np.arange(count * SUB) + 0.5
+    position = sub_pixels / SUB - 0.5 + NODES
     first, t = np.divmod(position / NODES, 1.0)
     node = first.astype(int)
     row = np.arange(len(position))
     result = np.zeros((len(position), columns), dtype=np.float32)
-    result[row, node - 1] += 0.5 * (-t * (1 - t) ** 2)
-    result[row, node] += 0.5 * (2 - 5 * t**2 + 3 * t**3)
-    result[row, node + 1] += 0.5 * (t * (1 + 4 * t - 3 * t**2))
-    result[row, node + 2] += 0.5 * (-(t**2) * (1 - t))
+    before = -t * (1 - t) ** 2
+    at_node = 2 - 5 * t**2 + 3 * t**3
+    after = t * (1 + 4 * t - 3 * t**2)
+    second_after = -(t**2) * (1 - t)
+    result[row, node - 1] += 0.5 * before
+    result[row, node] += 0.5 * at_node
+    result[row, node + 1] += 0.5 * after
+    result[row, node + 2] += 0.5 * second_after
     return result

@@ -23,11 +23,12 @@ from calib.simulation.unmodelled import WARM_TIME
 from calib.simulation.virtual_arm import MovingArm
 from calib.transforms import to_quaternion
 
-# number of poses over the whole joint range
+# Number of random poses over the whole joint range on which position errors are compared.
 TRUTH = 2000
-# of the validation motion [s], [Hz]
-SECONDS, RATE = 20.0, 250.0
-# of joints without a stated limit [rad/s or m/s]
+# Duration [s] and sampling rate [Hz] of the validation motion.
+SECONDS = 20.0
+RATE = 250.0
+# Speed assumed for joints without a stated limit [rad/s or m/s].
 DEFAULT_SPEED = 2.0
 
 
@@ -51,7 +52,9 @@ def position_errors(cell: Cell, calibrated: Installation, urdf: Chain) -> tuple[
         station=calibrated.station_names[0],
         tool_names=calibrated.tool_names[:1],
     )
-    return _rms(_placed(cell.nominal, block), block), _rms(calibrated, block), _rms(_placed(urdf, block), block)
+    nominal_arm = _placed(cell.nominal, block)
+    urdf_arm = _placed(urdf, block)
+    return _rms(nominal_arm, block), _rms(calibrated, block), _rms(urdf_arm, block)
 
 
 def _placed(chain: Chain, block: Poses) -> Installation:
@@ -98,7 +101,11 @@ def torque_errors(
     lower, upper = chain.sampling_limits()
     speed = np.array([joint.velocity for joint in chain.joints])
     speed = np.where(np.isfinite(speed), speed, DEFAULT_SPEED)
-    motion = random_fourier(0.8 * lower, 0.8 * upper, 0.8 * speed, SECONDS, RATE, seed=seed)
+    # motion within 80 % of the limits
+    lower = 0.8 * lower
+    upper = 0.8 * upper
+    speed = 0.8 * speed
+    motion = random_fourier(lower, upper, speed, SECONDS, RATE, seed=seed)
     states = (motion.q, motion.v, motion.a)
     motor = arm.true_torque(*states)
     link = arm.link_torque(*states)
@@ -110,11 +117,15 @@ def torque_errors(
     error = predicted - true
 
     plant = arm.plant
-    friction = link - inverse_dynamics(plant.bodies, plant.parameters[: plant.inertial], *states)
+    inertial = plant.parameters[: plant.inertial]
+    friction = link - inverse_dynamics(plant.bodies, inertial, *states)
     nominal_bodies = bodies_of(cell.nominal)
-    nominal = inverse_dynamics(nominal_bodies, standard_parameters(cell.nominal), *states) + friction
-    joint_rms = np.sqrt(np.mean(error**2, axis=0))
-    return TorqueComparison(_percent(error, true), joint_rms, _percent(nominal - link, link))
+    nominal_parameters = standard_parameters(cell.nominal)
+    nominal = inverse_dynamics(nominal_bodies, nominal_parameters, *states) + friction
+    mean_square = np.mean(error**2, axis=0)
+    identified_error = _percent(error, true)
+    nominal_error = _percent(nominal - link, link)
+    return TorqueComparison(identified_error, np.sqrt(mean_square), nominal_error)
 
 
 def _percent(error: np.ndarray, torque: np.ndarray) -> float:
@@ -134,7 +145,8 @@ def share_within(true: Mapping[str, float], estimate: Sequence[EstimateRow]) -> 
     for row in estimate:
         name = row.name.removesuffix("R")
         if name in true and row.sigma:
-            within.append(abs(row.value - true[name]) < 2 * row.sigma)
+            error = abs(row.value - true[name])
+            within.append(error < 2 * row.sigma)
     if not within:
         return 0.0, 0
     return float(np.mean(within)), len(within)
@@ -174,22 +186,29 @@ def true_base(
     samples = bases.random_samples(nominal_model, seed=seed, lower=lower, upper=upper)
     base = bases.find(true_model, samples, nominal=nominal_model)
     values = np.array([parameters[name] for name in true_model.names])
-    # what is regrouped on one geometry need not be on another: named without the R
+    # A parameter may be regrouped (final R of its name) on one geometry and not on another: names without the R.
     base_names = [base.standard[column] for column in base.kept]
     return dict(zip(base_names, base.transform @ values))
 
 
 def _true_parameters(arm: MovingArm, running: float) -> dict[str, float]:
-    """Return the true standard parameters of an arm by name; those of whole drives, and of link and motor side."""
+    """Return the true standard parameters of an arm by name.
+
+    Friction and offsets are given both for the link's and the motor's side of each gear and as the sum of both sides.
+    """
     plant = arm.plant
     names = [*plant.bodies.names, *(term.name for term in plant.terms)]
     parameters = dict(zip(names, plant.parameters))
     warming = arm.unmodelled.warming * (1.0 - np.exp(-running / WARM_TIME))
     for number in range(1, arm.chain.n + 1):
         for name, change in (("Fv", 0.0), ("Fc", arm.unmodelled.memory)):
-            link, motor = f"{name}l{number}", f"{name}m{number}"
-            parameters[motor] += (change - warming) * (parameters[link] + parameters[motor])
-        # of whole drives, for models that do not separate motor and link
+            link = f"{name}l{number}"
+            motor = f"{name}m{number}"
+            total = parameters[link] + parameters[motor]
+            parameters[motor] += (change - warming) * total
+        # sums of both sides, for models that do not separate motor and link
         for name in ("Fv", "Fc", "off"):
-            parameters[f"{name}{number}"] = parameters[f"{name}l{number}"] + parameters[f"{name}m{number}"]
+            link_value = parameters[f"{name}l{number}"]
+            motor_value = parameters[f"{name}m{number}"]
+            parameters[f"{name}{number}"] = link_value + motor_value
     return parameters

@@ -26,15 +26,16 @@ import numpy as np
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import gravity_torques
 
-# i_0 [poses], t_0 [s]
-WARM_POSES, WARM_TIME = 30.0, 120.0
-# s_k [rad or m]
+# Number of poses i_0 and time t_0 [s] after which the arm has warmed up by 63 %.
+WARM_POSES = 30.0
+WARM_TIME = 120.0
+# Displacements s_k [rad or m] after which the friction elements slip.
 WIDTHS = (2e-3, 8e-3, 30e-3)
-# N
+# Number N of periods of a gear's ripple per radian.
 TEETH = 100
-# of the cable's spring [rad]
+# Angle [rad] at which the spring of a cable begins to saturate.
 CABLE = 0.5
-# size of the gear errors of a prismatic joint, in m, per rad of a revolute one
+# Gear error of a prismatic joint [m] per radian of gear error of a revolute joint.
 PRISMATIC_SHARE = 0.3
 
 
@@ -96,7 +97,8 @@ def displacements(
     for j, joint in enumerate(chain.joints):
         if joint.kind != "revolute":
             joint_scale[j] = PRISMATIC_SHARE
-    next_joint = q[:, (np.arange(chain.n) + 1) % chain.n]
+    following = (np.arange(chain.n) + 1) % chain.n
+    next_joint = q[:, following]
     load = torque / _largest_load(chain)
     of_next_joint = np.sin(2.0 * q + next_joint + phases[0])
     of_load = load * np.sin(3.0 * q + phases[1])
@@ -106,10 +108,12 @@ def displacements(
     backlash = errors.backlash * side
     result = np.zeros((len(chain.elements), len(q)))
     result[chain.moving] = (joint_scale * (gear_error - backlash)).T
-    lengths = np.array([element.axis[0] == "t" for element in chain.elements])
+    translational = [element.axis[0] == "t" for element in chain.elements]
+    lengths = np.array(translational)
     poses_before = warm + np.arange(len(q))
     heat = 1.0 - np.exp(-poses_before / WARM_POSES)
-    result[lengths] += errors.growth * np.outer(chain.values[lengths], heat)
+    expansion = np.outer(chain.values[lengths], heat)
+    result[lengths] += errors.growth * expansion
     return result
 
 
@@ -117,7 +121,8 @@ def _largest_load(chain: Chain) -> np.ndarray:
     """Return the largest gravity torque (n,) [N m or N] of each joint; 1 for joints without gravity load."""
     if chain.inertias is None:
         return np.ones(chain.n)
-    torques = gravity_torques(chain, random_joints(chain, 200, 0))
+    q = random_joints(chain, 200, 0)
+    torques = gravity_torques(chain, q)
     largest = np.abs(torques).max(axis=0)
     return np.where(largest > 1e-6, largest, 1.0)
 
@@ -132,8 +137,9 @@ def drooping(errors: PositionErrors, chain: Chain, poses: np.ndarray, base: np.n
     """
     rng = np.random.default_rng([errors.seed, 13])
     droop_direction = rng.uniform(0.2, 1.0, 3)
-    gravity = max(float(np.linalg.norm(chain.gravity)), 1e-9)
-    down = base[:3, :3] @ (chain.gravity / gravity)
+    magnitude = float(np.linalg.norm(chain.gravity))
+    gravity_direction = chain.gravity / max(magnitude, 1e-9)
+    down = base[:3, :3] @ gravity_direction
     turn = poses[:, :3, :3]
     droop = np.einsum("mij,j,mkj,k->mi", turn, droop_direction, turn, down)
     result = poses.copy()
@@ -187,17 +193,17 @@ def gear_torques(
 
     Args:
         errors: sizes of the effects.
-        q: (N, n) in the order in which they are passed, finely sampled [rad or m].
-        drive: (N, n) the motors' torques.
-        coulomb: (n,) Fc.
-        friction: (N, n) the model's friction Fv v + Fc sign(v).
-        t: (N,) since the arm was cold [s].
+        q: (N, n) joint values of a motion in order of time, finely sampled [rad or m].
+        drive: (N, n) torques of the motors [N m or N].
+        coulomb: (n,) Coulomb friction Fc [N m or N].
+        friction: (N, n) friction of the model, Fv v + Fc sign(v) [N m or N].
+        t: (N,) times since the cold start of the arm [s].
     """
-    heat = (1.0 - np.exp(-t / WARM_TIME))[:, None]
+    heat = 1.0 - np.exp(-t / WARM_TIME)
     slipping = 0.0
     if errors.memory:
         slipping = memory(q, errors.memory * coulomb)
-    warming = errors.warming * heat * friction
+    warming = errors.warming * heat[:, None] * friction
     ripple = errors.ripple * drive * np.sin(TEETH * q)
     return slipping - warming + ripple
 
@@ -206,14 +212,15 @@ def memory(q: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Return the torque (N, n) of elasto-plastic friction elements along a motion q (N, n) [rad or m] from rest.
 
     Args:
-        q: finely sampled, since each step moves an element by the whole step.
-        sizes: (n,) torque where all elements slip [N m or N].
+        q: joint values in order of time, finely sampled: an element is moved by whole steps between samples.
+        sizes: (n,) torques while all elements slip [N m or N].
     """
     widths = np.array(WIDTHS)[:, None]
     z = np.zeros((len(WIDTHS), q.shape[1]))
     bent = np.zeros_like(q)
     steps = np.diff(q, axis=0)
     for k, step in enumerate(steps, start=1):
-        z = np.minimum(np.maximum(z + step, -widths), widths)
+        stretched = np.maximum(z + step, -widths)
+        z = np.minimum(stretched, widths)
         bent[k] = (z / widths).mean(axis=0)
     return sizes * bent

@@ -28,22 +28,29 @@ from calib.simulation import known_robots
 from calib.simulation.cell import Cell
 from calib.simulation.unmodelled import TorqueErrors, gear_torques
 
-# how wrong the maker's masses are, 1 sigma: shape, centre [m], mass
-STRETCH, SHIFT, MASS = 0.05, 6e-3, 0.04
-# of the joint controller [Hz], [-], and of its measured speed's filter [Hz]
-BANDWIDTH, DAMPING, CUTOFF = 8.0, 0.8, 60.0
-# share of the friction that the controller feeds forward
+# Standard deviations of the nominal bodies' errors: shape [-], centre of mass [m], root of the mass [-].
+STRETCH = 0.05
+SHIFT = 6e-3
+MASS = 0.04
+# Bandwidth [Hz] and damping ratio of the joint controller, and cutoff of its filter of the measured speed [Hz].
+BANDWIDTH = 8.0
+DAMPING = 0.8
+CUTOFF = 60.0
+# Share of the friction that the controller feeds forward.
 KNOWN = 0.8
-# noise of the encoders [rad]; of the torques as logged, as a share of their limits (our choice)
-SIGMA_Q, SIGMA_LINK, SIGMA_MOTOR = 1e-5, 0.003, 0.005
-# at rest before and after a motion [s]
+# Noise of the encoders [rad], and of the logged torques as a share of the torque limits (our choice).
+SIGMA_Q = 1e-5
+SIGMA_LINK = 0.003
+SIGMA_MOTOR = 0.005
+# Time at rest before and after a motion [s].
 REST = 1.0
-# our choice
+# Sizes of the unmodelled torques (our choice).
 UNMODELLED = TorqueErrors(memory=0.3, warming=0.1, ripple=0.005, cable=0.0005, push=0.001)
-# [Hz]
+# Bandwidth of the external torque [Hz].
 PUSH_BAND = 20.0
-# of joints without a stated limit: speed [rad/s or m/s] and torque [N m or N]
-DEFAULT_SPEED, DEFAULT_EFFORT = 2.0, 100.0
+# Speed [rad/s or m/s] and torque [N m or N] assumed for joints without a stated limit.
+DEFAULT_SPEED = 2.0
+DEFAULT_EFFORT = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,9 +58,11 @@ class MovingArm:
     """A simulated arm with drives, controller and sensors.
 
     Attributes:
-        chain: the true arm, its true inertias included.
-        plant: chain and drives, motors' torques; `link` sees the same terms behind the gears.
-        gains: gains of the controller and of its feedforward.
+        chain: the true arm, including its true inertias.
+        plant: the true dynamics, with the torques of the motors.
+        link: model of the torques on the output side of the gears, with the parameters of `plant` that act there.
+        believed: dynamics with the nominal masses and a part of the friction, from which the feedforward is computed.
+        gains: gains of the controller.
         effort: (n,) torque limits, to which the torque noise is proportional [N m or N].
         note: sentence on how the truth was generated.
         unmodelled: torques that no parameter of an identification describes.
@@ -72,13 +81,15 @@ class MovingArm:
 
     def true_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the noise-free motor torques (N, n) [N m or N] of a warm arm along a finely sampled motion."""
-        return _modelled(self, q, v, a) + _unmodelled(self, q, v, a, np.full(len(q), np.inf))
+        warm = np.full(len(q), np.inf)
+        return _modelled(self, q, v, a) + _unmodelled(self, q, v, a, warm)
 
     def link_torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the noise-free torques (N, n) on the output side of the gears [N m or N]."""
         motor_model = IdentificationModel(self.plant.bodies, self.plant.terms)
         shared = np.isin(motor_model.names, self.link.names)
-        model = np.einsum("kij,j->ki", self.link.regressor(q, v, a), self.plant.parameters[shared])
+        regressor = self.link.regressor(q, v, a)
+        model = np.einsum("kij,j->ki", regressor, self.plant.parameters[shared])
         return model + self.unmodelled.cable_torques(q, self.effort)
 
 
@@ -96,10 +107,10 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
     """
     nominal = cell.nominal
     if nominal.inertias is None:
-        raise CalibError(f"the library holds no masses for {robot}, so that its motion cannot be simulated")
+        raise CalibError(f"the library has no masses for {robot}, so that its motion cannot be simulated")
     rng = np.random.default_rng([seed, 71])
-    inertias = np.array([_perturbed(row, rng) for row in nominal.inertias])
-    chain = replace(cell.truth.chain, inertias=inertias)
+    bodies = [_perturbed(row, rng) for row in nominal.inertias]
+    chain = replace(cell.truth.chain, inertias=np.array(bodies))
     effort = np.array([joint.effort for joint in chain.joints])
     effort = np.where(np.isfinite(effort), effort, DEFAULT_EFFORT)
 
@@ -107,7 +118,8 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
     prismatic = [joint.kind == "prismatic" for joint in chain.joints]
     terms = tuple(drives.standard([drive_terms] * chain.n, linear=prismatic))
     values, source = _drives(robot, nominal, effort)
-    parameters = np.concatenate([standard_parameters(chain), values.ravel()])
+    true_bodies = standard_parameters(chain)
+    parameters = np.concatenate([true_bodies, values.ravel()])
     plant = Plant(bodies_of(chain), terms, parameters)
 
     # what the maker believes: the nominal masses and a part of the friction
@@ -115,11 +127,15 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
     for column, name in enumerate(known_robots.SIDED):
         if name.startswith("F"):
             believed_values[:, column] *= KNOWN
-    believed_parameters = np.concatenate([standard_parameters(nominal), believed_values.ravel()])
+    nominal_bodies = standard_parameters(nominal)
+    believed_parameters = np.concatenate([nominal_bodies, believed_values.ravel()])
     believed = Plant(bodies_of(nominal), terms, believed_parameters)
-    inertia = plant.inertia_diagonal(random_joints(chain, 200, 0))
+    postures = random_joints(chain, 200, 0)
+    inertia = plant.inertia_diagonal(postures)
     omega = 2 * np.pi * BANDWIDTH
-    gains = pd(omega**2 * inertia, 2 * DAMPING * omega * inertia)
+    kp = omega**2 * inertia
+    kd = 2 * DAMPING * omega * inertia
+    gains = pd(kp, kd)
 
     sensors = sensed(robot)
     noise = f"{SIGMA_MOTOR:.1%}"
@@ -157,16 +173,19 @@ def carrying(arm: MovingArm, payload: Sequence[float]) -> MovingArm:
 
 
 def sensed(robot: str) -> bool:
-    """Return whether a robot of the library has joint torque sensors: friction behind its gears is known."""
-    return library.path(f"{robot}_truth").exists() and "Fvl" in known_robots.truth(robot)["drives"]
+    """Return whether a robot of the library has joint torque sensors: its file states friction behind the gears."""
+    if not library.path(f"{robot}_truth").exists():
+        return False
+    return "Fvl" in known_robots.truth(robot)["drives"]
 
 
 def play(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, repeats: int) -> Reference:
     """Return the reference of a periodic motion that is repeated, with rest before and after.
 
     Args:
-        t: (N,), even steps [s].
-        q, v, a: (N, n) positions, velocities and accelerations.
+        t: (N,) times of a period's samples, in even steps [s]; both ends of the period are included.
+        q, v, a: (N, n) positions, velocities and accelerations over a period.
+        repeats: number of periods.
     """
     rate = (len(t) - 1) / (t[-1] - t[0])
     still = np.zeros((round(REST * rate), q.shape[1]))
@@ -177,8 +196,10 @@ def play(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, repeats: in
 
     zero = np.zeros(q.shape[1])
     positions = repeated(q, q[0], q[-1])
+    velocities = repeated(v, zero, zero)
+    accelerations = repeated(a, zero, zero)
     times = np.arange(len(positions)) / rate
-    return Reference(times, positions, repeated(v, zero, zero), repeated(a, zero, zero))
+    return Reference(times, positions, velocities, accelerations)
 
 
 def record(
@@ -198,25 +219,30 @@ def record(
     rng = np.random.default_rng(seed)
     # the controller feeds forward the torques at low accelerations
     slow = replace(reference, a=0.0 * reference.a)
-    controller = arm.gains.with_feedforward(feed_forward(arm.believed, slow))
-    sensing = Sensing(SIGMA_Q, push=arm.unmodelled.push * arm.effort, push_band=PUSH_BAND)
-    unmodelled = _unmodelled(arm, reference.q, reference.v, reference.a, running + reference.t)
+    torque = feed_forward(arm.believed, slow)
+    controller = arm.gains.with_feedforward(torque)
+    push = arm.unmodelled.push * arm.effort
+    sensing = Sensing(SIGMA_Q, push=push, push_band=PUSH_BAND)
+    since_cold_start = running + reference.t
+    unmodelled = _unmodelled(arm, reference.q, reference.v, reference.a, since_cold_start)
     run = simulate(arm.plant, controller, reference, sensing, rng, push=-unmodelled)
     # both are drawn, with sensors or without, so that the motors' noise is the same
-    link_noise = SIGMA_LINK * arm.effort * rng.normal(size=run.q.shape)
-    motor_noise = SIGMA_MOTOR * arm.effort * rng.normal(size=run.q.shape)
+    shape = run.q.shape
+    link_noise = SIGMA_LINK * arm.effort * rng.normal(size=shape)
+    motor_noise = SIGMA_MOTOR * arm.effort * rng.normal(size=shape)
     motor = _held(run.torque) + motor_noise
     link = None
     if arm.sensors:
-        link = _held(arm.link_torque(run.q, run.v, run.a)) + link_noise
+        link_torque = arm.link_torque(run.q, run.v, run.a)
+        link = _held(link_torque) + link_noise
     return Recording(run.t, run.measured, motor, "torque", arm.chain.joint_names, tau_link=link)
 
 
 def _held(torque: np.ndarray) -> np.ndarray:
     """Return torques (N, n) averaged over the two control periods around each sample.
 
-    The controller's torque is held for a period, so what is commanded at an instant acts half a period later; drives
-    and sensors that integrate over their sampling see this mean, without that lead.
+    The controller's torque is held for a period, so that on average a command acts half a period later. The mean has
+    this delay, as drives and sensors that integrate over a sampling period have.
     """
     result = torque.copy()
     result[1:] = 0.5 * (torque[1:] + torque[:-1])
@@ -226,7 +252,8 @@ def _held(torque: np.ndarray) -> np.ndarray:
 def _modelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the motor torques (N, n) [N m or N] of the simulated robot: rigid model with friction."""
     model = IdentificationModel(arm.plant.bodies, arm.plant.terms)
-    return np.einsum("kij,j->ki", model.regressor(q, v, a), arm.plant.parameters)
+    regressor = model.regressor(q, v, a)
+    return np.einsum("kij,j->ki", regressor, arm.plant.parameters)
 
 
 def _unmodelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -238,8 +265,9 @@ def _unmodelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray, t: 
     viscous = np.zeros(arm.chain.n)
     coulomb = np.zeros(arm.chain.n)
     for j in range(arm.chain.n):
-        viscous[j] = parameters[f"Fvl{j + 1}"] + parameters[f"Fvm{j + 1}"]
-        coulomb[j] = parameters[f"Fcl{j + 1}"] + parameters[f"Fcm{j + 1}"]
+        number = j + 1
+        viscous[j] = parameters[f"Fvl{number}"] + parameters[f"Fvm{number}"]
+        coulomb[j] = parameters[f"Fcl{number}"] + parameters[f"Fcm{number}"]
     friction = viscous * v + coulomb * np.sign(v)
     drive = np.zeros_like(q)
     if arm.unmodelled.ripple:
@@ -253,8 +281,9 @@ def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, s
     if not library.path(f"{robot}_truth").exists():
         speed = np.array([joint.velocity for joint in chain.joints])
         speed = np.where(np.isfinite(speed), speed, DEFAULT_SPEED)
+        postures = random_joints(chain, 200, 0)
         bare = Plant(bodies_of(chain), (), standard_parameters(chain))
-        inertia = bare.inertia_diagonal(random_joints(chain, 200, 0))
+        inertia = bare.inertia_diagonal(postures)
         friction = 0.05 * effort
         rows = {"Ia": 0.5 * inertia, "Fvm": friction / speed, "Fcm": friction}
         source = "drives assumed from its limits"
@@ -277,4 +306,6 @@ def _perturbed(parameters: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     transform[:3, :3] += STRETCH * rng.standard_normal((3, 3))
     transform[:3, 3] = SHIFT * rng.standard_normal(3)
     mass_scale = (1.0 + MASS * rng.standard_normal()) ** 2
-    return to_standard(mass_scale * transform @ from_standard(parameters) @ transform.T)
+    pseudo_inertia = from_standard(parameters)
+    perturbed = mass_scale * transform @ pseudo_inertia @ transform.T
+    return to_standard(perturbed)

@@ -15,17 +15,21 @@ from calib.simulation.cell import Cell, SimulatedInstrument
 from calib.simulation.unmodelled import PositionErrors
 from calib.transforms import pose
 
-# of the gears' harmonics
+# Orders of the gears' harmonics: periods per turn of the joint.
 ORDERS = (2, 3)
 CMM = SimulatedInstrument()
 NO_ERRORS = PositionErrors()
-# how far a made-up arm is from its nominal (1 sigma) [m], [rad], [rad]
-LENGTH, ANGLE, OFFSET = 0.3e-3, 0.5e-3, 3e-3
-# hidden part of the LWR4+ [rad/(N m)], [rad]
-COMPLIANCE, AMPLITUDE, HIDDEN_SEED = 2e-5, 6e-4, 2
-# share of it where `UNMODELLED` comes on top
+# Standard deviations of a perturbed arm's lengths [m], angles [rad] and joint offsets [rad] from the nominal arm.
+LENGTH = 0.3e-3
+ANGLE = 0.5e-3
+OFFSET = 3e-3
+# Hidden deflections of the LWR4+: compliance [rad/(N m)], amplitude of a harmonic [rad], seed of the phases.
+COMPLIANCE = 2e-5
+AMPLITUDE = 6e-4
+HIDDEN_SEED = 2
+# Scale of the hidden deflections where `UNMODELLED` errors are added.
 MODELLED = 0.7
-# our choice
+# Sizes of the errors that no model describes (our choice).
 UNMODELLED = PositionErrors(gear=4e-4, backlash=5e-5, growth=5e-5, droop=5e-5, seed=2)
 
 
@@ -40,7 +44,8 @@ def deflection(chain: Chain, compliance: np.ndarray, amplitude: np.ndarray, seed
     """
     rng = np.random.default_rng(seed)
     phases = rng.uniform(0.0, 2.0 * np.pi, (chain.n, len(ORDERS)))
-    terms, values = [], []
+    terms = []
+    values = []
     for j, element_index in enumerate(chain.moving):
         name = chain.elements[element_index].name
         terms.append(Term(name, "torque", j))
@@ -48,6 +53,7 @@ def deflection(chain: Chain, compliance: np.ndarray, amplitude: np.ndarray, seed
         for order, phase in zip(ORDERS, phases[j]):
             terms.append(Term(name, "sin", j, order))
             values.append(amplitude[j] * np.cos(phase))
+
             terms.append(Term(name, "cos", j, order))
             values.append(amplitude[j] * np.sin(phase))
     return Deflection(tuple(terms), np.array(values), chain)
@@ -56,10 +62,11 @@ def deflection(chain: Chain, compliance: np.ndarray, amplitude: np.ndarray, seed
 def virtual_cell(robot: str = "lwr4plus", seed: int = 0, instrument: SimulatedInstrument = CMM) -> Cell:
     """Return the simulated cell of a robot: the study's for the LWR4+, otherwise a perturbed one by seed.
 
-    A third of what is hidden, in squares at the tool (LWR4+: 0.34 of 0.65 mm rms, UR5: 0.08 of 0.13 mm), is of kinds
-    that no model of this toolkit describes (`UNMODELLED`). Perturbed arms err as real ones do: the TX40 of seeds 0 to 9
-    by 0.6 to 2.3 mm rms before and 0.08 to 0.12 mm after, a UR5, a UR10 and a Motoman by 0.24 to 0.84 and 0.06 to 0.09
-    mm (``examples/real_recordings.md``), an ABB IRB 1600 by up to 0.65 mm before (Slamani, Nubiola & Bonev 2012).
+    A third of the mean squared position error of the hidden effects (LWR4+: 0.34 of 0.65 mm rms, UR5: 0.08 of 0.13 mm)
+    is of kinds that no model of this toolkit describes (`UNMODELLED`). Errors of perturbed arms are as large as those
+    of real arms: 0.6 to 2.3 mm rms before and 0.08 to 0.12 mm after calibration for the TX40 of seeds 0 to 9; measured
+    were 0.24 to 0.84 mm before and 0.06 to 0.09 mm after for a UR5, a UR10 and a Motoman
+    (``examples/real_recordings.md``), and up to 0.65 mm before for an ABB IRB 1600 (Slamani, Nubiola & Bonev 2012).
     """
     if robot == "lwr4plus":
         return lwr4plus_cell(instrument, MODELLED, UNMODELLED)
@@ -70,14 +77,15 @@ def virtual_cell(robot: str = "lwr4plus", seed: int = 0, instrument: SimulatedIn
 def lwr4plus_cell(
     instrument: SimulatedInstrument = CMM, hidden: float = 1.0, unmodelled: PositionErrors = NO_ERRORS
 ) -> Cell:
-    """Return the paper's cell: truth is the calibrated column of Table 2, instrument its optical CMM.
+    """Return the cell of Kolyubin et al. (2019): the true arm has the calibrated values of their Table 2.
 
-    The hidden part, 20 µrad/(N m) and two harmonics of 0.6 mrad per joint, is chosen so that 17 poses chosen under
-    Table 1 leave about the paper's 0.80 mm and 0.10 deg (Table 3) on poses they have not seen.
+    Hidden deflections (compliance of 20 µrad/(N m) and two harmonics of 0.6 mrad per joint) are sized such that a fit
+    of 17 poses under the constraints of Table 1 has about the paper's errors on held-out poses: 0.80 mm and 0.10 deg
+    (Table 3).
 
     Args:
-        instrument: the instrument; the paper's by default.
-        hidden: scale of the hidden part; 0 for a rigid arm.
+        instrument: the instrument; by default the paper's optical CMM.
+        hidden: scale of the hidden deflections; 0 for a rigid arm.
         unmodelled: errors that no model describes.
     """
     _, calibrated = lwr4plus.table_2()
@@ -112,7 +120,7 @@ def perturbed_cell(
         seed: seed of the deviations, the placements and the hidden part.
         instrument: the instrument.
         size: scale of the deviations (`LENGTH`, `ANGLE`; `OFFSET` for joint offsets).
-        hidden: scale of the hidden deflections, in those of the LWR4+.
+        hidden: scale of the hidden deflections, relative to those of the LWR4+.
         unmodelled: errors that no model describes.
     """
     rng = np.random.default_rng(seed)
@@ -148,7 +156,8 @@ def _perturbed(chain: Chain, seed: int | np.random.Generator, size: float = 1.0)
             sigmas.append(OFFSET)
         else:
             sigmas.append(ANGLE)
-    errors = size * np.array(sigmas) * rng.standard_normal(len(sigmas))
+    sigma = size * np.array(sigmas)
+    errors = sigma * rng.standard_normal(len(sigmas))
     return chain.with_values(chain.values + errors)
 
 
@@ -161,6 +170,8 @@ def rigid(cell: Cell) -> Cell:
 
 
 def _random_pose(rng: np.random.Generator, distance: float) -> np.ndarray:
+    """Return a pose (4, 4) with random orientation, at a distance [m] from the origin in a random direction."""
     direction = rng.standard_normal(3)
     turn = Rotation.random(rng=rng).as_matrix()
-    return pose(turn, distance * direction / np.linalg.norm(direction))
+    position = distance * direction / np.linalg.norm(direction)
+    return pose(turn, position)

@@ -1,8 +1,8 @@
-"""The toolkit's parts for applications, by subject: what `import calib` offers beyond its verbs.
+"""The toolkit's functions and classes for applications, by subject, in addition to the commands of `import calib`.
 
-An application imports from here instead of from inner modules, so that those can change. A module is loaded when an
-application asks for it: commands import inside their functions, and `calib --help` loads none. What commands need to
-declare their options is here itself.
+Applications import from this package instead of from inner modules, so that inner modules can change. A module is
+loaded only when an application uses it: commands import inside their functions, and `calib --help` loads none. This
+file contains what commands need for the declaration of their options.
 """
 
 from calib.procedure.answers import CertificateSection

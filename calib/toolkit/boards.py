@@ -1,4 +1,4 @@
-"""Images of a camera: calibration boards to print, folders of images, images in recordings."""
+"""Camera images: calibration boards to print, folders of images, and images in recordings."""
 
 from calib.data.images.board_print import make as print_board
 from calib.data.images.image_bags import from_bag as images_from_bag

@@ -1,4 +1,4 @@
-"""Geometry: installations of robots and instruments, what they measure, fits, inverse kinematics."""
+"""Geometry: installations of robots and instruments, observation models, fits, inverse kinematics."""
 
 from calib.geometry.error_model import Discrepancy, ErrorModel, outside
 from calib.geometry.first_guess import check_scale, install

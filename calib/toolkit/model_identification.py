@@ -1,4 +1,4 @@
-"""Identification of recordings: how options gather them, the estimate, and its judgement."""
+"""Identification from recordings: reading of recordings by options, the estimate, and the verdict on it."""
 
 from calib.identification.identify import Identification, identify
 from calib.identification.identify_options import read_options as read_identify_options

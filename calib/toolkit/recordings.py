@@ -1,4 +1,4 @@
-"""Recordings: joint positions and torques over time, the motions filtered from them, planned motions."""
+"""Recordings: joint positions and torques over time, the motions filtered from recordings, and planned motions."""
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.bandwidth import USABLE

@@ -1,4 +1,4 @@
-"""Pages: sections, tables and key figures of reports, the certificate, templates."""
+"""Report pages: sections, tables, key figures, the certificate, and templates."""
 
 from calib.procedure.answers import CertificateSection
 from calib.procedure.report.certificate.record import Entry

@@ -1,4 +1,4 @@
-"""Results: their folders, figures and verdicts, and how they are shown."""
+"""Results: their folders, figures and verdicts, and functions to display them."""
 
 from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit, Several, fit_geometry
@@ -16,10 +16,10 @@ from calib.procedure.kinematic_stage.inputs import read_file as read_measured_fi
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import joints_of, stage_of
-from calib.results.registry import drawn, open_result
 from calib.results.result import Result, StoredResult
+from calib.results.result_classes import drawn, open_result
 from calib.results.scene import Drawn as DrawnRobot
-from calib.results.scene import ErrorSizes, Measured, Played, Scene, Torques, skeleton, strips, thinned
+from calib.results.scene import ErrorSizes, Measured, Played, Scene, Torques, TradeOffs, skeleton, strips, thinned
 
 __all__ = [
     "IN_SESSION",
@@ -47,6 +47,7 @@ __all__ = [
     "Shown",
     "StoredResult",
     "Torques",
+    "TradeOffs",
     "UnseenReport",
     "ValidationFolder",
     "ValidationMetrics",

@@ -1,4 +1,4 @@
-"""Sessions: a guided procedure in a folder, its steps, what they wait for and what they found."""
+"""Sessions: a guided procedure in a folder, with its steps, the files for which they wait, and their findings."""
 
 from calib.identification.settings import Payload
 from calib.procedure.session.certificate import pages as certificate_pages

@@ -1,4 +1,4 @@
-"""Simulation: virtual cells with known truth, arms in closed loop and their controllers."""
+"""Simulation: virtual cells with known truth, and arms in closed loop with their controllers."""
 
 from calib.identification.closed_loop.controllers import Reference
 from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
@@ -7,7 +7,9 @@ from calib.simulation.camera_cell import CameraCell, limits_of, seen_by_camera, 
 from calib.simulation.cell import (
     Cell,
     SimulatedInstrument,
+    drift_path,
     measure,
+    measure_frames,
     planned_poses,
     wandering,
     write_log,
@@ -38,11 +40,13 @@ __all__ = [
     "SimulatedInstrument",
     "SimulatedRun",
     "carrying",
+    "drift_path",
     "feed_forward",
     "known_plant",
     "known_truth",
     "limits_of",
     "measure",
+    "measure_frames",
     "moving_arm",
     "perturbed_cell",
     "planned_poses",

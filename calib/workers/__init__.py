@@ -1,13 +1,14 @@
-"""Parallel execution of tasks: in this process, in local processes, or on a Dask scheduler by address.
+"""Parallel execution of tasks: in this process, in local processes, or on a Dask scheduler with a known address.
 
-`Workers.completed` yields results as they complete, `Workers.map` in order; ``poses`` and ``trajectories`` use
-`Workers.map` as a plain callable. Functions, tasks and results must pickle. If the process of a task dies, the task is
-repeated, here or by the scheduler: it may run twice, but yields one result. A task that fails repeatedly yields a
-`TaskLost` and does not affect the others. Few tasks are in progress at a time (one per process, or per thread of the
-cluster), so that there may be millions; each should take a tenth of a second or more.
+`Workers.completed` yields results as they complete, `Workers.map` in the order of the tasks; the packages ``poses`` and
+``trajectories`` take `Workers.map` as a plain callable. Functions, tasks and results must be picklable. If a process
+dies, its task is repeated, by this module or by the scheduler: a task may run twice, but yields one result. A task that
+fails repeatedly yields a `TaskLost` and does not affect the other tasks. Only a few tasks are in progress at a time
+(one per process, or per thread of the cluster), so that there may be millions of tasks; each should take a tenth of a
+second or more.
 
 Processes are spawned, not forked, since forked threads of numerical libraries may block; scripts that use workers need
-``if __name__ == "__main__"``. BLAS, OpenMP and numba get one thread in every worker, since the tasks run in parallel.
+``if __name__ == "__main__"``. BLAS, OpenMP and numba use one thread in every worker, since the tasks run in parallel.
 """
 
 from __future__ import annotations
@@ -32,19 +33,24 @@ MAX_AHEAD = 256
 
 @dataclass(frozen=True)
 class Workers:
-    """Runs many tasks in parallel, created by `workers`.
+    """Runner of many parallel tasks, created by the function `workers`.
 
     Attributes:
-        here: whether tasks run in this process's current folder.
+        here: whether tasks run on this computer, with the current folder of this process.
     """
 
     _stream: Stream
     here: bool = True
 
     def completed(self, function: Callable[..., Any], tasks: Iterable[object]) -> Iterator[tuple[int, Any]]:
-        """Yield (number of the task, its result) as tasks complete; tasks are read from the iterable as needed.
+        """Yield the number (from 0) of each task and its result, in the order of completion.
 
-        A task that was lost repeatedly has a `TaskLost` as its result. An exception of a task is raised.
+        Tasks are read from the iterable as needed. The result of a task that was lost repeatedly is a `TaskLost`. An
+        exception in a task is raised.
+
+        Args:
+            function: function of one task; must be picklable.
+            tasks: the tasks.
         """
         with closing(self._stream(function, ((task,) for task in tasks), lambda number: True)) as answers:
             for number, result, error in answers:
@@ -53,8 +59,13 @@ class Workers:
                 yield number, result if error is None else error
 
     def map(self, function: Callable, *items: Iterable[object]) -> Iterator[Any]:
-        """Yield results in the order of the tasks, like the builtin `map`; after Ctrl-C, the available results, then
-        raise.
+        """Yield function(*item) for the items in their order, like the builtin `map`.
+
+        After Ctrl-C, the available results are yielded, and then KeyboardInterrupt is raised.
+
+        Args:
+            function: the function; must be picklable.
+            *items: one iterable for each argument of the function.
 
         Raises:
             TaskLost: instead of a lost result.
@@ -62,9 +73,12 @@ class Workers:
         return self._in_order(None, function, *items)
 
     def map_without(self, lost: list[TaskLost]) -> Callable[..., Iterator[Any]]:
-        """Return a `map` for searches that need only the best result: lost tasks are appended to `lost`.
+        """Return a function like `map` that omits lost tasks, for searches that need only the best result.
 
-        If all tasks are lost, it raises the last `TaskLost`.
+        If all tasks are lost, the last `TaskLost` is raised.
+
+        Args:
+            lost: list to which lost tasks are appended.
         """
         return partial(self._in_order, lost)
 
@@ -102,15 +116,15 @@ class Workers:
 
 @contextmanager
 def workers(where: str | int | None = None) -> Iterator[Workers]:
-    """Yield workers for parallel tasks; at the end of the block they are stopped, with their running tasks.
+    """Yield workers for parallel tasks; at the end of the block, workers and running tasks are stopped.
 
     Args:
-        where: None, 1 or "1" for this process; a number of local processes; or the address of a Dask scheduler, e.g.
-            ``tcp://host:8786`` (needs the extra ``cluster``, and this toolkit on its workers).
+        where: None, 1 or "1" for this process; a number of local processes; or the address of a Dask scheduler, such as
+            ``tcp://host:8786`` (requires the extra ``cluster``, and this toolkit on the cluster's workers).
 
     Raises:
-        UsageError: for anything else, a scheduler that does not answer, or Dask missing.
-        CalibError: while tasks run: the scheduler went away, or has had no workers for a minute.
+        UsageError: for any other value, a scheduler that does not answer, or missing Dask.
+        CalibError: while tasks run, if the scheduler stops, or has had no workers for a minute.
     """
     text = str(where if where is not None else 1)
     if "://" not in text and (not text.isdigit() or int(text) < 1):
@@ -129,7 +143,7 @@ def workers(where: str | int | None = None) -> Iterator[Workers]:
 
 @contextmanager
 def finishing() -> Iterator[None]:
-    """Run the block to its end: the first Ctrl-C is ignored, a second one stops it at once."""
+    """Run the block to its end even after Ctrl-C: the first Ctrl-C is ignored, a second one stops the block at once."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

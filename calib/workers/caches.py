@@ -1,9 +1,8 @@
 """Cache folders of numba and matplotlib, for users whose usual cache folders are not writable.
 
-numba refuses to load a kernel that it cannot cache ("no locator available"); matplotlib warns, and searches fonts anew
-in every process. If the package is not writable and the home folder is read-only or missing (containers, CI, services),
-both get a folder of the user in the temporary folder. Variables that the user sets have priority; worker processes
-inherit them.
+numba refuses to load a kernel that it cannot cache ("no locator available"); matplotlib warns, and searches for fonts
+again in every process. If the usual folders are not writable (containers, CI, services), both libraries get a private
+folder in the temporary folder. Variables that the user sets have priority; worker processes inherit the variables.
 """
 
 import os
@@ -17,7 +16,7 @@ FOLDER = "calib-cache-{user}"  # in the temporary folder
 
 
 def provide() -> None:
-    """Set NUMBA_CACHE_DIR and MPLCONFIGDIR to a temporary folder, each where its usual folders are not writable."""
+    """Set NUMBA_CACHE_DIR and MPLCONFIGDIR to temporary folders if the libraries' usual folders are not writable."""
     caches = _user_caches()
     if not os.environ.get("NUMBA_CACHE_DIR") and not _writable(caches) and not _kernels_writable():
         with suppress(OSError):
@@ -33,31 +32,36 @@ def provide() -> None:
 
 
 def _home() -> Path:
-    """Return the user's home; a path that does not exist for a user without one."""
+    """Return the user's home folder; a path that does not exist for a user without a home folder."""
     home = Path(os.path.expanduser("~"))
     return home if home.is_absolute() else Path("/nonexistent")
 
 
 def _user_caches() -> Path:
-    """Return the folder of the user's caches, as numba and matplotlib look for it."""
+    """Return the user's cache folder, as numba and matplotlib determine it."""
     usual = _home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
     return Path(os.environ.get("XDG_CACHE_HOME") or usual)
 
 
 def _kernels_writable() -> bool:
-    """Return whether numba can keep every compiled kernel of this package beside its source."""
+    """Return whether numba can store every compiled kernel of this package in the folder of the kernel's source."""
     folders = {path.parent / "__pycache__" for path in PACKAGE.rglob("*kernels.py")}
     return all(_writable(folder) for folder in folders)
 
 
 def _writable(folder: Path) -> bool:
-    """Return whether a folder is writable, or can be made."""
+    """Return whether files can be written into a folder, which is created if necessary."""
     existing = [part for part in (folder, *folder.parents) if part.exists()]
     return existing[0].is_dir() and os.access(existing[0], os.W_OK | os.X_OK)
 
 
 def _temporary(name: str) -> Path:
-    """Return a private folder of this user that persists for later processes; if another user owns it, a new one.
+    """Return a private folder of this user in the temporary folder, which later processes find again.
+
+    If another user owns a folder with this name, a new folder is created, which is removed when this process ends.
+
+    Args:
+        name: name of the folder.
 
     Raises:
         OSError: if no temporary folder is writable.

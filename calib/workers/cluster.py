@@ -1,4 +1,4 @@
-"""Tasks on a Dask cluster; the only module that imports Dask."""
+"""Execution of tasks on a Dask cluster; the only module that imports Dask."""
 
 import asyncio
 import logging
@@ -23,7 +23,7 @@ NO_WORKERS = 60.0  # [s] without any worker at a scheduler (our choice)
 
 
 class _Cluster:
-    """Workers of a Dask scheduler; Dask repeats lost tasks as often as configured."""
+    """Workers of a Dask scheduler; Dask repeats lost tasks as often as its configuration states."""
 
     attempts = 1
 
@@ -36,7 +36,13 @@ class _Cluster:
         return self._threads() - len(self.under_way)
 
     def _threads(self) -> int:
-        """Return the number of threads of all workers, updated once a second at most; 1 without workers."""
+        """Return the number of threads of all workers (1 without workers).
+
+        The scheduler is asked at most once per second.
+
+        Raises:
+            CalibError: if there have been no workers for `NO_WORKERS` seconds.
+        """
         time_now = time.monotonic()
         if time_now > self.asked + 1.0:
             threads = self._said(lambda: sum(self.client.nthreads(callback_timeout=ANSWER).values()))
@@ -44,11 +50,18 @@ class _Cluster:
             if threads:
                 self.manned = time_now
             elif time_now > self.manned + NO_WORKERS:
-                raise CalibError(f"the Dask scheduler at {self.address} has had no workers for {NO_WORKERS:g} s")
+                raise CalibError(
+                    f"the Dask scheduler at {self.address} has had no workers for {NO_WORKERS:g} s: start workers, "
+                    "then repeat the command"
+                )
         return self.threads
 
     def _said(self, ask: Callable[[], T]) -> T:
-        """Return the scheduler's answer to `ask`; raise CalibError if the scheduler is gone."""
+        """Return the result of `ask`, a function without arguments that asks the scheduler.
+
+        Raises:
+            CalibError: if the scheduler does not answer.
+        """
         error = None
         try:
             if self.client.status == "running":
@@ -89,7 +102,13 @@ class _Cluster:
         yield self.under_way.pop(future.key)[0], result, raised
 
     def _failed(self, error: Exception) -> Exception:
-        """Return the exception to report as a task's result if Dask failed, and not the task."""
+        """Return the exception to report as the result of a task that Dask could not run.
+
+        Exceptions of the task itself are results and are not passed to this function.
+
+        Args:
+            error: exception that Dask raised.
+        """
         from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
 
         if isinstance(error, KilledWorker):
@@ -118,12 +137,18 @@ def _cloudpickled(value: object) -> bytes:
 
 
 def _on_cluster(call: bytes) -> bytes:
-    """Run a pickled call on a Dask worker, and return its pickled answer."""
+    """Run a pickled function call on a Dask worker, and return the pickled result or exception."""
     return run_call(call, lambda: None, _cloudpickled)
 
 
 async def _answers(address: str) -> None:
-    """Check in bounded time that a Dask scheduler answers; a client would wait forever on a silent port."""
+    """Check that a Dask scheduler answers at `address` within `ANSWER` seconds.
+
+    Dask's client would wait forever for a port that accepts connections but does not answer.
+
+    Raises:
+        OSError: without an answer.
+    """
     from distributed.comm.core import connect  # pyright: ignore[reportMissingImports]
 
     try:
@@ -137,7 +162,7 @@ async def _answers(address: str) -> None:
 def dask(address: str) -> Iterator[_Cluster]:
     with refused_as(UsageError, ImportError, "a Dask scheduler needs Dask: pip install 'armature-calib[cluster]'"):
         from distributed import Client  # pyright: ignore[reportMissingImports]
-    with refused_as(UsageError, (OSError, ValueError), f"no Dask scheduler answers at {address}: {{}}"):
+    with refused_as(UsageError, (OSError, ValueError), f"no Dask scheduler answers at {address}: {{}}; is it running?"):
         with ThreadPoolExecutor(1) as executor:  # a notebook has a loop of its own
             executor.submit(asyncio.run, _answers(address)).result()
         client = Client(address, timeout=ANSWER, set_as_default=False)

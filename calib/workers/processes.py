@@ -1,6 +1,8 @@
-"""Execution of tasks by local processes: each is spawned and runs one task at a time, so that a crash loses one task.
+"""Execution of tasks in local processes: each process is spawned and runs one task at a time, so that a crash loses
+one.
 
-`streamed` and `run_call` serve local processes and a cluster: start tasks, collect results, repeat lost tasks.
+`streamed` and `run_call` are used for local processes and for a cluster: they start tasks, collect results, and repeat
+lost tasks.
 """
 
 import os
@@ -31,17 +33,17 @@ class Died(Exception):
 
 
 class NotBegun(Exception):
-    """Result of a task whose process died before it received the task."""
+    """Result of a task whose process died before it had received the task."""
 
 
 class Crew(Protocol):
-    """Runner of numbered tasks, each a pickled function with its arguments."""
+    """Runner of numbered tasks; each task is a pickled function with its arguments."""
 
     attempts: int
     busy: Lock
 
     def free(self) -> int:
-        """Return the number of tasks that can be started now."""
+        """Return the number of tasks that can be started without waiting."""
         ...
 
     def pickled(self, call: tuple[Callable, tuple]) -> bytes: ...
@@ -49,11 +51,11 @@ class Crew(Protocol):
     def begin(self, number: int, call: bytes) -> None: ...
 
     def ended(self) -> Iterable[Answer]:
-        """Return the answers of the completed tasks, after waiting for at least one."""
+        """Return the answers of completed tasks; wait until there is at least one."""
         ...
 
     def settled(self) -> Iterable[Answer]:
-        """Return the answers of the running tasks after Ctrl-C."""
+        """Return the answers that running tasks still give after Ctrl-C."""
         ...
 
     def drop(self) -> None:
@@ -69,7 +71,17 @@ class _Task:
 
 
 def streamed(crew: Crew, function: Callable, tasks: Iterable[tuple], near: Callable[[int], bool]) -> Generator[Answer]:
-    """Run tasks and yield their answers as they arrive; task k starts when a worker is free and `near(k)` is true."""
+    """Run tasks and yield their answers as they arrive.
+
+    Args:
+        crew: runner of the tasks.
+        function: function that each task calls.
+        tasks: for each task, the tuple of the function's arguments.
+        near: function of a task's number (from 0) that returns whether the task may be started already.
+
+    Raises:
+        RuntimeError: if the runner is in use.
+    """
     if not crew.busy.acquire(blocking=False):
         raise RuntimeError("these workers are busy; let one `map` or `completed` end before the next")
     upcoming, begun = enumerate(tasks), 0
@@ -123,13 +135,14 @@ def _lost(number: int, task: _Task, error: Died) -> TaskLost:
 def run_call(
     call: bytes, hear: Callable[[], object], dumps: Callable[[object], bytes], hush: Callable[[], object] = lambda: None
 ) -> bytes:
-    """Run a pickled call in a worker; return (result, raised exception), pickled.
+    """Run a pickled function call in a worker, and return the pickled pair of result and raised exception (or None).
 
     Args:
         call: the pickled call.
-        hear: called before the call, to accept Ctrl-C.
+        hear: function called before the call, which enables Ctrl-C.
         dumps: function that pickles the answer.
-        hush: called after an exception, to ignore further Ctrl-C, since terminal and parent process both send one.
+        hush: function called after an exception, which disables further Ctrl-C, since terminal and parent process both
+            send one.
     """
     try:
         hear()
@@ -156,7 +169,7 @@ ATTEMPTS = 3  # processes that a task may take along before it is given up (our 
 
 
 class _Process:
-    """A spawned process that runs one task at a time: if it dies, the lost task is known."""
+    """A spawned process that runs one task at a time; if the process dies, it is known which task was lost."""
 
     def __init__(self) -> None:
         context = get_context("spawn")
@@ -189,7 +202,7 @@ class _Process:
 
 
 class Processes:
-    """Runner of tasks in local processes, which are started when tasks need them."""
+    """Runner of tasks in local processes; a process is started when a task needs it."""
 
     attempts = ATTEMPTS
 
@@ -244,12 +257,15 @@ class Processes:
         if self.stillborn < ATTEMPTS * self.count or self.stopping:
             return NotBegun()
         raise CalibError(
-            f"worker processes die at start ({how}): not enough memory, or the calling script lacks "
-            'if __name__ == "__main__"'
+            f"worker processes die at start ({how}): is memory short, or does the calling script lack "
+            'if __name__ == "__main__"?'
         )
 
     def settled(self) -> Iterator[Answer]:
-        """Return the answers of tasks ended by Ctrl-C; interrupt worker processes that did not receive it."""
+        """Yield the answers of tasks that end after Ctrl-C.
+
+        Worker processes that did not receive the Ctrl-C are interrupted.
+        """
         self.stopping = True
         for patience in (GRACE, 2 * GRACE):
             deadline = time.monotonic() + patience
@@ -281,7 +297,10 @@ class Processes:
 
 
 def _serve(pipe: connection.Connection) -> None:
-    """Answer calls in a worker process until the pipe is closed. Ctrl-C has an effect only during a task."""
+    """Run the calls that a worker process receives through `pipe`, until the pipe is closed.
+
+    Ctrl-C has an effect only during a call.
+    """
     heard = list[int]()
 
     def interrupt(number: int, frame: object) -> None:
@@ -306,13 +325,17 @@ def _serve(pipe: connection.Connection) -> None:
 
 
 def _unheard(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Suppress the message of a Ctrl-C inside a library's callback, which cannot raise KeyboardInterrupt."""
+    """Suppress the message of a Ctrl-C inside a library's callback, where Python cannot raise KeyboardInterrupt.
+
+    Args:
+        unraisable: Python's description of the exception; other exceptions are reported as usual.
+    """
     if not isinstance(unraisable.exc_value, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)
 
 
 def end_with_parent() -> None:
-    """Wait for the parent process, and end this process with it."""
+    """Wait until the parent process ends, then end this process."""
     if parent := parent_process():
         parent.join()
         os._exit(1)

@@ -1,8 +1,9 @@
-"""Threads of BLAS: one for all computations of calib, since more threads slow down small matrices.
+"""Number of BLAS threads: one for all computations of this package, since more threads slow down small matrices.
 
-Idle threads wait in loops that take processors from others: a fit on two idle cores took twice as long, beside one busy
-process eighteen times. The API, the command, the workers and the tests all limit them here. A caller's own choice wins:
-one of `VARIABLES` in the environment, or fewer threads than the library had before, as threadpoolctl sets them.
+Idle threads wait in loops that take processor time from others: a fit on two idle cores took twice as long, and
+eighteen times as long beside one busy process. API, commands, workers and tests limit the number of threads by this
+module. A choice of the caller has priority: one of `VARIABLES` in the environment, or a number of threads below the
+library's earlier number, as set by threadpoolctl.
 """
 
 import os
@@ -24,7 +25,10 @@ _calls = 0
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Limit BLAS to one thread in the block; restore the previous number after the last such block."""
+    """Limit BLAS to one thread within the block, and restore the earlier number of threads afterwards.
+
+    Of nested or parallel blocks, the last one to end restores the number.
+    """
     global _calls
     with _changing:
         if not _calls:
@@ -41,7 +45,11 @@ def one_blas_thread() -> Iterator[None]:
 
 
 def limited_steps(steps: Generator[object, Never, object]) -> Iterator[object]:
-    """Yield a generator's values, with one BLAS thread inside the generator and the caller's number outside."""
+    """Yield the values of a generator, with one BLAS thread inside the generator and the caller's number outside.
+
+    Args:
+        steps: the generator.
+    """
     ended = object()
     with closing(steps):
         while True:
@@ -53,13 +61,13 @@ def limited_steps(steps: Generator[object, Never, object]) -> Iterator[object]:
 
 
 def limit_process() -> None:
-    """Limit BLAS to one thread in this process permanently, unless the user set a number."""
+    """Limit BLAS to one thread for the rest of this process, unless the user has chosen a number."""
     if not _chosen():
         _limit_for_good()
 
 
 def limit_worker() -> None:
-    """Give BLAS and numba one thread in this process permanently: the tasks themselves run in parallel."""
+    """Limit BLAS and numba to one thread for the rest of this worker process, since the tasks run in parallel."""
     _limit_for_good()
     if numba := sys.modules.get("numba"):
         numba.set_num_threads(1)
@@ -91,9 +99,9 @@ def _limit_for_good() -> None:
 
 
 def _set(threads: dict["LibController", int]) -> None:
-    """Set the thread numbers of libraries, from any thread.
+    """Set the number of threads of each BLAS library to the given value; this works from any thread.
 
-    threadpoolctl 3.8 accepts settings from the controlling thread only, until this thread is cleared.
+    threadpoolctl 3.8 accepts settings only from its controlling thread, unless this thread is cleared before.
     """
     for library, number in threads.items():
         clear = getattr(library, "clear_controlling_thread", lambda force: None)
@@ -104,7 +112,10 @@ def _set(threads: dict["LibController", int]) -> None:
 
 @cache
 def _libraries() -> list["LibController"]:
-    """Return all loaded BLAS libraries; cached, since their search takes milliseconds, setting threads microseconds."""
+    """Return all loaded BLAS libraries.
+
+    The result is cached, since the search takes milliseconds, and setting the number of threads only microseconds.
+    """
     from threadpoolctl import ThreadpoolController
 
     controllers = ThreadpoolController().select(user_api="blas").lib_controllers

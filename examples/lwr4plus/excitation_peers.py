@@ -42,13 +42,11 @@ from matplotlib.figure import Figure
 from calib import files
 from calib.dynamics import base, drives
 from calib.dynamics.base import BaseModel
-from calib.dynamics.bodies import bodies_of, standard_parameters
-from calib.dynamics.idim import IdentificationModel
 from calib.procedure.excitation.limits import Points
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS
-from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, save, sheet, styled
-from calib.robot.chain import Chain
-from calib.robot.library import load
+from calib.toolkit.chains import Chain, load
+from calib.toolkit.report_charts import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, save, sheet, styled
+from calib.toolkit.torque_models import IdentificationModel, bodies_of, standard_parameters
 from calib.trajectories.constraints import TorqueLimit, box_limits
 from calib.trajectories.design import search
 from calib.trajectories.design.objectives import Excitation, condition_numbers
@@ -58,7 +56,7 @@ from calib.trajectories.design.search import STAGES, Method, SearchResult, Stage
 from calib.trajectories.design.starts import random_start
 from calib.trajectories.design.verify import dense_motion, ensured
 from calib.trajectories.fourier import fourier_family
-from calib.trajectories.places import Workspace
+from calib.trajectories.workspace_limits import Workspace
 
 FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)  # [N m], Jubien, Gautier & Janot 2014 as quoted in public code
 FV = (14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6)  # [N m s/rad]

@@ -1,1 +1,1 @@
-"""Searches that move joint values continuously: local search, multistart, and the two-stage meta-heuristic."""
+"""Searches over continuous joint values: local search, multistart, global search (MLSL), and tabu search."""

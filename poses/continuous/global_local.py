@@ -1,10 +1,10 @@
 """Multi-level single linkage over all joint values (NLopt's MLSL), then the local search from the best set.
 
 MLSL (Rinnooy Kan & Timmer 1987; Sobol points as in Kucherenko & Sytsko 2005) starts a local search at a sampled point
-only if no better point lies near it, so that no optimum is searched twice. NLopt's MLSL handles bounds but no
-constraints: a violated constraint is charged quadratically. The best set is then corrected to satisfy the constraints;
-poses that still violate them, or the predicate, are replaced by those of the start. Half of the effort is for MLSL, the
-rest for `calib.poses.continuous.local`.
+only if no better point lies near, so that no optimum is searched twice. NLopt's MLSL handles bounds but no constraints:
+a violated constraint is penalised quadratically. The best set is then corrected to satisfy the constraints. Poses that
+still violate the constraints or the predicate are replaced by the corresponding poses of the start. MLSL may use half
+of the evaluations and of the time, `calib.poses.continuous.local` the rest.
 """
 
 import time
@@ -35,11 +35,12 @@ def mlsl_search(
 
     Args:
         space: limits, constraints, predicate, Jacobian.
-        start: (m, n) feasible poses, where MLSL begins [rad or m]; its other points are Sobol's.
+        start: (m, n) feasible poses, the first point of MLSL [rad or m]; MLSL takes its other points from a Sobol
+            sequence.
         index: the observability index to improve.
         existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
         evaluations: largest number of evaluations of the index, in MLSL and local search together.
-        seconds: limit of processor time, for MLSL and local search together.
+        seconds: limit of processor time [s], for MLSL and local search together.
     """
     import nlopt
 
@@ -93,8 +94,13 @@ def mlsl_search(
 
 
 def _charged(space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None) -> tuple[float, np.ndarray]:
-    """Return the smoothed merit of poses q (m, n) minus the charge for violated constraints, and its gradient by q (m,
-    n).
+    """Return the smoothed merit of poses q (m, n), less the penalty for violated constraints, and its gradient.
+
+    Args:
+        space: limits, constraints and Jacobian; a violated constraint is penalised quadratically.
+        q: (m, n) joint values [rad or m].
+        index: observability index to maximise.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
     """
     value, gradient = merit_of(space, q, index, existing, SHARPNESS[0])
     broken = np.maximum(constraint_values(space, q), 0.0)

@@ -1,9 +1,9 @@
 """Deterministic local search over all m · n joint values at once, under constraints, with exact gradients.
 
-Sequential quadratic programming (SLSQP, Kraft 1988, in SciPy) on a smoothed index that is sharpened stage by stage (see
-`calib.poses.indices.merit`); a stage ends when the merit stagnates. An iterate may violate the constraints a little, so
-every stage ends with a restoration: Newton steps of least norm until the constraints hold, pose by pose. The result is
-the best restored set by the index itself, unsmoothed.
+The method is sequential quadratic programming (SLSQP, Kraft 1988, in SciPy) on a smoothed index. The smoothing is
+reduced from stage to stage (see `calib.poses.indices.merit`); a stage ends when the merit stagnates. An iterate may
+violate the constraints slightly. Every stage therefore ends with a correction: each pose is moved by Newton steps of
+least norm until it satisfies the constraints. The result is the corrected set with the best index, unsmoothed.
 """
 
 import time
@@ -20,9 +20,10 @@ Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 # above this number of variables, poses are searched in blocks, the others fixed: SLSQP's cost is cubic
 MAX_BLOCK = 300
-# the stages of a smoothed search (our choice): at the last one the smoothing costs at most log(p)/1024 of the merit
+# sharpness of each stage of a smoothed search (our choice); in the last one the smoothed merit is at most log(p)/1024
+# below the merit itself
 SHARPNESS = (16.0, 64.0, 256.0, 1024.0)
-# iterations within which a stage must improve (our choice)
+# number of iterations within which the merit must improve for a stage to go on (our choice)
 PATIENCE = 25
 # largest accepted constraint violation in a result [unit of the constraint]
 FEASIBLE = 1e-8
@@ -35,9 +36,9 @@ class Improved:
     Attributes:
         q: (m, n) poses [rad or m]; never worse than the start, feasible to `FEASIBLE` if the start was.
         merit: log O (−log cond; O1 without 1/√m).
-        history: merits of the start and of every stage that improved on it, rising.
+        history: merits of the start and of every stage that improved the best merit, rising.
         evaluations: number of evaluations of the index with its gradient.
-        interrupted: True after Ctrl-C; q is then the best set until then.
+        interrupted: True where Ctrl-C ended the search; q is then the best set reached.
     """
 
     q: np.ndarray
@@ -55,11 +56,11 @@ def merit_of(
     ∂ log O/∂q_ik = Σ_rp G[i,r,p] ∂J[i,r,p]/∂q_ik with G = ∂ log O/∂W (see `calib.poses.indices`).
 
     Args:
-        space: gives the Jacobian and its derivative product.
+        space: provides the Jacobian and its derivative product.
         q: (m, n) poses [rad or m].
-        index: "O1" ... "O5", "cond".
-        existing: Jacobians (k, rows, p), or stacked (k rows, p), of poses that count but do not move; None without
-            such.
+        index: the observability index O, "O1" ... "O5" or "cond".
+        existing: Jacobians (k, rows, p), or stacked (k rows, p), of poses whose information is added but which are not
+            changed; None for no such poses.
         sharpness: sharpness of the smoothing, see `calib.poses.indices.merit`; infinite for the index itself.
 
     Returns:
@@ -90,21 +91,21 @@ def improved(
     sharpness: Sequence[float] = SHARPNESS,
     report: Callable[[float], None] | None = None,
 ) -> Improved:
-    """Return a set of poses improved within limits and constraints, by moving all joint values at once.
+    """Return a set of poses with improved index, within limits and constraints; all joint values are varied at once.
 
-    A predicate without gradient cannot steer the search: poses at which it fails in the end go back to their start, and
-    the other poses are searched again around them (our choice).
+    A predicate has no gradient to guide the search. Poses at which the predicate is false at the end are reset to their
+    start values, and the other poses are searched again with these fixed (our choice).
 
     Args:
         space: limits, constraints, predicate, Jacobian.
         q: (m, n) start [rad or m].
         index: the observability index to improve.
         existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
-        evaluations: largest number of evaluations of index and gradient; a search ends by itself long before.
-        tolerance: gain of the merit over `PATIENCE` iterations below which the last stage ends; stages before end at
-            ten times this.
-        seconds: processor time after which the search ends with the best set until then.
-        sharpness: sharpness of each stage, for indices with kinks.
+        evaluations: largest number of evaluations of index and gradient; most searches converge long before.
+        tolerance: gain of the merit over `PATIENCE` iterations below which the last stage ends; the other stages end at
+            ten times this gain.
+        seconds: processor time [s] after which the search ends with the best set reached.
+        sharpness: sharpness of the smoothing in each stage, for indices with kinks.
         report: called with every improved merit; None for no report.
     """
     deadline = time.process_time() + seconds
@@ -153,7 +154,7 @@ def _objective(
 
 
 class _Ended(Exception):
-    """Raised when a stage no longer improves the merit, or its evaluations are used up."""
+    """Raised when a stage no longer improves the merit, or has used all its evaluations."""
 
 
 def _search(
@@ -166,7 +167,18 @@ def _search(
     sharpness: Sequence[float],
     deadline: float,
 ) -> Improved:
-    """Run stages from one start and return the best set that keeps the constraints; the predicate is not checked."""
+    """Run all stages from one start and return the best set that satisfies the constraints; ignore the predicate.
+
+    Args:
+        space: limits, constraints, Jacobian.
+        start: (m, n) poses [rad or m].
+        index: observability index to improve.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+        evaluations: largest number of evaluations of index and gradient in all stages together.
+        tolerance: gain of the merit below which the last stage ends (`improved`).
+        sharpness: sharpness of the smoothing in each stage.
+        deadline: value of `time.process_time` [s] at which the search ends.
+    """
     feasible = bool(_keeps(space, start).all())
     best = start
     value = -np.inf
@@ -223,7 +235,7 @@ def climb(
     tolerance: float,
     deadline: float = np.inf,
 ) -> tuple[np.ndarray, int, bool]:
-    """Maximise a smooth function of poses by SLSQP, until it gains less than `tolerance` over `PATIENCE` iterations.
+    """Maximise a smooth function of poses by SLSQP until the gain over `PATIENCE` iterations is below `tolerance`.
 
     Args:
         space: limits and constraints; its Jacobian and predicate are not used.
@@ -231,10 +243,10 @@ def climb(
         objective: (m, n) -> value and gradient (m, n).
         evaluations: largest number of calls of the objective.
         tolerance: gain over `PATIENCE` iterations below which the search ends.
-        deadline: `time.process_time` at which to end.
+        deadline: value of `time.process_time` [s] at which the search ends.
 
     Returns:
-        The last iterate (m, n), which may break constraints a little (see `restored`), the number of calls of the
+        The last iterate (m, n), which may violate constraints slightly (see `restored`), the number of calls of the
         objective, and whether Ctrl-C ended the search.
     """
     m, n = start.shape
@@ -304,9 +316,14 @@ def climb(
 
 
 def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
-    """Return poses (m, n) corrected to satisfy the constraints, by Newton steps of least norm within the limits.
+    """Return poses (m, n) corrected to satisfy the constraints, by Newton steps of least norm within the joint limits.
 
-    A pose that still violates a constraint after `steps` steps is returned as it then is.
+    A pose that still violates a constraint after `steps` steps is returned in its last state.
+
+    Args:
+        space: limits and constraints; its predicate is not checked.
+        q: (m, n) joint values [rad or m].
+        steps: largest number of Newton steps.
     """
     q = np.clip(q, space.lower, space.upper)
     for _ in range(steps if space.constraints else 0):
@@ -335,13 +352,18 @@ def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
 
 
 def _keeps(space: SearchSpace, q: np.ndarray) -> np.ndarray:
-    """Return whether each pose satisfies the constraints, (m,) bool; the predicate is not checked."""
+    """Return whether each pose q (m, n) satisfies the constraints of `space`, (m,) bool; the predicate is ignored."""
     satisfied = constraint_values(space, q) <= FEASIBLE
     return np.asarray(satisfied.all(axis=1))
 
 
 def _with_rows(space: SearchSpace, q: np.ndarray, existing: np.ndarray | None) -> np.ndarray | None:
-    """Return the rows (R, p) of the poses q and of `existing` stacked; `existing` itself where q is empty."""
+    """Return the Jacobian rows (R, p) of the poses q, followed by those of `existing`; `existing` where q is empty.
+
+    Args:
+        space: provides the Jacobian of the poses q (m, n).
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+    """
     if not len(q):
         return existing
     rows = np.asarray(space.jacobian(q), dtype=float)

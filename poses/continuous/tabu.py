@@ -1,14 +1,16 @@
 """IMHATR: iterative meta-heuristic with a tabu rule, in two stages.
 
-The LWR4+ study names it after its reference [8] (most likely Daney, Papegay & Madeline, IJRR 24(6), 2005: poses chosen
-one after another, a tabu list against local minima) and gives no details. This is our reconstruction, and all numbers
-are ours:
+The study of the KUKA LWR4+ by Kolyubin, Shiriaev & Jubien (2019) names the method after its reference [8] (most likely
+Daney, Papegay & Madeline, IJRR 24(6), 2005: poses chosen one after another, a tabu list against local minima) and gives
+no details. This is our reconstruction, and all numbers are ours:
 
-1. *Construct.* Until there are m poses: draw N_c random feasible poses outside the tabu list, take the best to add,
-   improve that one pose by local search with the others fixed, add it; start and end become tabu.
-2. *Exchange.* Drop the pose whose removal hurts least, look for its replacement as in stage 1, keep it where the index
-   improves; visited and rejected poses become tabu (first in, first out). After `patience` failures in a row, stop. A
-   pose whose replacement failed is spared until something else improves, so that every pose has its turn.
+1. *Construct.* Until there are m poses: draw N_c random feasible poses outside the tabu list and take the one that
+   improves the index most. Improve this pose by a local search with the other poses fixed, and add it. The drawn and
+   the improved pose become tabu.
+2. *Exchange.* Drop the pose whose removal reduces the index least, search for its replacement as in stage 1, and accept
+   the replacement where the index improves. Visited and rejected poses become tabu (first in, first out). Stop after
+   `patience` · m failures in a row. A pose whose replacement failed is not dropped again until another exchange
+   improves the index, so that every pose is tried.
 """
 
 import time
@@ -57,7 +59,7 @@ def tabu_search(
     seconds: float = np.inf,
     report: Callable[[int, float], None] | None = None,
 ) -> Improved:
-    """Choose m poses by IMHATR; see the module's docstring.
+    """Return m poses chosen by IMHATR, the method of the module's docstring.
 
     Args:
         space: limits, constraints, predicate, Jacobian.
@@ -66,7 +68,7 @@ def tabu_search(
         existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
         seed: seed of all draws.
         rule: settings of the tabu search.
-        seconds: processor time after which no further pose is exchanged.
+        seconds: processor time [s] after which no further pose is exchanged.
         report: called after every step with the number of poses chosen so far and the merit; None for no report.
     """
     generator = np.random.default_rng(seed)
@@ -123,8 +125,18 @@ def _newcomer(
     listed: deque[np.ndarray],
     rule: TabuRule,
 ) -> tuple[np.ndarray, int]:
-    """Return an individually improved pose (n,) to add to `poses`, and the evaluations used; its start and end become
-    tabu.
+    """Return a pose (n,) to add to `poses`, improved by a local search, and the number of evaluations used.
+
+    The drawn and the improved pose are added to the tabu list.
+
+    Args:
+        space: limits, constraints, predicate, Jacobian.
+        poses: (n,) joint values of each pose chosen so far, which remain fixed.
+        index: observability index to improve.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+        generator: source of the random poses.
+        listed: the tabu list of poses (n,), extended in place.
+        rule: settings of the tabu search.
     """
 
     def allowed(q: np.ndarray) -> np.ndarray:
@@ -161,7 +173,12 @@ def _newcomer(
 
 
 def _spanning(rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
-    """Return log det(εI + information) (K,) of `rows` with each Jacobian added; columns are scaled by their rms."""
+    """Return log det(εI + information) (K,) of `rows` with each of K Jacobians added, columns scaled by their rms.
+
+    Args:
+        rows: (R, p) Jacobian rows of the poses chosen so far.
+        jacobians: (K, rows, p) Jacobians of the poses that may be added.
+    """
     mean_squares = (jacobians**2).mean((0, 1))
     scale = np.sqrt(mean_squares)
     scale = np.where(scale > 0, scale, 1.0)
@@ -176,7 +193,15 @@ def _spanning(rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
 def _least_useful(
     space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None, spared: set[int]
 ) -> int:
-    """Return the number of the pose, among those not spared, without which the merit is largest."""
+    """Return the index into q of the pose whose removal leaves the largest merit, among the poses not in `spared`.
+
+    Args:
+        space: provides the Jacobian.
+        q: (m, n) poses chosen so far [rad or m].
+        index: observability index of the merit.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+        spared: indices into q of poses that are not removed.
+    """
     jacobians = np.asarray(space.jacobian(q), dtype=float)
     parameters = jacobians.shape[2]
     measured_rows = np.zeros((0, parameters))
@@ -192,7 +217,13 @@ def _least_useful(
 
 
 def _fixed(space: SearchSpace, poses: list[np.ndarray], existing: np.ndarray | None) -> np.ndarray | None:
-    """Return the rows (R, p) of `poses` and of the poses measured before; `existing` itself where `poses` is empty."""
+    """Return the Jacobian rows (R, p) of `poses` and of those measured before; `existing` where `poses` is empty.
+
+    Args:
+        space: provides the Jacobian.
+        poses: (n,) joint values of each pose [rad or m].
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+    """
     if not poses:
         return existing
     q = np.array(poses)

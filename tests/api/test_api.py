@@ -355,7 +355,7 @@ def test_session_in_python_is_the_commands(logs, tmp_path, monkeypatch, capsys):
     own, other = (tomllib.loads((tmp_path / name / "session.toml").read_text()) for name in ("script", "command"))
     assert made == Path("script") and own | {"created": ""} == other | {"created": ""}
     script, command = calib.run_sessions(["script", "command/session.toml"], plots=False)
-    assert script.state == command.state == "waits" and "Bring script/3-measured/measured.csv" in str(script)
+    assert script.state == command.state == "waits" and "Provide script/3-measured/measured.csv" in str(script)
     assert cli.run(["run", "command", "--no-plots"]) == 0
     assert "command: waits" in capsys.readouterr().out
     assert (made / "2-poses/poses.csv").read_bytes() == (tmp_path / "command/2-poses/poses.csv").read_bytes()
@@ -366,7 +366,7 @@ def test_session_in_python_is_the_commands(logs, tmp_path, monkeypatch, capsys):
 def test_poses_without_constraints_say_so():
     """Poses chosen without constraints say what they keep and what is not checked."""
     chosen = calib.select_poses("ur5", 8, calib.SelectionSettings(method="detmax", candidates=200))
-    assert "kept: 1 % of each joint's range to its limits, self-collision" in str(chosen)
+    assert "respected: 1 % of each joint's range to its limits, self-collision" in str(chosen)
     assert "NOT checked: line of sight (the instrument's position is not known), walls" in str(chosen)
     found = json.loads(json.dumps(chosen.to_dict()))
     assert found["random_baseline"] < found["value"] and 0.9 < found["efficiency"] <= 1.0

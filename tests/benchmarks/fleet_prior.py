@@ -17,7 +17,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 import calib
-from calib.apps.fleet import prior
+from calib.apps.fleet import arm_distribution
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.errors import CalibError
@@ -50,8 +50,8 @@ def rms(arm: Arm, way: str, others: Sequence[CalibratedChain], few: np.ndarray, 
         names, units = robot.chain.names, robot.chain.units
         options = replace(options, prior={n: 5e-4 if u == "m" else 5e-3 for n, u in zip(names, units)})
     if way == "fleet":
-        found = prior.spread(others)
-        robot = prior.expected_arm(others, found)
+        found = arm_distribution.spread(others)
+        robot = arm_distribution.expected_arm(others, found)
         options = replace(options, prior={one.name: one.width for one in found})
     try:
         result = calib.fit_geometry(

@@ -27,7 +27,7 @@ from calib.trajectories.design.objectives import Excitation
 from calib.trajectories.design.problem import ExcitationProblem, evaluate
 from calib.trajectories.design.starts import random_start
 from calib.trajectories.fourier import fourier_family
-from calib.trajectories.places import Workspace
+from calib.trajectories.workspace_limits import Workspace
 
 CHAIN = load("lwr4plus")
 FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)

@@ -70,7 +70,7 @@ def test_rows_are_taken_with_their_parts():
     some = take(block, [7, 2])
     assert isinstance(some, Heights) and some.rows.tolist() == [8, 3]
     assert np.array_equal(some.height, block.height[[7, 2]]) and some.sigma is not None and len(some.sigma) == 2
-    with pytest.raises(MeasurementError, match="height has 3 rows, q has 10"):
+    with pytest.raises(MeasurementError, match="height has 3 rows, but q has 10"):
         replace(block, height=np.zeros(3))
 
 

@@ -141,7 +141,7 @@ def test_two_loads_give_the_payload_by_power(robot, tmp_path, monkeypatch):
     (tmp_path / "power.toml").write_text(options)
     command = ["identify", robot, "empty.csv", "loaded.csv", "--options", "power.toml", "--no-plots", "--out", "out"]
     assert run(command) in (0, 1)
-    with open("out/estimate.csv") as file:
+    with open("out/estimate.csv", encoding="utf-8") as file:
         estimate = {row["name"]: row for row in csv.DictReader(file)}
     mass, sigma = float(estimate["Mtool"]["value"]), float(estimate["Mtool"]["sigma"])
     assert abs(mass - 2.8) < 3.0 * sigma < 0.3

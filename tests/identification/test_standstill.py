@@ -203,7 +203,7 @@ def test_intervals_have_two_widths():
 
 def test_cut_slow_names_its_replacement():
     """The option cut_slow is refused, with what replaced it."""
-    with pytest.raises(UsageError, match="cut_slow: each standstill of a joint now counts once"):
+    with pytest.raises(UsageError, match="cut_slow: standing rows are no longer cut"):
         parse_options({"cut_slow": True})
 
 

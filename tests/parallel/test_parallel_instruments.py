@@ -136,7 +136,7 @@ def test_impossible_simulation_is_said():
     model, values = truth(find("dualv").mechanism, "Ia Fv Fc")
     with pytest.raises(CannotSimulate, match="not positive definite"):
         model.plant(-values).run(gains("dualv", 1000.0, 8.0), asked("dualv", 0.2))
-    with pytest.raises(CannotSimulate, match="without v0 above 0"):
+    with pytest.raises(CannotSimulate, match="state its v0, above 0"):
         replace(model, terms=tuple(replace(x, settings=(0.0,) * len(x.settings)) for x in model.terms)).plant(
             values
         ).run(gains("dualv", 1000.0, 8.0), asked("dualv", 0.2))
@@ -148,8 +148,8 @@ def test_impossible_simulation_is_said():
         ({"method": "ekf"}, r"parallel robots take ols, wls.*iv, didim, pc-iv, pc-didim, cloe, clie"),
         ({"method": "cloe", "rows": "power"}, r"rows = 'power' is not supported"),
         ({"method": "gtls"}, "differentiates the torques of a serial arm"),
-        ({"rows": "power"}, r"rows = 'power' is not supported; methods that do: ols, wls"),
-        ({"loop": None}, r"needs a \[loop\]|state the controller"),
+        ({"rows": "power"}, r"rows = 'power' is not supported; methods that support it: ols, wls"),
+        ({"loop": None}, r"needs a \[loop\]|needs the closed loop"),
     ],
 )
 def test_methods_need_a_simulation(more, said):

@@ -9,7 +9,7 @@ import planar
 import pytest
 from differences import check
 
-from calib.poses import constraints
+from calib.poses import pose_constraints
 from calib.poses.continuous.local import improved, merit_of
 from calib.poses.continuous.tabu import TabuRule
 from calib.poses.errors import BadInput
@@ -64,11 +64,11 @@ def test_gradient_is_central_difference(index, exact):
     "constraint",
     [
         LOW,
-        constraints.height(planar.tool, -0.3, 0.9, planar.tool_jacobian),
-        constraints.axis_distance(planar.tool, 0.2, planar.tool_jacobian),
-        constraints.reach(planar.tool, 0.9, (0.1, 0, 0.2), planar.tool_jacobian),
-        constraints.orientation(planar.tool, turned(), (-2.0, 2.5), (-1.0, 1.2), planar.tool_jacobian),
-        constraints.line_of_sight(planar.tool, (2, 1, 1), (1, 0, 0.2), 0.6, planar.tool_jacobian),
+        pose_constraints.height(planar.tool, -0.3, 0.9, planar.tool_jacobian),
+        pose_constraints.axis_distance(planar.tool, 0.2, planar.tool_jacobian),
+        pose_constraints.reach(planar.tool, 0.9, (0.1, 0, 0.2), planar.tool_jacobian),
+        pose_constraints.orientation(planar.tool, turned(), (-2.0, 2.5), (-1.0, 1.2), planar.tool_jacobian),
+        pose_constraints.line_of_sight(planar.tool, (2, 1, 1), (1, 0, 0.2), 0.6, planar.tool_jacobian),
     ],
     ids=lambda c: c.name,
 )
@@ -82,13 +82,13 @@ def test_constraint_gradients(constraint):
 
 
 def test_line_of_sight_is_a_cone():
-    seen = constraints.line_of_sight(planar.tool, (5, 0.1, 0), (1, 0, 0), 0.5)
+    seen = pose_constraints.line_of_sight(planar.tool, (5, 0.1, 0), (1, 0, 0), 0.5)
     turned = np.array([[0, 0, 0.4], [0, 0, 0.6]])
     assert (seen.function(turned)[:, 0] <= 0).tolist() == [True, False]
 
 
 def test_orientation_limits_roll_and_pitch():
-    level = constraints.orientation(planar.tool, np.eye(3), (-0.1, 0.1), (-0.5, 0.5))
+    level = pose_constraints.orientation(planar.tool, np.eye(3), (-0.1, 0.1), (-0.5, 0.5))
     poses = np.array([[0, 0, 0.4], [0, 0, 0.6], [0, 0, -0.6]])  # these turn about −y: pitch −0.4, −0.6, 0.6
     values = level.function(poses)
     assert ((values <= 0).all(1)).tolist() == [True, False, False]

@@ -213,13 +213,13 @@ NOT_THERE = ("empty.csv", "absent/load.csv", "--options", "options.toml", "--no-
     [
         (("identify", "dualv", "reversed.csv", "--validate", "other.csv", "--no-plots"), 1, "fail above 30 %"),
         (("fit", "dualv", "wrong.csv", "--validate", "poses.csv"), 1, "worse than the nominal"),
-        pytest.param(("identify", "dualv", *NOT_THERE), 0, "move as if it were absent", marks=pytest.mark.slow),
+        pytest.param(("identify", "dualv", *NOT_THERE), 0, "seems absent from its recordings", marks=pytest.mark.slow),
         pytest.param(("identify", "dualv", NOT_THERE[1], *NOT_THERE[2:]), 0, "record a run without it",
                      marks=pytest.mark.slow),
         *((words, 2, said) for words, said in (
         (("identify", "dualv", "three.csv"), "3 joints"),
         (("identify", "dualv", "swapped.csv"), "swapped.csv: sample 1: the loops"),
-        (("identify", "dualv", "load.csv", "--method", "didim"), "state the controller"),
+        (("identify", "dualv", "load.csv", "--method", "didim"), "needs the closed loop"),
         (("identify", "dualv", "load.csv", "--friction", "stribeck"), "standard friction only"),
         (("fit", "dualv", "passive.csv"), "passive joint"),
         (("fit", "dualv", "three.csv"), "'motor1' is missing"),

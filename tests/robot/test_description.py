@@ -208,7 +208,7 @@ def test_loading(tmp_path, monkeypatch):
     [
         ("ur5x", r"no robot 'ur5x' \(did you mean 'ur5'\?\); give a path .* iiwa14, lwr4plus"),
         ("absent.urdf", r"no file absent\.urdf; give a path of a \.urdf"),
-        ("empty", "empty holds no result; give a URDF, .*; the library has"),
+        ("empty", "empty contains no result; give a URDF, .*; the library has"),
         ("arm.urdf.xacro", r"arm\.urdf\.xacro: xacro: syntax error"),
         ("arm.step", r"arm\.step is no robot file; give"),
     ],

@@ -22,7 +22,7 @@ from calib.trajectories.design.starts import random_start
 from calib.trajectories.design.verify import dense_motion, ensured, verify_motion
 from calib.trajectories.errors import BadInput, NotExciting, NothingFeasible
 from calib.trajectories.fourier import fourier_family
-from calib.trajectories.places import Clearance, Workspace
+from calib.trajectories.workspace_limits import Clearance, Workspace
 
 BASE, CHI, CHAIN = arm.lwr()
 EFFORT = np.array([joint.effort for joint in CHAIN.joints])

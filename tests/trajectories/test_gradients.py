@@ -19,7 +19,7 @@ from calib.trajectories.design.objectives import (  # fmt: skip
 from calib.trajectories.design.problem import AttainmentGoal, ExcitationProblem, evaluate, exact_values
 from calib.trajectories.errors import BadInput, NotExciting
 from calib.trajectories.fourier import fourier_family
-from calib.trajectories.places import Clearance, Workspace
+from calib.trajectories.workspace_limits import Clearance, Workspace
 
 BASE, CHI, CHAIN = arm.lwr(0.3)
 LIMITS = np.array([joint.effort for joint in CHAIN.joints])

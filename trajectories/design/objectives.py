@@ -1,10 +1,10 @@
 """Objectives of motion design, with exact gradients.
 
-Excitation indices are functions of the observation matrix W (all samples' regressors, rows of joint j divided by
-sigma_j) by the eigenvalues λ = s² of the information matrix M = Wᵀ W + M_existing, s the singular values of W:
+Excitation indices are functions of the observation matrix W, which stacks the regressors of all samples, with the rows
+of joint j divided by sigma_j. They depend on the eigenvalues λ = s² of the information matrix M = Wᵀ W + M_existing of
+b parameters; without M_existing, s are the singular values of W:
 
-Of the observation matrix W (all samples' regressors, rows of joint j divided by sigma_j) with the information matrix
-M = Wᵀ W + M_existing, its eigenvalues λ = s², s the singular values of W:
+
 
     cond       s_1 / s_b                       minimise (Gautier & Khalil 1992; Kolyubin et al. 2019, eq. 24)
     logdet     -(log det M) / b                minimise (D-optimality; per column, so that searches are well scaled)
@@ -12,13 +12,14 @@ M = Wᵀ W + M_existing, its eigenvalues λ = s², s the singular values of W:
     trace      log tr(A M⁻¹) / 2               minimise (A-optimality; I-optimality where A = Σ yᵀy of a task's rows y,
                                                whose predicted variances tr(A M⁻¹) sums)
 
-Swevers et al. (1997) weigh the rows with the covariance of the torques: logdet with `sigmas`. Column scaling: ``raw``
-takes the columns in SI units, ``normalised`` divides each by its norm over the motion (so that the unit of a parameter
-does not matter), or a vector of scales is given. logdet ranks motions alike for every fixed scaling.
+Swevers et al. (1997) weight the rows with the covariance of the torques: logdet with `sigmas`. Column scaling: ``raw``
+uses the columns in SI units, ``normalised`` divides each column by its norm over the motion (so that the unit of a
+parameter does not matter), or a vector of scales is given. For logdet, the ranking of motions is the same for every
+fixed scaling.
 
-Gradients: ∂F/∂W = 2 W S with S = ∂F/∂M. cond and smallest have kinks where singular values meet, which is where their
-optima lie: `sharpness` p < ∞ replaces max λ by (Σ λ^p)^(1/p) and min λ by (Σ λ^-p)^(-1/p). The smoothed cond is at
-least cond and at most b^(1/p) cond; its gradient is exact, too.
+Gradients: ∂F/∂W = 2 W S with S = ∂F/∂M. cond and smallest have kinks where singular values coincide, and their optima
+lie at such kinks. A `sharpness` p < ∞ replaces max λ by (Σ λ^p)^(1/p) and min λ by (Σ λ^-p)^(-1/p). The smoothed cond
+is between cond and b^(1/p) cond, and its gradient is exact.
 """
 
 from dataclasses import dataclass, replace
@@ -41,9 +42,9 @@ class Value(NamedTuple):
         value: the objective, smoothed.
         by_torque: (N, n) gradient by the torques; None where the objective does not depend on them.
         by_motion: (4, N, n) gradient by q, v, a, jerk; None where the objective does not depend on them.
-        by_duration: gradient by the duration [1/s].
-        exact: the objective without smoothing.
-        by_information: (c, c) gradient ∂F/∂M of an index of the information matrix; empty for other objectives.
+        by_duration: gradient by the duration of the motion [1/s].
+        exact: value of the objective without smoothing.
+        by_information: (c, c) gradient of an excitation index by the information matrix; empty for other objectives.
     """
 
     value: float
@@ -55,14 +56,14 @@ class Value(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """A weighted observation matrix and its information matrix, for the columns of a regressor that an objective uses.
+    """Weighted observation matrix and information matrix, for the columns of the regressor that an objective uses.
 
     Attributes:
         W: (n N, c) weighted observation matrix, joint after joint.
-        M: (c, c) information Wᵀ W + M_existing.
+        M: (c, c) information matrix Wᵀ W, plus that of motions recorded before.
         shape: shape (N, n, b) of the regressor.
-        sigmas: (n,) standard deviations of the torques; None: 1.
-        columns: which of the regressor's b columns are in W.
+        sigmas: (n,) standard deviations of the torques; None takes 1.
+        columns: indices of the regressor's b columns that are in W.
     """
 
     W: np.ndarray
@@ -72,7 +73,13 @@ class Observed(NamedTuple):
     columns: np.ndarray | slice
 
     def by_regressor(self, by_information: np.ndarray) -> np.ndarray:
-        """Return ∂F/∂regressor (N, n, b) = 2 W S divided by the sigmas, with S = ∂F/∂M (c, c), symmetric."""
+        """Return the gradient (N, n, b) of an excitation index by the regressor, from that by the information matrix.
+
+        With W the observation matrix, it is 2 W S, divided by the standard deviations `sigmas`.
+
+        Args:
+            by_information: S (c, c), symmetric gradient of the index by the information matrix.
+        """
         count, n, b = self.shape
         slope = np.zeros((b, n, count))
         by_matrix = 2 * by_information @ self.W.T
@@ -84,17 +91,19 @@ class Observed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """An index of the information matrix, as an objective.
+    """An excitation index of the information matrix, as an objective to minimise.
 
     Attributes:
         index: "cond", "logdet", "smallest" or "trace".
-        scaling: "raw", "normalised", or (b,) scales by which the columns are divided.
-        sharpness: p of the smoothing; infinite for the index itself.
-        sigmas: (n,) standard deviations of the torques [N m or N]; None: 1. Infinite: that joint's rows do not count.
-        existing: (b, b) information of motions recorded before, with these sigmas, which the next motion complements;
-            None without such motions. From a triangular factor R of their observation matrix it is Rᵀ R.
-        columns: (c,) indices of the regressor's columns that count; None: all.
-        task: (c, c) A of the index "trace", for these columns; None: the identity.
+        scaling: "raw", "normalised", or (b,) scales by which the regressor's columns are divided.
+        sharpness: p of the smoothing, which replaces the largest eigenvalue by (Σ λ^p)^(1/p); infinite for no
+            smoothing.
+        sigmas: (n,) standard deviations of the torques [N m or N]; None takes 1. An infinite value excludes the rows of
+            that joint.
+        existing: (b, b) information matrix of motions recorded before, computed with these sigmas; None for no such
+            motions. If R is a triangular factor of their observation matrix, the information matrix is Rᵀ R.
+        columns: (c,) indices of the regressor's columns to use; None uses all.
+        task: (c, c) A of the index "trace", for these columns; None takes the identity.
 
     Raises:
         BadInput: an unknown index or scaling.
@@ -121,11 +130,19 @@ class Excitation:
         return f"{self.index} scaled"
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
-        """Return the index and its gradient with respect to the information, from a regressor (N, n, b)."""
+        """Return the index of a motion and its gradient with respect to the information matrix.
+
+        Args:
+            motion: the motion; not used, since the regressor is given.
+            regressor: (N, n, b) of the motion's N samples.
+        """
         return self.seen(self.observed(regressor))
 
     def observed(self, regressor: np.ndarray) -> Observed:
-        """Return the observation matrix of a regressor (N, n, b) in the objective's columns, with its information."""
+        """Return the weighted observation matrix and its information matrix, from the regressor (N, n, b) of a motion.
+
+        They contain only the regressor's columns that this objective uses.
+        """
         columns = slice(None)
         if self.columns is not None:
             columns = self.columns
@@ -140,21 +157,22 @@ class Excitation:
         return Observed(W, information(W, existing), regressor.shape, self.sigmas, columns)
 
     def seen(self, matrix: Observed) -> Value:
-        """Return the index of an observation matrix formed with this objective's columns, sigmas and existing
-        information.
-        """
+        """Return the index of an observation matrix that was formed for this objective by `observed`."""
         value, by_m, exact = self.of_information(matrix.M)
         return Value(value, exact=exact, by_information=by_m)
 
     def of_information(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
-        """Return the index of an information matrix M (c, c), its gradient S = ∂F/∂M, symmetric, and the unsmoothed
-        index.
+        """Return the index F of an information matrix M (c, c), its gradient S = ∂F/∂M, and F without smoothing.
 
-        With C = D M D, D = diag(M)^-1/2 (normalised): ∂F/∂M = D S_C D - diag((C S_C)_kk / M_kk).
+        With normalised columns, F is that of C = D M D, D = diag(M)^-1/2. With S_C the gradient by C, ∂F/∂M = D S_C D -
+        diag((C S_C)_kk / M_kk).
         """
         diagonal = np.diag(M)
         if not (diagonal > 0).all():
-            raise NotExciting(f"column {int(np.argmin(diagonal))} of the regressor is zero along the whole motion")
+            raise NotExciting(
+                f"column {int(np.argmin(diagonal))} of the regressor is zero along the whole motion: remove it, or "
+                "move more joints"
+            )
         if self.index == "trace":
             return self._trace(M)
         normalised = isinstance(self.scaling, str) and self.scaling == "normalised"
@@ -182,8 +200,10 @@ class Excitation:
         return value, by_m, exact
 
     def _trace(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
-        """Return log tr(A M⁻¹) / 2, its derivative -M⁻¹ A M⁻¹ / (2 tr) by M, and the index again (it needs no
-        smoothing).
+        """Return the index log tr(A M⁻¹) / 2 of M (c, c), its derivative by M, and the unsmoothed index.
+
+        The derivative is -M⁻¹ A M⁻¹ / (2 tr(A M⁻¹)). The third value repeats the first, since this index needs no
+        smoothing.
         """
         d = np.diag(M) ** -0.5
         scaled = M * d * d[:, None]
@@ -198,7 +218,11 @@ class Excitation:
         return value, -0.5 * spread @ inverse / trace, value
 
     def _of_spectrum(self, eigenvalues: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the index F and ∂F/∂λ from rising eigenvalues λ."""
+        """Return the index F and its derivative ∂F/∂λ from the eigenvalues λ (c,) of the information matrix.
+
+        Args:
+            eigenvalues: λ, smallest first.
+        """
         if self.index == "logdet":
             return -float(np.log(eigenvalues).mean()), -1.0 / eigenvalues / len(eigenvalues)
         low, by_low = _extreme(eigenvalues, -self.sharpness)
@@ -212,19 +236,20 @@ class Excitation:
 
 @dataclass(frozen=True, eq=False)
 class TorqueSlack:
-    """Slack of the joint torques to their limits, as in the paper: 1 - mean over joints and time of |τ_j| / τ_max.
+    """Mean distance of the joint torques from their limits: 1 - mean over joints and time of |τ_j| / τ_max.
 
-    Eq. 24 asks for F = mean(τ_max - |τ|) ≤ k τ_max: slacks are *minimised*, so a goal of k = 0.9 asks for a mean torque
-    of at least a tenth of the limit. The modulus is smoothed as √(τ² + (ε τ_max)²) - ε τ_max, ε = `smoothing`, which
-    never overstates the torque. τ = Y χ is the motor torque: link torques of a light wrist cannot reach such goals.
+    Eq. 24 of Kolyubin et al. (2019) requires F = mean(τ_max - |τ|) ≤ k τ_max. The slack F is *minimised*: a goal of k =
+    0.9 requires a mean torque of at least a tenth of the limit. The absolute value is smoothed as √(τ² + (ε τ_max)²) -
+    ε τ_max, ε = `smoothing`, which is never above |τ|. τ = Y χ is the motor torque; without the motor's share, the
+    torques of a light wrist could not reach such goals.
 
     Attributes:
         joints: indices of the joints averaged over.
-        parameters: (b,) χ, of the regressor's columns.
+        parameters: (b,) χ, the parameters of the regressor's columns.
         limits: (n,) τ_max [N m or N].
-        torque_product: (q, v, a, χ, G (N, n)) -> slopes of Σ G · Y χ.
-        smoothing: ε.
-        label: name in messages; empty for one made from the joints.
+        torque_product: (q, v, a, χ, G (N, n)) -> slopes of Σ G · Y χ in q, v, a.
+        smoothing: ε, as a share of the torque limit.
+        label: name in messages; empty for a name made from the joints.
     """
 
     joints: tuple[int, ...]
@@ -252,12 +277,13 @@ class TorqueSlack:
 
 @dataclass(frozen=True, eq=False)
 class FrictionCoverage:
-    """Shortfall from the required shares of time at low and at high speed, in both directions.
+    """Objective: shortfall from the required shares of time at low and at high speed, in both directions.
 
         F = mean over joints and the four ranges of  (max(0, 1 - share / wanted))²
 
-    Shares are means of logistic memberships of v. High speed: σ((±v - high) / (`width` high)); low speed: σ(±v / w) -
-    σ((±v - low) / w) with w = `width` low.
+    The four ranges of speed are fast and slow, each forward and backward. The share of time in a range is the mean of a
+    smooth (logistic) membership of v. With the logistic function σ, high speed is σ((±v - high) / (`width` high)) and
+    low speed is σ(±v / w) - σ((±v - low) / w), w = `width` low.
 
     Attributes:
         low, high: (n,) speeds [rad/s or m/s], 0 < low < high.
@@ -292,7 +318,11 @@ class FrictionCoverage:
         return Value(value, None, slope, exact=value)
 
     def shares(self, motion: SampledMotion) -> np.ndarray:
-        """Return the exact shares of time (4, n): fast forward, slow forward, fast backward, slow backward."""
+        """Return the shares of time (4, n) without smoothing: fast forward, slow forward, fast backward, slow backward.
+
+        Args:
+            motion: the motion, whose samples have equal time steps.
+        """
         rows = []
         for v in (motion.v, -motion.v):
             fast = (v > self.high).mean(axis=0)
@@ -303,7 +333,7 @@ class FrictionCoverage:
 
 @dataclass(frozen=True)
 class Duration:
-    """The period [s] as an objective, where the period is a free variable."""
+    """The period [s] as an objective, for problems in which the period is a free variable."""
 
     name: str = "duration"
 
@@ -317,7 +347,12 @@ Objective = Excitation | TorqueSlack | FrictionCoverage | Duration
 
 
 def information(stacked: np.ndarray, existing: np.ndarray | None = None) -> np.ndarray:
-    """Return M = Wᵀ W + M_existing (b, b) of a stacked W (rows, b); without M_existing if `existing` is None."""
+    """Return the information matrix M = Wᵀ W + M_existing (b, b).
+
+    Args:
+        stacked: W (rows, b), the observation matrix.
+        existing: M_existing (b, b), information of motions recorded before; None for no such motions.
+    """
     M = stacked.T @ stacked
     if existing is None:
         return M
@@ -330,16 +365,19 @@ def condition_numbers(
     existing: np.ndarray | None = None,
     columns: np.ndarray | None = None,
 ) -> dict[str, float]:
-    """Return cond of the observation matrix with raw and with normalised columns, by SVD (not via M).
+    """Return the condition number of the observation matrix with raw and with normalised columns.
+
+    It is computed by SVD of the observation matrix, which is more accurate than by the eigenvalues of the information
+    matrix.
 
     Args:
-        regressor: (N, n, b).
-        sigmas: (n,) standard deviations by which the rows are divided; None: 1.
-        existing: (b, b) information of motions recorded before; None without such motions.
-        columns: (c,) indices of the columns that count; None: all.
+        regressor: (N, n, b) of a motion's N samples.
+        sigmas: (n,) standard deviations by which the rows are divided; None takes 1.
+        existing: (b, b) information matrix of motions recorded before; None for no such motions.
+        columns: (c,) indices of the columns to use; None uses all.
 
     Returns:
-        The condition numbers by "raw" and "normalised"; infinite where a column is zero.
+        The condition numbers by "raw" and "normalised"; infinite if a column is zero.
     """
     if sigmas is not None:
         regressor = regressor / sigmas[:, None]
@@ -367,14 +405,18 @@ def _cond(s: np.ndarray) -> float:
 
 
 def _stacked(regressor: np.ndarray) -> np.ndarray:
-    """Return W (n N, b), joint after joint: no copy where the regressor's memory is ordered (b, n, N)."""
+    """Return the observation matrix W (n N, b), the rows of joint 1 first, from a regressor (N, n, b).
+
+    The result shares the regressor's memory if that is ordered (b, n, N).
+    """
     count, n, b = regressor.shape
     return regressor.transpose(2, 1, 0).reshape(b, n * count).T
 
 
 def _extreme(eigenvalues: np.ndarray, p: float) -> tuple[float, np.ndarray]:
-    """Return log (Σ λ^p)^(1/p) of eigenvalues λ and its gradient by λ; for p = ∞ log of the largest λ, for -∞ of the
-    smallest.
+    """Return log (Σ λ^p)^(1/p) of eigenvalues λ (c,), a smoothed log of an extreme eigenvalue, and its gradient by λ.
+
+    For p = ∞ the value is the log of the largest λ, for p = -∞ of the smallest.
     """
     logs = np.log(eigenvalues)
     if np.isinf(p):

@@ -1,8 +1,8 @@
 """Search for exciting motions: sequential quadratic programming from several feasible starts, gradients exact.
 
-A start is a random motion inside the joint limits (`calib.trajectories.design.starts`). If the start breaks another
-constraint it is repaired (the squared excess is minimised); then the search begins from it
-(`calib.trajectories.design.search`).
+A start is a random motion inside the joint limits (`calib.trajectories.design.starts`). If the start violates another
+constraint, it is first repaired: the squared constraint violation is minimised. The search then begins from the
+repaired motion (`calib.trajectories.design.search`).
 """
 
 import time
@@ -19,7 +19,7 @@ from ..design.problem import ExcitationProblem, exact_values, stretched, unmet
 from ..design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
 from ..errors import BadInput, NotExciting, NothingFeasible, require
 
-# share of the starts which the last stages are for (our choice)
+# share of the starts for which the last stages are run (our choice)
 KEPT = 1 / 3
 
 
@@ -34,24 +34,24 @@ def design(
     map: Callable = map,
     report: Callable[[int, int, str], None] | None = None,
 ) -> SearchResult:
-    """Return the best motion over several starts.
+    """Return the best motion of searches from several start motions.
 
     Args:
-        problem: the excitation problem; must pickle where `map` runs in other processes.
-        starts: number of random starts besides the guesses, each from its own child of the seed.
+        problem: the excitation problem; must be picklable where `map` runs in other processes.
+        starts: number of random start motions in addition to `guesses`; each is drawn by its own generator.
         evaluations: largest number of evaluations per start.
-        method: "slsqp" (Kraft 1988, of SciPy), or of NLopt "auglag" (augmented Lagrangian, Birgin & Martínez 2008,
-            over L-BFGS), "mma" or "ccsaq" (sequential convex separable approximations, Svanberg 2002).
+        method: "slsqp" (Kraft 1988, by SciPy), or by NLopt "auglag" (augmented Lagrangian, Birgin & Martínez 2008, over
+            L-BFGS), "mma" or "ccsaq" (sequential convex separable approximations, Svanberg 2002).
         seed: seed of the random starts.
-        guesses: variables (p,) to start from besides; empty for none.
+        guesses: free variables x (p,) of the motion family for further start motions; empty for none.
         map: the builtin, or a parallel map that returns results in order.
-        report: called with the number of starts done, of all starts, and the best merit so far in words; None for no
-            report.
+        report: called with the number of finished searches, the number of all searches, and a sentence on the best
+            merit so far; None for no report.
 
     Raises:
         BadInput: an unknown method, or no starts.
-        NothingFeasible: no start reached a feasible motion; the message names the constraint that the nearest one
-            breaks.
+        NothingFeasible: no search reached a feasible motion; the message names the constraint that the least infeasible
+            motion violates most.
         NotExciting: no motion could be evaluated.
     """
     if method not in get_args(Method):
@@ -79,7 +79,18 @@ def design(
 
 
 class _Starts:
-    """Searches from several starts, run stage by stage."""
+    """Searches from several start motions, and the results so far; the searches run stage by stage.
+
+    Args:
+        problem: the excitation problem.
+        evaluations: largest number of evaluations per start.
+        method: optimiser, as for `design`.
+        seed: seed of the random starts.
+        map: the builtin, or a parallel map that returns results in order.
+        report: called with the number of finished searches, the number of all searches, and a sentence; None: no
+            report.
+        starts: number of all start motions.
+    """
 
     def __init__(
         self,
@@ -103,7 +114,12 @@ class _Starts:
         self.interrupted = False
 
     def run(self, tasks: list[int | np.ndarray], stages: tuple[Stage, ...]) -> list[SearchResult]:
-        """Run the given stages of the search for each task and return the results that are feasible."""
+        """Run the given stages of the search for each start and return the results that are feasible.
+
+        Args:
+            tasks: for each start, the number of a random start (from 0), or variables (p,) of a motion to start from.
+            stages: the stages to run, in order.
+        """
         fresh = list[SearchResult]()
         search = partial(one_start, self.problem, *self.arguments, stages=stages)
         # a map in other processes may still hand back what it has
@@ -122,15 +138,16 @@ class _Starts:
         return fresh
 
     def _summary(self) -> str:
-        """Return a sentence on the best merit so far."""
+        """Return a sentence on the best merit so far, for the progress report."""
         if not self.found:
             return "nothing feasible yet"
         best = min(result.merit for result in self.found)
         return f"best so far {best:.4g}"
 
     def promising(self) -> list[int | np.ndarray]:
-        """Return the variables of the best third of the motions so far; infeasible ones rank last, by constraint
-        violation.
+        """Return the variables (p,) of the best motions so far, the share `KEPT` of all starts.
+
+        Feasible motions are ranked by merit; infeasible motions follow, ranked by constraint violation.
         """
         feasible = sorted(self.found, key=lambda result: result.merit)
         infeasible = sorted(self.stuck, key=lambda stuck: stuck.excess)
@@ -145,12 +162,18 @@ class _Starts:
 
 
 def _kept(starts: int) -> int:
-    """Return how many of the starts the last stages are run for."""
+    """Return the number of start motions, out of `starts`, for which the last stages are run."""
     return max(1, round(KEPT * starts))
 
 
 def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> NothingFeasible:
-    """Return the error that names the constraint or hard goal which the nearest motion misses."""
+    """Return the error of a search without a feasible motion, which names the violated constraint or hard goal.
+
+    Args:
+        problem: the excitation problem.
+        stuck: results of the searches that failed; the least infeasible motion is described.
+        starts: number of start motions, for the message.
+    """
     best = min(stuck, key=lambda start: start.excess)
     motion = stretched(problem.basis().motion(best.x), best.factor)
     if best.excess[0] <= 0.0 and problem.goals:

@@ -1,4 +1,4 @@
-"""Trade-offs between objectives: goals proposed from single-objective runs, and a Pareto front by sweeping one goal."""
+"""Trade-offs between two objectives: goals from single-objective optima, and a Pareto front by varying a bound."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -13,14 +13,14 @@ from ..design.search import STAGES, SearchResult, one_start
 
 @dataclass(frozen=True, eq=False)
 class Front:
-    """Motions on a trade-off front between objectives.
+    """Motions on a trade-off front between k objectives.
 
     Attributes:
         names: names of the k objectives.
-        values: (m, k) unsmoothed objectives of the motions.
-        found: (m,) search results of the motions.
-        best: (m,) True where no other motion is as small in every objective and smaller in one.
-        designed: number of the motion that the front is compared with.
+        values: (m, k) unsmoothed objectives of the m motions.
+        found: (m,) search results that contain the motions.
+        best: (m,) True where no other motion dominates: is at least as small in every objective and smaller in one.
+        designed: index (from 0) of the motion with which the front is compared.
     """
 
     names: tuple[str, ...]
@@ -40,7 +40,16 @@ def proposed_goals(
     guesses: tuple[np.ndarray, ...] = (),
     map: Callable = map,
 ) -> list[tuple[float, SearchResult]]:
-    """Return the optimum of each objective alone, with its motion, as initial goals (the study's advice)."""
+    """Return the optimum of each objective alone, with its motion, as initial goals (Kolyubin et al. 2019).
+
+    Args:
+        problem: family and constraints of the motions; its objectives and goals are ignored.
+        objectives: the objectives to minimise one after the other.
+        starts, evaluations, seed, guesses, map: as for `calib.trajectories.design.optimise.design`.
+
+    Returns:
+        The smallest value of each objective, and the search result that attains it.
+    """
     result = []
     for objective in objectives:
         single = replace(problem, objectives=((objective, 1.0),), goals=())
@@ -60,21 +69,20 @@ def sweep(
     evaluations: int = 600,
     report: Callable[[int, int, str], None] | None = None,
 ) -> Front:
-    """Return a Pareto front by the ε-constraint (Haimes, Lasdon & Wismer 1971): minima of `first` under bounds on
-    `second`.
+    """Return a Pareto front: the smallest values of the objective `first` under bounds on the objective `second`.
 
-    Bounds on the second objective, hard goals, are evenly spaced from its own optimum to its value at the optimum of
-    the first. Each search starts from the best known motion within the bound, and from the motion nearest to the bound;
-    the better result counts.
-
-    Levels of the second objective, a hard goal, go evenly from its own optimum to where the first one's lies. Each is
-    searched from the best motion known that keeps the level, and from the motion nearest to it; the better one counts.
+    This is the ε-constraint method (Haimes, Lasdon & Wismer 1971). The bounds on the second objective are hard goals,
+    evenly spaced from its own optimum to its value at the optimum of the first. Each search starts from the best known
+    motion within the bound, and from the motion nearest to the bound; the better result is used.
 
     Args:
-        count: of the levels, with both ends.
-        ends: what minimises the first objective alone, and the second.
-        designed: another motion, which the front shall stand beside.
-        evaluations: most of each search.
+        problem: family and constraints of the motions; its objectives and goals are ignored.
+        first, second: the two objectives.
+        count: number of bounds on the second objective, including its values at the two optima.
+        ends: the search results that minimise the first objective alone, and the second alone.
+        designed: search result of another motion, which is added to the front for comparison.
+        evaluations: largest number of evaluations of each search.
+        report: called with the number of bounds done, their total, and a sentence; None for no report.
     """
     points = [*ends, designed]
     values = [_of(problem, (first, second), run) for run in points]
@@ -98,7 +106,8 @@ def sweep(
             if isinstance(run, SearchResult) and run.merit < least_merit:
                 best = run
                 least_merit = run.merit
-        if best is not None:
+        # two levels may have the same best motion
+        if best is not None and not any(np.allclose(best.values, point) for point in values):
             points.append(best)
             values.append(best.values)
         if report:
@@ -109,7 +118,13 @@ def sweep(
 
 
 def _of(problem: ExcitationProblem, objectives: Sequence[Objective], run: SearchResult) -> np.ndarray:
-    """Return the unsmoothed values (k,) of the objectives for a search result."""
+    """Return the unsmoothed values (k,) of the objectives for the motion of a search result.
+
+    Args:
+        problem: family, regressor and times of the motions; its objectives and goals are ignored.
+        objectives: the k objectives.
+        run: the search result.
+    """
     weighted = tuple((objective, 1.0) for objective in objectives)
     spot = replace(problem, objectives=weighted, goals=())
     motion = stretched(spot.basis().motion(run.x), run.factor)
@@ -118,7 +133,10 @@ def _of(problem: ExcitationProblem, objectives: Sequence[Objective], run: Search
 
 
 def non_dominated(values: np.ndarray) -> np.ndarray:
-    """Return which rows (m, k) are not dominated, (m,) bool: no row is as small everywhere and smaller somewhere."""
+    """Return which rows of `values` (m, k) are not dominated, (m,) bool.
+
+    A row is dominated where another row is at least as small in every column and smaller in one.
+    """
     nowhere_larger = (values[:, None] <= values[None]).all(-1)
     somewhere_smaller = (values[:, None] < values[None]).any(-1)
     better = nowhere_larger & somewhere_smaller

@@ -1,9 +1,10 @@
-"""An excitation problem: a family sampled over its period, objectives or goals, and constraints, with all gradients.
+"""An excitation problem: a motion family sampled over its period, objectives or goals, and constraints, with gradients.
 
-Goal attainment (Gembicki 1974; the paper's eq. 24): min γ subject to F_i - w_i γ ≤ g_i, w_i = |g_i| by default, so that
-γ is the relative under- or overattainment; w_i = 0 makes a goal hard. The optimiser's variable is s with γ = e^s - 1,
-and goals on a condition number are compared by logarithm: the optimum does not change, and the problem is well scaled
-from condition numbers of 10⁶ down (our choice).
+Goal attainment (Gembicki 1974; Kolyubin, Shiriaev, Jubien 2019, eq. 24): min γ subject to F_i - w_i γ ≤ g_i for
+objectives F_i with goals g_i. By default w_i = |g_i|, so that γ is the relative amount by which goals are missed
+(negative: exceeded); w_i = 0 makes a goal hard, that is, a constraint. The optimiser varies s with γ = e^s - 1, and
+goals on a condition number are compared by logarithm. This does not change the optimum, and keeps the problem well
+scaled for condition numbers up to 10⁶ (our choice).
 """
 
 from collections.abc import Sequence
@@ -23,13 +24,13 @@ INSTANTS = 2000  # over a period at which a motion is looked at between its samp
 
 @dataclass(frozen=True, eq=False)
 class AttainmentGoal:
-    """Goal F ≤ goal + weight · γ on an objective F.
+    """Goal F ≤ goal + weight · γ on an objective F, where γ, the largest miss of all goals, is minimised.
 
     Attributes:
         objective: F.
         goal: the value to attain.
-        weight: None takes |goal|; 0 makes the goal hard.
-        words: the goal in messages; empty for one made from name and value.
+        weight: factor of γ; None takes |goal|, so that γ is a relative miss; 0 makes the goal hard (a constraint).
+        words: wording of the goal in messages; empty for a wording made from name and value.
     """
 
     objective: Objective
@@ -48,7 +49,10 @@ class AttainmentGoal:
         return self.weight
 
     def stated(self, value: float) -> float:
-        """Return a value F in terms of `words`: mean torque over its limit, share of time covered, else F itself."""
+        """Return the value F of the objective, converted to the quantity that the goal's `words` name.
+
+        This quantity is the mean torque over its limit, a share of time, or F itself.
+        """
         if isinstance(self.objective, FrictionCoverage):
             return self.objective.wanted * (1.0 - float(np.sqrt(value)))  # of its rms shortfall
         if isinstance(self.objective, TorqueSlack):
@@ -56,7 +60,10 @@ class AttainmentGoal:
         return value
 
     def attainment(self, value: float) -> float:
-        """Return the γ at which F = value just meets the goal; for a hard goal −∞ if it is met, else ∞."""
+        """Return the attainment γ, for which the objective's `value` equals goal + weight · γ.
+
+        Negative: the goal is exceeded. For a hard goal, γ is −∞ where the value meets the goal, else ∞.
+        """
         if self.share == 0:
             rounding = 1e-6 * max(abs(self.goal), 1e-3)
             if value <= self.goal + rounding:
@@ -71,18 +78,19 @@ class ExcitationProblem:
 
     Attributes:
         family: the family of motions over one period.
-        regressor: (q, v, a) -> Y (N, n, b).
-        product: its derivative product, (q, v, a, G (N, n, b)) -> slopes of Σ G · Y in q, v, a.
-        objectives: pairs (objective, weight) of the sum to minimise (a condition number enters by its logarithm);
-            ignored where there are goals.
+        regressor: (q, v, a) -> Y (N, n, b), which maps b dynamic parameters to the joint torques.
+        product: derivative product of the regressor, (q, v, a, G (N, n, b)) -> slopes of Σ G · Y in q, v, a.
+        objectives: pairs (objective, weight) of the weighted sum to minimise (of a condition number, the logarithm is
+            added); ignored where there are goals.
         constraints: constraints on the motion, from `calib.trajectories.constraints`.
         goals: goals of goal attainment; empty for the weighted sum of the objectives.
         samples: number of instants over the period at which objectives and constraints are evaluated.
-        stretch: (least, most) factor on the period; equal ends fix it.
+        stretch: (smallest, largest) factor on the period; equal numbers fix the period.
         extra: further times [s] within the period at which the constraints are evaluated.
-        tightening: how far inside the constraints to stay, as a share of each constraint's scale, one number or one per
-            constraint: a margin for the motion between the samples.
-        coarse: a family of fewer variables and the same period, in which random starts begin; None: the family itself.
+        tightening: margin to keep from each constraint for the motion between the samples, as a share of the
+            constraint's scale; one number or one per constraint.
+        coarse: a family of fewer variables and the same period, in which searches from random starts begin; None takes
+            `family`.
 
     Raises:
         BadInput: invalid stretch, fewer than 8 samples, a coarse family that does not match, or nothing to minimise.
@@ -113,27 +121,28 @@ class ExcitationProblem:
         return self.stretch[0] < self.stretch[1]
 
     def basis(self) -> Basis:
-        """Return the family's basis at the sample times, then at the extra times."""
+        """Return the linear map from variables to the motion at the sample times, followed by the extra times."""
         times = np.append(sample_times(self.family.period, self.samples), self.extra)
         return self.family.basis(times)
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Evaluation of a problem at a point: constraints, and on demand merit and gradients by (x, factor on the period).
+    """Evaluation of a problem at one point; merit and gradients are computed only when used.
 
-    A step that is not taken needs no gradients, and a motion that is being corrected to keep its limits needs no merit:
-    skipping both saves a third of a search's computation.
+    The gradients are by the variables x and, where the period is free, the factor on the period. Rejected steps of the
+    optimiser need no gradients, and the repair of constraint violations needs no merit; leaving them out saves a third
+    of the computation of a search.
 
     Attributes:
         problem: the problem.
         basis: the family's basis at the problem's times.
         motion: the motion at the samples, then at the extra times.
         factor: factor on the period.
-        sharpness: p of the spectra.
+        sharpness: p of the smoothed excitation indices.
         smoothed: smoothed values of each constraint.
-        constraints: (r,) smoothed values of all constraints, feasible where ≤ 0.
-        excess: largest unsmoothed constraint value over its scale.
+        constraints: (r,) smoothed values of all constraints, satisfied where ≤ 0.
+        excess: largest unsmoothed constraint value divided by its scale.
     """
 
     problem: ExcitationProblem
@@ -147,7 +156,7 @@ class Evaluation:
 
     @cached_property
     def sampled(self) -> SampledMotion:
-        """The motion at the samples only, on which the objectives depend."""
+        """The motion at the samples only, without the extra times; the objectives depend on these."""
         if not len(self.problem.extra):
             return self.motion
         return self.motion.part(np.arange(self.problem.samples))
@@ -158,13 +167,13 @@ class Evaluation:
 
     @property
     def values(self) -> np.ndarray:
-        """Smoothed values (k,) of the objectives or goals."""
+        """Smoothed values (k,) of the objectives, or of the goals' objectives."""
         values, _ = self._found
         return np.array([value.value for value in values])
 
     @property
     def exact(self) -> np.ndarray:
-        """Unsmoothed values (k,) of the objectives or goals."""
+        """Unsmoothed values (k,) of the objectives, or of the goals' objectives."""
         values, _ = self._found
         return np.array([value.exact for value in values])
 
@@ -179,12 +188,12 @@ class Evaluation:
 
     @property
     def slopes(self) -> np.ndarray:
-        """Gradients (k, p) of the goals, or (1, p) of the weighted sum without goals."""
+        """Gradients (k, p) of the goals' objectives; without goals, the gradient (1, p) of the weighted sum."""
         return self._gradient[: len(self.problem.goals) or 1]
 
     @property
     def rows(self) -> np.ndarray:
-        """Gradients (r, p) of the constraints."""
+        """Gradients (r, p) of the r smoothed constraints."""
         count = len(self.problem.goals) or 1
         if "_found" in self.__dict__:  # whoever asked for the merit will ask for its gradient
             return self._gradient[count:]
@@ -217,13 +226,14 @@ class Evaluation:
 
 
 def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness: tuple[float, float]) -> Evaluation:
-    """Return the evaluation at y = (x, factor on the period where that is free).
+    """Return the evaluation of a problem at the point y = (x, factor on the period where the period is free).
 
     Args:
         problem: the problem.
         basis: result of `ExcitationProblem.basis`.
-        y: the point.
-        sharpness: p of the spectra and ρ of the constraints.
+        y: (p + 1,) or (p,) the point: x (p,) are the family's free variables.
+        sharpness: exponent p of the smoothed excitation indices, and ρ of the smoothed maximum (1/ρ) log Σ exp(ρ g) of
+            the scaled constraints g.
     """
     x, factor = _variables(problem, y)
     motion = stretched(basis.motion(x), factor)
@@ -238,7 +248,10 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
 
 
 def _variables(problem: ExcitationProblem, y: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the family's variables and the factor on the period of a point y."""
+    """Return the family's variables x (p,) and the factor on the period from the point y = (x, factor).
+
+    Where the problem fixes the period, y is x alone, and the factor is that of the problem.
+    """
     if problem.free_period:
         return y[:-1], float(y[-1])
     return y, problem.stretch[0]
@@ -251,13 +264,14 @@ def critical_times(
     constraints: Sequence[MotionConstraint] = (),
     count: int = INSTANTS,
 ) -> np.ndarray:
-    """Return the times over the family's period [s] at which a motion is near or beyond violated constraints.
+    """Return the times [s] within the family's period at which the motion violates constraints, or nearly does.
 
     Args:
         problem: the problem.
-        y: (x, factor on the period where that is free).
-        min_excess: share of its scale by which a constraint has to be broken to count.
-        constraints: constraints to check; empty for the problem's.
+        y: free variables x (p,) of the family, then the factor on the period where the period is free.
+        min_excess: violation from which a constraint is considered, as a share of its scale. Of such a constraint,
+            instants up to a tenth of the scale below the limit are returned, too.
+        constraints: constraints to check; empty checks those of the problem.
         count: number of instants to check.
     """
     times = sample_times(problem.family.period, count)
@@ -275,7 +289,15 @@ def critical_times(
 
 
 def _value(objective: Objective, motion: SampledMotion, Y: np.ndarray, observed: dict[_Matrix, Observed]) -> Value:
-    """Return an objective's value; excitation indices with equal columns, sigmas and information share one matrix."""
+    """Return an objective's value.
+
+    Args:
+        objective: the objective.
+        motion: the motion.
+        Y: (N, n, b) regressor of the motion.
+        observed: observation matrices formed so far; excitation indices with equal columns, sigmas and existing
+            information share one.
+    """
     if not isinstance(objective, Excitation):
         return objective.evaluate(motion, Y)
     key = _matrix(objective)
@@ -289,8 +311,13 @@ def _matrix(objective: Excitation) -> _Matrix:
 
 
 def _summed(problem: ExcitationProblem, values: list[float]) -> tuple[float, np.ndarray]:
-    """Return the weighted sum of the objectives, condition numbers by logarithm, and its gradient (1, k) by their
-    values.
+    """Return the weighted sum of the problem's objectives and its gradient (1, k) by their values.
+
+    Of condition numbers, the logarithm is summed.
+
+    Args:
+        problem: the problem, which gives objectives and weights.
+        values: the k values of the objectives.
     """
     is_log = [is_condition(objective) for objective, _ in problem.objectives]
     logs = np.array(is_log)
@@ -309,7 +336,16 @@ def _slope(
     shares: np.ndarray,
     observed: dict[_Matrix, Observed],
 ) -> np.ndarray:
-    """Return the gradients (4, N, n) of Σ shares · objectives in q, v, a, jerk, by one derivative product."""
+    """Return the gradients (4, N, n) of Σ shares · objectives by q, v, a, jerk, computed by one derivative product.
+
+    Args:
+        problem: the problem.
+        motion: the motion at the problem's samples.
+        Y: (N, n, b) regressor of the motion.
+        values: values and gradients of the k objectives.
+        shares: (k,) factors of the objectives in the sum.
+        observed: observation matrices of the excitation indices, as formed by `_value`.
+    """
     result = np.zeros((4, *motion.q.shape))
     by_regressor = None
     by_information: dict[_Matrix, np.ndarray] = {}
@@ -333,7 +369,7 @@ def _slope(
 
 
 def _terms(problem: ExcitationProblem) -> list[Objective]:
-    """Return the objectives to evaluate: those of the goals, or those of the weighted sum."""
+    """Return the objectives to evaluate: those of a problem's goals or, without goals, of its weighted sum."""
     if problem.goals:
         return [goal.objective for goal in problem.goals]
     return [objective for objective, _ in problem.objectives]
@@ -350,7 +386,13 @@ def is_condition(objective: Objective) -> bool:
 
 
 def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: np.ndarray) -> np.ndarray:
-    """Return the unsmoothed values (k,) of the objectives, or of the goals' objectives, for a motion."""
+    """Return the unsmoothed values (k,) of a problem's objectives (or of its goals' objectives) for a motion.
+
+    Args:
+        problem: the problem.
+        motion: the motion at N samples.
+        regressor: (N, n, b) of the motion.
+    """
     values = []
     for objective in _terms(problem):
         unsmoothed = _sharpened(objective, np.inf)
@@ -359,7 +401,15 @@ def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: n
 
 
 def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
-    """Return merit to minimise from objective values (k,): γ with goals, else the weighted sum with log conditions."""
+    """Return the merit to minimise from objective values (k,) of a problem.
+
+    It is γ, the largest relative miss of the goals, for a problem with goals, else the weighted sum. In the weighted
+    sum, condition numbers are taken by logarithm.
+
+    Args:
+        problem: the problem.
+        values: unsmoothed values of the objectives, or of the goals' objectives.
+    """
     if problem.goals:
         return max(goal.attainment(value) for goal, value in zip(problem.goals, values))
     total, _ = _summed(problem, list(values))
@@ -367,7 +417,15 @@ def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
 
 
 def unmet(problem: ExcitationProblem, values: np.ndarray) -> tuple[float, AttainmentGoal, float] | None:
-    """Return the relative miss of the worst hard goal, that goal, and its value; None if all hard goals are met."""
+    """Return, of the problem's hard goals, the relative amount by which the worst is missed, that goal, and its value.
+
+    Args:
+        problem: the problem with its goals.
+        values: (k,) values of the goals' objectives.
+
+    Returns:
+        The miss relative to the goal, the goal, and the value of its objective; None if all hard goals are met.
+    """
     worst = None
     for goal, value in zip(problem.goals, values):
         lacking = (value - goal.goal) / max(abs(goal.goal), 1e-3)
@@ -377,7 +435,7 @@ def unmet(problem: ExcitationProblem, values: np.ndarray) -> tuple[float, Attain
 
 
 def stretched(motion: SampledMotion, factor: float) -> SampledMotion:
-    """Return the motion along the same path with `factor` times the duration."""
+    """Return the motion along the same path with the duration multiplied by `factor`."""
     if factor == 1.0:
         return motion
     velocity = motion.v / factor
@@ -394,8 +452,18 @@ def _by_variables(
     factor: float,
     by_duration: np.ndarray,
 ) -> np.ndarray:
-    """Return gradients (m, p) by (x, factor) from slopes (m, 4, N, n) in q, v, a, jerk; d v/d factor = -v / factor,
-    etc.
+    """Return the gradients (m, p) of m functions by the variables of the point y = (x, factor on the period).
+
+    The derivatives by the factor are d v/d factor = -v / factor, and correspondingly for a and jerk. Where the period
+    is fixed, the gradients are by x alone.
+
+    Args:
+        problem: the problem, which says whether the period is free.
+        basis: the linear map from x to the motion.
+        motion: the motion with the duration multiplied by `factor`.
+        slopes: (m, 4, N, n) gradients by q, v, a, jerk of this motion.
+        factor: factor on the family's period.
+        by_duration: (m,) gradients by the duration [1/s].
     """
     powers = factor ** np.arange(4)
     in_family_time = slopes

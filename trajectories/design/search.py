@@ -1,8 +1,8 @@
-"""One start's search: sequential quadratic programming on the smoothed problem, sharper from stage to stage.
+"""Search from one start motion: sequential quadratic programming on the problem, smoothed less from stage to stage.
 
-The first stage uses half of the samples and, where the problem names a coarser family, motions of few harmonics: most
-progress costs a fraction in this way. The result is the best motion that kept all constraints at the samples, not the
-last one.
+The first stage uses half of the samples and, where the problem has a coarse family, motions of few harmonics; this
+makes most of the progress at a fraction of the cost. The result is the best motion that satisfied all constraints at
+the samples, which need not be the last one.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ Method = Literal["slsqp", "auglag", "mma", "ccsaq"]
 
 
 class Stage(NamedTuple):
-    """Stage of a search.
+    """Settings of one stage of a search.
 
     Attributes:
-        spectra: sharpness p of the spectra.
-        constraints: sharpness ρ of the constraints.
+        spectra: exponent p of the smoothed excitation indices; the larger, the less they are smoothed.
+        constraints: sharpness ρ of the smoothed constraints; the larger, the less they are smoothed.
         tolerance: SLSQP's tolerance.
-        share: share of the evaluations.
-        rough: half of the samples are used.
-        coarse: the coarse family is used.
+        share: share (0 to 1) of the search's evaluations that the stage may use.
+        rough: True uses half of the samples.
+        coarse: True uses the problem's coarse family.
     """
 
     spectra: float
@@ -61,7 +61,7 @@ KEPT = 1e-7  # of a constraint's scale, by which a point that keeps it may break
 
 
 class _Spent(Exception):
-    """Raised when the evaluations are used up."""
+    """Raised inside a stage when the stage has used all its evaluations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,16 +69,16 @@ class SearchResult:
     """Result of a search.
 
     Attributes:
-        x: (p,) variables of the family.
+        x: (p,) free variables of the motion family (coefficients that the equations of rest leave free).
         factor: factor on the family's period.
-        merit: the weighted sum, or γ.
-        values: (k,) unsmoothed objectives or goals at the problem's samples.
-        history: merits of the improving feasible iterates, falling.
+        merit: the weighted sum of the objectives; for problems with goals γ, the largest relative miss of the goals.
+        values: (k,) unsmoothed values of the objectives, or of the goals' objectives, at the problem's samples.
+        history: merits of the feasible iterates that improved on all before, falling.
         evaluations: number of evaluations of constraints and merit.
-        feasible: share of the evaluations that kept all constraints at the samples.
+        feasible: share of the evaluations that satisfied all constraints at the samples.
         seconds: wall-clock time of the search [s].
-        seed: number of the random start; −1 for a given start.
-        interrupted: True after Ctrl-C.
+        seed: number of the random start; −1 for a start given by its variables.
+        interrupted: True where Ctrl-C ended the search.
         times: processor time [s] since the search began, for each entry of `history`.
     """
 
@@ -100,10 +100,11 @@ class Stuck:
     """Result of a search that found no feasible motion.
 
     Attributes:
-        x, factor: variables and factor on the period of the motion that broke the constraints least.
-        excess: its largest excess over the constraints, and over the hard goals, each relative to their scale.
+        x, factor: free variables (p,) of the family and factor on the period of the motion that violated the
+            constraints least.
+        excess: largest violation of the constraints by this motion, and of the hard goals, each relative to its scale.
         evaluations: number of evaluations of the search.
-        reason: why the optimiser ended, empty where it gives no reason.
+        reason: why the optimiser ended; empty where it gives no reason.
     """
 
     x: np.ndarray
@@ -121,22 +122,22 @@ def one_start(
     start: int | np.ndarray,
     stages: tuple[Stage, ...] = STAGES,
 ) -> SearchResult | Stuck:
-    """Search from one random start (its number) or from given variables (p,).
+    """Return the result of the search from one start motion.
 
-    Where the best motion of a stage breaks a limit between the samples by more than a share of its scale, the stage is
-    repeated with those instants as extra times, from that motion or, where it cannot be repaired, from the last motion
-    that keeps the limits.
+    The best motion of a stage may violate a limit between the samples by more than a share of the limit's scale. The
+    stage is then repeated with the instants of violation as extra times. It begins from the best motion or, where this
+    cannot be repaired, from the last motion that satisfies the limits.
 
     Args:
         problem: the problem.
         evaluations: largest number of evaluations over all of `STAGES`.
-        method: see `calib.trajectories.design.optimise.design`.
+        method: optimiser, "slsqp", "auglag", "mma" or "ccsaq"; see `calib.trajectories.design.optimise.design`.
         seed: seed of the random start.
-        start: number of the random start, or variables to start from.
-        stages: the stages to run; given variables are never searched in the coarse family.
+        start: number (from 0) of the random start, or variables (p,) of the motion to start from.
+        stages: the stages to run; a search from given variables never uses the coarse family.
 
     Returns:
-        The result, or a `Stuck` where no motion kept the constraints.
+        The result; a `Stuck` where no motion satisfied the constraints.
     """
     began = time.perf_counter()
     random = isinstance(start, int | np.integer)
@@ -189,7 +190,13 @@ def one_start(
 
 
 def _at_stage(problem: ExcitationProblem, stage: Stage, extra: np.ndarray) -> tuple[ExcitationProblem, Basis]:
-    """Return the problem as a stage sees it (samples, family), with `extra` times [s], and its basis."""
+    """Return the problem with the samples and the family of a stage, and the linear map from variables to its motion.
+
+    Args:
+        problem: the full problem.
+        stage: the stage, which may use half of the samples or the coarse family.
+        extra: further times [s] at which the constraints are evaluated.
+    """
     problem = replace(problem, extra=extra)
     if stage.rough:
         problem = replace(problem, samples=max(8, problem.samples // 2))
@@ -199,7 +206,12 @@ def _at_stage(problem: ExcitationProblem, stage: Stage, extra: np.ndarray) -> tu
 
 
 class StartSearch:
-    """One start's search in one problem: the state shared by the optimiser's callbacks."""
+    """Search from one start motion in one problem: the state that the optimiser's callbacks share.
+
+    Args:
+        problem: the excitation problem.
+        basis: linear map from variables to motion of the problem.
+    """
 
     def __init__(self, problem: ExcitationProblem, basis: Basis):
         self.problem = problem
@@ -223,7 +235,13 @@ class StartSearch:
         self._trail: list[np.ndarray] = []
 
     def reached(self, last: np.ndarray) -> np.ndarray:
-        """Return the best feasible point, else the least infeasible, else the last point."""
+        """Return the best feasible point so far; without one, the point that violates the constraints least.
+
+        A point y is the family's variables x (p,), with the factor on the period where the period is free.
+
+        Args:
+            last: the point to return if none was evaluated.
+        """
         if self.best is not None:
             return self.best
         if self.nearest is not None:
@@ -231,14 +249,18 @@ class StartSearch:
         return last
 
     def broken(self, y: np.ndarray) -> np.ndarray:
-        """Return times [s] at which a motion breaks limits between samples by more than `max_break`; empty if none."""
+        """Return the times [s] at which the motion of a point y violates limits between samples.
+
+        Violations are counted from `max_break` on, a share of a limit's scale. The result is empty if there are none.
+        """
         # of a constraint's scale: a motion that breaks it by more between the samples leads nowhere (our choice)
         max_break = 0.02
         return critical_times(self.problem, y, max_break)
 
     def last_unbroken(self) -> np.ndarray:
-        """Return the last improving point that keeps the limits between samples, by bisection; the first point if none
-        does.
+        """Return the last improving point that satisfies the limits between samples, found by bisection.
+
+        If no point does, the first point is returned.
         """
         low, high = 0, len(self._trail) - 1
         while high - low > 1:
@@ -250,7 +272,13 @@ class StartSearch:
         return self._trail[low]
 
     def continued(self, y: np.ndarray, problem: ExcitationProblem, basis: Basis) -> tuple[StartSearch, np.ndarray]:
-        """Return the search continued in another problem, and the point y expressed in that problem's variables."""
+        """Return a search in another problem with this search's history, and the point y in that problem's variables.
+
+        Args:
+            y: point of this search: variables (p,), with the factor on the period where the period is free.
+            problem: the other problem.
+            basis: linear map from variables to motion of the other problem.
+        """
         if problem.family is not self.problem.family:
             p = self.basis.p
             path = self.problem.family.basis(basis.times).motion(y[:p])
@@ -266,7 +294,13 @@ class StartSearch:
         return new, y
 
     def result(self, y: np.ndarray, seconds: float, seed: int) -> SearchResult | Stuck:
-        """Return the result of the search, which ended at the point y after `seconds` [s]."""
+        """Return the result of the search, which ended at the point y after `seconds` [s].
+
+        Args:
+            y: last point: variables (p,), with the factor on the period where the period is free.
+            seconds: wall-clock time of the search [s].
+            seed: number of the random start, to be recorded; −1 for a start given by its variables.
+        """
         p = self.basis.p
         stretch = self.problem.stretch
         best = self.reached(y)
@@ -297,7 +331,7 @@ class StartSearch:
         )
 
     def at(self, y: np.ndarray) -> Evaluation:
-        """Return the evaluation of a point, computed once; the best feasible point is remembered."""
+        """Return the evaluation of the point y, computed once per point; the best feasible point is remembered."""
         key = (y.tobytes(), self.sharpness)
         if self._evaluation is None or key != self._at:
             self._evaluation = evaluate(self.problem, self.basis, y, self.sharpness)
@@ -307,7 +341,12 @@ class StartSearch:
         return self._evaluation
 
     def remember(self, y: np.ndarray, evaluation: Evaluation) -> None:
-        """Remember a point if it keeps the limits and is the best so far, or if it breaks them least so far."""
+        """Remember a feasible point if it is the best so far, and any point if it violates the constraints least.
+
+        Args:
+            y: the point.
+            evaluation: constraints and objectives evaluated at y.
+        """
         missed = None
         if self.problem.goals:
             missed = unmet(self.problem, evaluation.values)
@@ -330,7 +369,7 @@ class StartSearch:
             self.times.append(time.process_time() - self.began)
 
     def inside(self, y: np.ndarray) -> np.ndarray:
-        """Return a point that keeps the constraints: y repaired, or a smaller motion where that fails."""
+        """Return a point that satisfies the constraints: y repaired or, if this fails, y's motion scaled down."""
         evaluation = self.repaired(y)
         max_halvings = 4  # times that a motion is halved which cannot be brought back inside
         for _ in range(max_halvings):
@@ -341,7 +380,15 @@ class StartSearch:
         return evaluation
 
     def repaired(self, y: np.ndarray, evaluations: int = 80) -> np.ndarray:
-        """Return a point that keeps constraints, or the last one of the repair: min Σ max(0, c + 0.01)² by L-BFGS."""
+        """Return a point that satisfies the constraints, found from y by minimising their violation with L-BFGS.
+
+        The violation is Σ max(0, c + 0.01)² of the smoothed constraints c ≤ 0. If the minimisation does not succeed,
+        its last point is returned.
+
+        Args:
+            y: the point to start from.
+            evaluations: largest number of evaluations.
+        """
         if not self.problem.constraints or self.at(y).constraints.max() <= 0:
             return y
 
@@ -362,7 +409,16 @@ class StartSearch:
         return self._optimised(solver, y)
 
     def solve(self, y: np.ndarray, evaluations: int, method: Method, tolerance: float = 1e-5) -> np.ndarray:
-        """Return the optimiser's last point y for the smoothed problem; with goals it also varies s, γ = e^s - 1."""
+        """Return the optimiser's last point for the smoothed problem.
+
+        With goals, the optimiser also varies s, where γ = e^s - 1 is the relative amount by which goals are missed.
+
+        Args:
+            y: the point to start from.
+            evaluations: largest number of evaluations.
+            method: optimiser, "slsqp", "auglag", "mma" or "ccsaq".
+            tolerance: relative change of the merit at which the optimiser stops.
+        """
         goals = self.problem.goals
         if goals:
             start = np.append(y, self._attainment(y))
@@ -395,13 +451,22 @@ class StartSearch:
         return self._optimised(solver, start)[: len(y)]
 
     def _count(self, y: np.ndarray) -> int:
-        """Return the number of inequalities, including those of goals."""
+        """Return the number of inequalities of constraints and goals together.
+
+        Args:
+            y: any point, at which they are evaluated.
+        """
         return len(self.at(np.ascontiguousarray(y)).constraints) + len(self.problem.goals)
 
     def _by_scipy(self, start: np.ndarray, last: int, tolerance: float) -> np.ndarray:
         """Return the last point of SciPy's SLSQP (Kraft 1988), run until the search has made `last` evaluations.
 
-        Its subproblems are solved faster than in NLopt.
+        SciPy's version solves the quadratic subproblems faster than NLopt's.
+
+        Args:
+            start: point to start from, followed by s where the problem has goals.
+            last: number of evaluations of the whole search at which to stop.
+            tolerance: change of the merit at which SLSQP stops.
         """
         self._tried = start
         goal_variables = bool(self.problem.goals)
@@ -461,8 +526,10 @@ class StartSearch:
         return run.x
 
     def _ends(self, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the bounds of all variables: of the factor on the period, and of s (γ from -0.98 to 10⁵); x is not
-        bounded.
+        """Return the lower and upper bounds, each (size,), of the `size` variables of the optimiser.
+
+        Bounded are the factor on the period, and s of the goal attainment γ = e^s - 1, so that γ is from -0.98 to 10⁵.
+        The family's variables x are not bounded.
         """
         lower = np.full(size, -np.inf)
         upper = np.full(size, np.inf)

@@ -1,6 +1,6 @@
-"""Start motions of searches: random, inside the joint limits, about a pose that breaks the other limits least.
+"""Start motions of searches: random motions inside the joint limits.
 
-Also smaller motions about a pose that keeps the limits, from which a search begins again.
+A search also begins again from smaller motions about a pose inside the limits (`shrunk`).
 """
 
 import numpy as np
@@ -11,11 +11,16 @@ from ..design.problem import ExcitationProblem, stretched
 
 
 def random_start(problem: ExcitationProblem, basis: Basis, rng: np.random.Generator) -> np.ndarray:
-    """Return variables (and the factor on the period, where free) of a random motion within a random part of the joint
-    limits.
+    """Return variables (and the factor on the period, where free) of a random motion inside the joint limits.
 
-    The centre of the motion is the best of 200 random poses by the constraints that a constant pose can break; the
-    amplitude is scaled down to the limits of position, velocity, acceleration and jerk.
+    The motion fills a random part of the joint limits. The centre of the motion is the best of 200 random poses by the
+    constraints that a constant pose can violate. The amplitude is scaled down to the limits of position, velocity,
+    acceleration and jerk.
+
+    Args:
+        problem: the excitation problem, whose joint limits are satisfied.
+        basis: linear map from variables to motion of the problem.
+        rng: generator of the random numbers.
     """
     n = basis.n
     boxes = [constraint for constraint in problem.constraints if isinstance(constraint, BoxLimit)]
@@ -55,7 +60,15 @@ def random_start(problem: ExcitationProblem, basis: Basis, rng: np.random.Genera
 
 
 def shrunk(problem: ExcitationProblem, y: np.ndarray, share: float) -> np.ndarray:
-    """Return the point of the motion scaled by `share` about its pose furthest inside the limits."""
+    """Return the point of a motion scaled by `share` about one of its poses.
+
+    The pose is the one that lies furthest inside the limits.
+
+    Args:
+        problem: the excitation problem with its limits.
+        y: point of the motion: variables (p,), with the factor on the period where the period is free.
+        share: factor on the motion's amplitude, 0 to 1.
+    """
     basis = problem.basis()
     path = basis.motion(y[: basis.p])
     still = np.zeros(path.q.shape)
@@ -70,7 +83,15 @@ def shrunk(problem: ExcitationProblem, y: np.ndarray, share: float) -> np.ndarra
 
 
 def _fitting(boxes: list[BoxLimit], still: SampledMotion, moving: SampledMotion) -> float:
-    """Return the largest scale (at most 1) of a motion about the pose `still` that keeps the box limits."""
+    """Return the largest factor (at most 1) by which a motion about a pose satisfies the box limits.
+
+    The factor multiplies the deviation of the motion from the pose.
+
+    Args:
+        boxes: limits of position, velocity, acceleration and jerk.
+        still: the constant pose, as a motion.
+        moving: the motion.
+    """
     share = 1.0
     for box in boxes:
         at = still.orders[box.order]

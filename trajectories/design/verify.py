@@ -1,10 +1,10 @@
-"""Final check of feasibility: a motion evaluated anew, densely, with an allowance between the samples.
+"""Final check of feasibility: a motion is evaluated again at dense instants, with an allowance between the instants.
 
-Positions and derivatives come from the family's formula, not from the optimiser's tables. Between two instants dt
-apart a function rises above its values at both by at most max|f''| dt² / 8. For limits on d^r q / dt^r that maximum is
-bounded by the coefficients (*proved*); for torques, positions and distances it is estimated as twice the second
-difference at that instant (*estimated*: our choice; a jump between two instants, as of Coulomb friction, needs no
-further allowance).
+Positions and derivatives are computed by the formula of the family, not from the optimiser's tables. Between two
+instants dt apart a function exceeds the larger of its values at both by at most max|f''| dt² / 8. For limits on d^r q /
+dt^r, a bound on max|f''| follows from the coefficients (*proved*). For torques, positions and distances the allowance
+is twice the second difference at the instant, divided by 8 (*estimated*: our choice). A jump between two instants, as
+of Coulomb friction, needs no further allowance.
 """
 
 from collections.abc import Sequence
@@ -26,8 +26,9 @@ class Margin:
 
     Attributes:
         name, label, unit: name of the constraint, label of the column, unit of the values.
-        margin: least distance to the limit over all times, minus the allowance [unit]; negative: broken.
-        share: margin over the constraint's scale.
+        margin: least distance to the limit over all times, minus the allowance [unit]; negative where the limit is
+            violated.
+        share: margin divided by the constraint's scale.
         time: time of the least distance [s].
         allowance: largest excess that is possible between the instants [unit].
         proved: True where the allowance is a bound, False where it is an estimate.
@@ -45,10 +46,10 @@ class Margin:
 
 @dataclass(frozen=True)
 class Verification:
-    """Margins to all constraints, column by column.
+    """Margins to all constraints, one for each column of a constraint (such as one side of one joint's limit).
 
     Attributes:
-        margins: one per column of every constraint.
+        margins: one margin per column of every constraint.
         instants: number of instants checked over the period.
         rest: largest velocity and acceleration at the start [per s, per s²].
     """
@@ -63,7 +64,7 @@ class Verification:
 
     @property
     def worst(self) -> dict[str, Margin]:
-        """The smallest margin of each constraint, by its name."""
+        """The smallest margin of each constraint, by the constraint's name."""
         result: dict[str, Margin] = {}
         for margin in self.margins:
             if margin.name not in result or margin.share < result[margin.name].share:
@@ -72,7 +73,14 @@ class Verification:
 
 
 def dense_motion(family: Family, x: np.ndarray, times: np.ndarray, factor: float = 1.0) -> SampledMotion:
-    """Return the time-scaled motion sampled at times [s], evaluated by the family's formula."""
+    """Return the time-scaled motion sampled at times [s], computed by the family's formula.
+
+    Args:
+        family: the family of motions.
+        x: (p,) free variables of the family.
+        times: (N,) [s].
+        factor: factor on the period.
+    """
     family_times = times / factor
     orders = [family.evaluate(x, family_times, order) / factor**order for order in range(4)]
     return SampledMotion(times, *orders)
@@ -81,10 +89,14 @@ def dense_motion(family: Family, x: np.ndarray, times: np.ndarray, factor: float
 def verify_motion(
     family: Family, x: np.ndarray, constraints: Sequence[MotionConstraint], *, factor: float = 1.0, instants: int = 5000
 ) -> Verification:
-    """Return the margins of a motion to constraints at `instants` over one period, and between them.
+    """Return the margins of a motion to its constraints, at `instants` instants over one period and between them.
 
     Args:
-        factor: on the family's period.
+        family: the family of motions.
+        x: (p,) free variables of the family for this motion.
+        constraints: the constraints to check.
+        factor: factor on the family's period.
+        instants: number of instants.
     """
     period = family.period * factor
     step = period / instants
@@ -107,19 +119,19 @@ def ensured(
 ) -> tuple[SearchResult, Verification]:
     """Return a motion that passes `verify_motion`, and its verification.
 
-    A motion that does not pass is searched again from its variables, with the instants near the broken limits as extra
-    times, and with more tightening of these limits. Where that does not help, the motion is made smaller about its pose
-    that is furthest inside the limits.
-
-    One that does not is searched again from there, with the instants near what it breaks, and further inside the limits
-    that it breaks. Where that does not help, it is made smaller about its pose that is furthest inside.
+    A motion that does not pass is searched again from its variables, with the instants near the violated limits as
+    extra times, and with more tightening of these limits. Where this does not help, the motion is scaled down about its
+    own pose that lies furthest inside the limits.
 
     Args:
-        constraints: to verify against, one for each of the problem's; default these.
-        rounds: of searching again.
+        problem: the excitation problem.
+        result: the motion to start from.
+        constraints: constraints to verify, one for each constraint of the problem; None takes those of the problem.
+        instants: number of instants at which the motion is verified.
+        rounds: largest number of repeated searches.
 
     Raises:
-        NothingFeasible: where none of that helps.
+        NothingFeasible: neither a repeated search nor scaling down gives a motion that passes.
     """
     checked = constraints or problem.constraints
     tighter = problem

@@ -1,13 +1,13 @@
-"""Straight tool lines as joint paths, by inverse kinematics along the line; the robot enters by callables only.
+"""Straight tool lines as joint paths, by inverse kinematics along the line; the robot is given by callables only.
 
-The tool's position is linear in σ = 0 … 1, its orientation turns about one axis (R = R_0 exp(σ log(R_0ᵀ R_1))). At each
-sample damped least squares (Wampler 1986; Nakamura & Hanafusa 1986) meets the pose, and a term in J's null space draws
-the arm to the posture at the start:
+The tool's position is linear in σ = 0 … 1, and its orientation rotates about one axis (R = R_0 exp(σ log(R_0ᵀ R_1))).
+At each sample the pose is reached by damped least squares (Wampler 1986; Nakamura & Hanafusa 1986), and a term in the
+null space of J pulls the joint values towards those at the start:
 
     Δq = J⁺ e + (1 - J⁺ J)(q_start - q),    J⁺ = Jᵀ (J Jᵀ + λ² 1)⁻¹,    e = [Δp; Δφ]
 
-iterated until Δq vanishes, so that q is a smooth function of σ. A quintic spline joins the samples; they are made
-denser until the tool keeps to the line between them.
+This is iterated until Δq vanishes, so that q is a smooth function of σ. A quintic spline interpolates the samples. The
+number of samples is raised until the tool's deviation from the line between them is small.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ class _Line:
     """Straight tool line as a joint path.
 
     Attributes:
-        path: the joints' path.
+        path: the joint path.
         deviation: (2,) largest distance from the line [m] and from its orientation [rad], between the samples.
     """
 
@@ -39,18 +39,18 @@ class _Line:
 
 
 def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarray) -> _Line:
-    """Return the joint path of a straight tool line from the tool pose at `start` to the pose `goal`, with its
-    deviation.
+    """Return the joint path of a straight tool line from `start` to `goal`, with its deviation from the line.
 
     Args:
         forward: q (m, n) to tool poses T_base_tool (m, 4, 4).
         jacobian: q (m, n) to (m, 6, n), [v; ω] of the tool in the base frame.
-        start: (n,) joint values [rad or m].
+        start: (n,) joint values at the start of the line [rad or m].
         goal: (4, 4) tool pose at the end.
 
     Raises:
-        BadInput: both ends have one tool pose.
-        NothingFeasible: a pose of the line is out of reach; the message says how far along and by how much.
+        BadInput: both ends have the same tool pose.
+        NothingFeasible: a pose of the line is out of reach; the message gives its position on the line and the
+            remaining error.
     """
     start = np.asarray(start, dtype=float)
     first = forward(start[None])[0]
@@ -76,7 +76,14 @@ def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarra
 
 
 def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return joint values (m, n) at the targets (m, 4, 4), solved one after the other."""
+    """Return joint values (m, n) at the tool poses `targets` (m, 4, 4), each solved from the solution before.
+
+    Args:
+        forward: q (m, n) to tool poses T_base_tool (m, 4, 4).
+        jacobian: q (m, n) to (m, 6, n), [v; ω] of the tool in the base frame.
+        start: (n,) joint values at the first tool pose [rad or m].
+        targets: (m, 4, 4).
+    """
     q = start.copy()
     profile = [start]
     for k, target in enumerate(targets[1:], 1):
@@ -97,8 +104,14 @@ def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.
 
 
 def _reach(forward: Forward, jacobian: Forward, q: np.ndarray, remaining: np.ndarray, target: np.ndarray):
-    """Return joint values (n,) at a target pose (4, 4), near the posture `remaining` (n,), and the remaining error
-    (6,).
+    """Return joint values (n,) at the tool pose `target` (4, 4), and the remaining error [Δp; Δφ] (6,) [m and rad].
+
+    Args:
+        forward: q (m, n) to tool poses T_base_tool (m, 4, 4).
+        jacobian: q (m, n) to (m, 6, n), [v; ω] of the tool in the base frame.
+        q: (n,) joint values from which the iteration starts.
+        remaining: (n,) joint values towards which redundant joints are pulled.
+        target: (4, 4).
     """
     error = np.full(6, np.inf)
     max_step = 0.2  # [rad or m] of a step of any joint
@@ -132,7 +145,7 @@ def _targets(first: np.ndarray, goal: np.ndarray, share: np.ndarray) -> np.ndarr
 
 
 def _error(poses: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return the errors [Δp; Δφ] (m, 6) [m and rad] from poses to targets (m, 4, 4), in the base frame."""
+    """Return the errors [Δp; Δφ] (m, 6) [m and rad] of `poses` to `targets` (m, 4, 4), in the base frame."""
     rotations = targets[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)
     turn = Rotation.from_matrix(rotations).as_rotvec()
     shift = targets[:, :3, 3] - poses[:, :3, 3]

@@ -1,7 +1,8 @@
-"""Paths q = Φ(s): geometry of a motion without timing. At least twice continuously differentiable.
+"""Paths q = Φ(s): geometry of a motion without timing, at least twice continuously differentiable.
 
-Splines through joint waypoints are parametrised by chord length (knots s_k apart by |q_k - q_{k-1}|), so that Φ' has a
-norm near one and the spline does not swing out where waypoints lie unevenly (de Boor 1978; Lee 1989 compares).
+Splines through joint waypoints are parametrised by chord length (the knots s_k have the distances |q_k - q_{k-1}|). Φ'
+then has a norm near one, and the spline does not overshoot where waypoints are unevenly spaced (de Boor 1978; Lee 1989
+compares parametrisations).
 """
 
 from collections.abc import Callable
@@ -17,7 +18,7 @@ SAME = 1e-9  # waypoints nearer than this [rad or m] are one
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """A path of n joints as a spline.
+    """A path q = Φ(s) of n joints as a spline, with the path parameter s.
 
     Attributes:
         derivative: (s (N,), order) to (N, n), d^order Φ / ds^order [rad or m per s^order], order 0 to 2.
@@ -49,12 +50,13 @@ class Path:
 
 
 def spline(waypoints: np.ndarray, spacing: np.ndarray | None = None, scale: np.ndarray | None = None) -> Path:
-    """Return the natural cubic spline (C²) through waypoints; for two waypoints the straight line.
+    """Return the natural cubic spline (C²) through waypoints; for two waypoints this is the straight line.
 
     Args:
         waypoints: (m, n) joint values [rad or m], two or more.
-        spacing: (m - 1,) factors on the chord lengths between knots, which change the shape of the path; None: ones.
-        scale: (n,) length of each joint that counts as 1 in the chord length; None: ones.
+        spacing: (m - 1,) factors on the distances between knots (the chord lengths in joint space), which change the
+            shape of the path; None: ones.
+        scale: (n,) length of each joint that enters the chord length as 1 [rad or m]; None: ones.
 
     Raises:
         BadInput: fewer than two waypoints, equal neighbours, or values that are not numbers.
@@ -76,7 +78,7 @@ def spline(waypoints: np.ndarray, spacing: np.ndarray | None = None, scale: np.n
 
 
 def through(samples: np.ndarray, s: np.ndarray) -> Path:
-    """Return the quintic spline (C⁴) through dense samples (N, n) of a curve at parameters s (N,), rising from 0."""
+    """Return the quintic spline (C⁴) through dense samples (N, n) of a curve, at parameters s (N,) rising from 0."""
     points = checked(samples)
     degree = min(5, len(points) - 1 - len(points) % 2)
     curve = make_interp_spline(s, points, k=degree)
@@ -84,7 +86,11 @@ def through(samples: np.ndarray, s: np.ndarray) -> Path:
 
 
 def checked(waypoints: np.ndarray) -> np.ndarray:
-    """Return the waypoints (m, n) as floats, after the checks of `spline`."""
+    """Return the waypoints (m, n) as floats.
+
+    Raises:
+        BadInput: fewer than two waypoints, equal neighbours, or values that are not numbers.
+    """
     points = np.asarray(waypoints, dtype=float)
     if points.ndim != 2 or not points.shape[1]:
         raise BadInput(f"waypoints: expected an (m, n) array of joint values, found shape {points.shape}")
@@ -103,12 +109,12 @@ def checked(waypoints: np.ndarray) -> np.ndarray:
 
 
 def check_within(path: Path, lower: np.ndarray, upper: np.ndarray, waypoints: np.ndarray | None = None) -> np.ndarray:
-    """Return the path's margin (n,) to the nearer joint limit [rad or m].
+    """Return the path's smallest distance (n,) from the nearer joint limit [rad or m].
 
     Args:
         path: the path.
         lower, upper: (n,) joint limits [rad or m].
-        waypoints: (m, n) waypoints to name in the message; None where the path has none.
+        waypoints: (m, n) waypoints, to be named in the message; None where the path has no waypoints.
 
     Raises:
         BadInput: the path exceeds a limit; the message names the waypoint or the part of the path, the joint and the
@@ -148,7 +154,12 @@ def extremes(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reversals(path: Path, s: np.ndarray) -> np.ndarray:
-    """Return the path parameters where joints reverse between samples s (N,): zeros of Φ'_j, by bisection."""
+    """Return the path parameters at which a joint reverses (zeros of Φ'_j = dΦ_j/ds), found by bisection.
+
+    Args:
+        path: the path q = Φ(s).
+        s: (N,) samples; one reversal of each joint is found between neighbours with opposite signs of Φ'_j.
+    """
     slope = path(s, 1)
     k, j = np.nonzero(slope[:-1] * slope[1:] < 0)
     low = s[k]

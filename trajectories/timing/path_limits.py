@@ -9,7 +9,10 @@ from ..errors import BadInput
 
 
 class Law(Protocol):
-    """A robot's dynamics along a path, see `calib.dynamics.path_dynamics.PathDynamics`; arrays are (N, n)."""
+    """Interface of a robot's dynamics along a path, implemented by `calib.dynamics.path_dynamics.PathDynamics`.
+
+    Arrays are (N, n).
+    """
 
     def along(
         self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
@@ -20,7 +23,7 @@ class Law(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class TimingLimits:
-    """Limits on absolute values (n,), each above zero; infinite for no limit.
+    """Limits (n,) on the absolute values of velocity, acceleration and torque, each above zero; infinite for no limit.
 
     Attributes:
         velocity: [rad/s or m/s].

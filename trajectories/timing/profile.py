@@ -1,4 +1,4 @@
-"""Speed along a path: profiles s(t) with s̈ constant between grid points, so that x = ṡ² is linear in s there."""
+"""Speed along a path: profiles s(t) with s̈ constant between grid points, where x = ṡ² is therefore linear in s."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ TorqueLaw = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """A speed profile along a path.
+    """A speed profile along a path with the parameter s: ṡ² at grid points, linear in s between them.
 
     Attributes:
-        s: (K + 1,) grid on the path, rising from 0.
-        x: (K + 1,) ṡ² [1/s² in units of s]; zero at rest.
+        s: (K + 1,) grid of path parameters, rising from 0.
+        x: (K + 1,) ṡ² at the grid points [square of the unit of s, per s²]; zero at rest.
     """
 
     s: np.ndarray
@@ -28,13 +28,13 @@ class Profile:
 
     @property
     def u(self) -> np.ndarray:
-        """Path acceleration s̈ (K,) between grid points: Δx / (2 Δs)."""
+        """Path acceleration s̈ (K,) on each interval: Δx / (2 Δs)."""
         steps = np.diff(self.s)
         return np.diff(self.x) / (2 * steps)
 
     @property
     def times(self) -> np.ndarray:
-        """Times (K + 1,) of the grid points [s]: Δt = 2 Δs / (ṡ_k + ṡ_{k+1})."""
+        """Times (K + 1,) [s] at which the motion passes the grid points: Δt = 2 Δs / (ṡ_k + ṡ_{k+1})."""
         speed = np.sqrt(self.x)
         summed_speeds = speed[:-1] + speed[1:]
         durations = 2 * np.diff(self.s) / summed_speeds
@@ -45,11 +45,11 @@ class Profile:
         return float(self.times[-1])
 
     def slower(self, factor: float) -> Profile:
-        """Return the profile `factor` times slower."""
+        """Return the profile slowed down to `factor` times the duration."""
         return Profile(self.s, self.x / factor**2)
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return s, ṡ, s̈, each (N,), at times [s]."""
+        """Return path parameter s, speed ṡ and path acceleration s̈, each (N,), at times (N,) [s]."""
         starts = self.times
         interval = np.searchsorted(starts, times, side="right") - 1
         k = np.clip(interval, 0, len(self.s) - 2)
@@ -69,7 +69,8 @@ class Sampled:
     Attributes:
         s: (N,) path parameters of the samples.
         weights: (N,) duration that each sample represents [s]; they sum to the duration of the motion.
-        q, v, a, tau: (N, n) joint values, velocities, accelerations, torques; tau is None without a torque law.
+        q, v, a, tau: (N, n) joint values [rad or m], velocities, accelerations, torques [N m or N]; tau is None where
+            no torque law is given.
     """
 
     s: np.ndarray
@@ -81,9 +82,16 @@ class Sampled:
 
 
 def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: int = 8) -> Sampled:
-    """Return the motion of a profile, sampled on each interval with both ends: s̈ and friction jump between intervals.
+    """Return the motion along a path with a given speed profile, sampled densely on each interval of the profile.
 
-    At rest friction takes the direction of the motion that begins or ends there, which gives the larger torque.
+    Both ends of an interval are samples, since s̈ and friction jump between intervals. At rest, friction has the
+    direction of the motion that begins or ends at this instant, which gives the larger torque.
+
+    Args:
+        path: the path.
+        profile: the speed profile along it.
+        torque: (q, v, a) to torques, each (N, n); None computes no torques.
+        per_interval: number of samples on each interval.
     """
     share = np.linspace(1e-6, 1 - 1e-6, per_interval)
     steps = np.diff(profile.s)[:, None]
@@ -105,7 +113,14 @@ def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: 
 
 
 def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return joint values, velocities and accelerations q = Φ, v = Φ' ṡ, a = Φ' s̈ + Φ'' ṡ², each (N, n)."""
+    """Return joint values, velocities and accelerations q = Φ, v = Φ' ṡ, a = Φ' s̈ + Φ'' ṡ², each (N, n).
+
+    Args:
+        path: the path Φ(s), with Φ' = dΦ/ds.
+        s: (N,) path parameters s.
+        speed: (N,) ṡ [unit of s per second].
+        u: (N,) s̈ [unit of s per second²].
+    """
     slope = path(s, 1)
     velocity = slope * speed[:, None]
     acceleration = slope * u[:, None] + path(s, 2) * (speed**2)[:, None]
@@ -113,9 +128,16 @@ def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[
 
 
 def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = None) -> Setpoints:
-    """Return the motion as setpoints at a controller's rate [Hz]; its duration must be a whole number of samples.
+    """Return the motion along a path as setpoints at a controller's rate.
 
-    Torques at rest are those just after the start and just before the end.
+    The duration must be a whole number of samples. Torques at rest are those just after the start and just before the
+    end.
+
+    Args:
+        path: the path.
+        profile: the speed profile along it.
+        rate: sampling rate of the controller [Hz].
+        torque: (q, v, a) to torques, each (N, n); None leaves the torques of the setpoints None.
     """
     count = round(profile.duration * rate)
     times = np.arange(count + 1) / rate

@@ -1,7 +1,8 @@
-"""The convex step of timing: rows a u + b x + c within limits on every interval, and the fastest profile within them.
+"""The convex step of timing: the fastest speed profile within limits on rows a u + b x + c, with u = s̈ and x = ṡ².
 
-Controllable speeds come from toppra (Pham & Pham 2018), imported at the first call. The forward pass is our own: with x
-given, the largest u is the smallest of a few quotients, whereas toppra's forward pass loses 1e-4 of x at every step.
+Controllable speeds are computed by toppra (Pham & Pham 2018), imported at the first call. The forward pass is our own:
+with x given, the largest u is the smallest of a few quotients, whereas the forward pass of toppra loses 1e-4 of x at
+every step.
 """
 
 from __future__ import annotations
@@ -21,10 +22,13 @@ from ..timing.profile import Profile
 
 @dataclass(frozen=True, eq=False)
 class _Bounded:
-    """Rows |a u + b x + c| ≤ 1 at both ends of each of K intervals, and 0 ≤ x ≤ top.
+    """Limits as inequalities |a u + b x + c| ≤ 1 and 0 ≤ x ≤ top, with u = s̈ and x = ṡ² along a path parameter s.
+
+    The path is divided into K intervals; the inequalities apply at both ends of each.
 
     Attributes:
-        a, b, c: (2, K, m) at the left and the right end; x at the right end is x + 2 Δ u.
+        a, b, c: (2, K, m) coefficients of m inequalities at the left and the right end. In those of the right end, x is
+            the value there, x_left + 2 Δ u with the length Δ of the interval.
         top: (K + 1,) largest x at the grid points.
     """
 
@@ -36,12 +40,12 @@ class _Bounded:
 
 @dataclass(frozen=True, eq=False)
 class ConstraintRows:
-    """Geometry, dynamics and limits on a grid, which do not change between the iterations.
+    """Geometry, dynamics and limits on a grid along a path q = Φ(s), which do not change between the iterations.
 
     Attributes:
-        s: (K + 1,) the grid.
-        q, slope, curvature: (2, K, n) Φ, Φ', Φ'' at both ends of the intervals.
-        A, B, G: (2, K, n) torque by s̈, torque by ṡ², and gravity torque at both ends; zero without dynamics.
+        s: (K + 1,) the grid of path parameters.
+        q, slope, curvature: (2, K, n) Φ and its derivatives Φ', Φ'' by s, at both ends of the intervals.
+        A, B, G: (2, K, n) torque per s̈, torque per ṡ², and gravity torque at both ends; zero without dynamics.
         limits: limits of velocity, acceleration and torque.
     """
 
@@ -72,12 +76,16 @@ class ConstraintRows:
         return cls(s, q, slope, curvature, A, B, G, limits)
 
     def speed(self, fastest_joint: float) -> float:
-        """Return the x = ṡ² up to which no joint exceeds the speed `fastest_joint` [rad/s or m/s] anywhere."""
+        """Return the largest x = ṡ² at which no joint exceeds the speed `fastest_joint` [rad/s or m/s]."""
         steepest = np.abs(self.slope).max()
         return (fastest_joint / steepest) ** 2
 
     def top(self, tight: np.ndarray) -> np.ndarray:
-        """Return the largest x (K + 1,) that the velocity limits allow: min_j (v_max / Φ')²."""
+        """Return the largest x = ṡ² (K + 1,) that the velocity limits allow at the grid points, min_j (v_max / Φ')².
+
+        Args:
+            tight: share of each limit that may be used, for each interval and joint (K, n).
+        """
         with np.errstate(divide="ignore"):
             max_speeds = self.limits.velocity * tight / np.abs(self.slope)
             ends = (max_speeds**2).min(axis=2)
@@ -87,11 +95,11 @@ class ConstraintRows:
         return np.minimum(np.minimum(by_left, by_right), self.speed(max_speed))
 
     def bounded(self, friction: tuple[np.ndarray, np.ndarray], tight: Mapping[str, np.ndarray]) -> _Bounded:
-        """Return the rows divided by the limits.
+        """Return the limits of acceleration and torque as inequalities in u = s̈ and x = ṡ², and the largest x.
 
         Args:
             friction: slope and value (2, K, n) of friction as a linear function of x.
-            tight: kind of limit to the share of it (K, n) that may be used on each interval.
+            tight: for each kind of limit, the share (K, n) of the limit that may be used on each interval.
         """
         pushing = np.isfinite(self.limits.torque)
         turning = np.isfinite(self.limits.acceleration)
@@ -110,13 +118,13 @@ class ConstraintRows:
     def friction(
         self, law: Law | None, x: np.ndarray | None, before: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return friction linearised in x: slope and value at x = 0, each (2, K, n); zeros without dynamics.
+        """Return friction torque linearised in x = ṡ²: slope and value at x = 0, each (2, K, n).
 
         Args:
-            law: the robot's dynamics; None: none.
-            x: (K + 1,) the profile of the last round; None: friction at a creeping speed.
-            before: the profile of the round before the last. Where both profiles agree, the line is the tangent at x;
-                elsewhere, and for None, it is the secant from creeping to x, which at rest never exceeds friction.
+            law: the robot's dynamics; None for no dynamics, which returns zeros.
+            x: (K + 1,) the profile x of the last round; None takes friction at a very low (creeping) speed.
+            before: the profile x of the round before the last. Where both profiles agree, the tangent at x is used;
+                elsewhere, and for None, the secant from creeping speed to x, which at rest never exceeds friction.
         """
         if law is None:
             return np.zeros_like(self.q), np.zeros_like(self.q)
@@ -155,16 +163,21 @@ class ConstraintRows:
 
 
 def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
-    """Return the fastest speed profile from rest to rest within the rows.
+    """Return the fastest speed profile from rest to rest that satisfies the inequalities |a u + b x + c| ≤ 1.
+
+    Args:
+        rows: the inequalities, with u = s̈ and x = ṡ².
+        s: (K + 1,) grid of path parameters.
 
     Raises:
-        NothingFeasible: from some grid point on no speed keeps the limits, or the motion stops on the way.
+        NothingFeasible: at some grid point no speed satisfies the limits, or the motion comes to rest before the end.
     """
     controllable = _controllable(rows, s)
     if not np.isfinite(controllable).all():
         k = int(np.flatnonzero(~np.isfinite(controllable)).max())
         raise NothingFeasible(
-            f"no motion: no speed at {s[k] / s[-1]:.0%} of the path allows a stop at its end within the limits",
+            f"no motion: no speed at {s[k] / s[-1]:.0%} of the path allows a stop at its end within the limits: use "
+            "other waypoints or larger limits",
             "torque",
             float("nan"),
             "N m",
@@ -178,7 +191,8 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
     if (x[1:-1] <= 0).any():
         k = int(np.argmax(x[1:-1] <= 0)) + 1
         raise NothingFeasible(
-            f"no motion: it comes to a stop at {s[k] / s[-1]:.0%} of the path, within these limits",
+            f"no motion: it comes to a stop at {s[k] / s[-1]:.0%} of the path, within these limits: use other "
+            "waypoints or larger limits",
             "torque",
             float("nan"),
             "N m",
@@ -187,7 +201,14 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
 
 
 def _largest(rows: _Bounded, k: int, x: float, step: float) -> float:
-    """Return the largest path acceleration u on interval k, which begins at x = ṡ² and is `step` long."""
+    """Return the largest path acceleration u on interval k (from 0), which begins with x = ṡ² and is `step` long.
+
+    Args:
+        rows: limits as inequalities |a u + b x + c| ≤ 1, with u = s̈.
+        k: index of the interval.
+        x: ṡ² at its beginning.
+        step: its length, in the unit of the path parameter s.
+    """
     right = rows.a[1, k] + 2 * step * rows.b[1, k]
     a = np.concatenate([rows.a[0, k], right])
     left_constant = rows.b[0, k] * x + rows.c[0, k]
@@ -201,10 +222,14 @@ def _largest(rows: _Bounded, k: int, x: float, step: float) -> float:
 
 
 def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
-    """Return the largest x (K + 1,) at each grid point from which the path's end can be reached at rest; NaN if there
-    is none.
+    """Return, for each grid point, the largest x = ṡ² (K + 1,) from which the path's end can be reached at rest.
 
-    u and x are passed to toppra in units of a typical x; otherwise its linear programs fail where speeds are large.
+    NaN where there is no such x. u = s̈ and x are passed to toppra in units of a typical x; otherwise its linear
+    programs fail where speeds are large.
+
+    Args:
+        rows: limits as inequalities |a u + b x + c| ≤ 1.
+        s: (K + 1,) grid of path parameters.
     """
     try:
         from toppra.algorithm import TOPPRA
@@ -231,7 +256,7 @@ def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
 
 
 class _Interval:
-    """The interval of path parameters in the form of a path that toppra accepts."""
+    """The interval of path parameters, in the form of a path that toppra accepts."""
 
     dof = 1
 
@@ -241,7 +266,7 @@ class _Interval:
 
 
 def _constraint(rows: _Bounded, s: np.ndarray) -> Any:
-    """Return the rows as toppra's canonical constraint."""
+    """Return the inequalities `rows`, |a u + b x + c| ≤ 1, on the grid s (K + 1,) in the form that toppra uses."""
     from toppra.constraint import LinearConstraint
 
     steps = np.diff(s)[:, None]

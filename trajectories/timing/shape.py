@@ -1,11 +1,10 @@
 """Outer optimisation: path parameters φ for a shorter duration, with fixed waypoints.
 
-A spline through m waypoints can still change by the spacing of its knots (m - 2 ratios), and by a via point in the
-middle
-of each interval that may leave the first spline by `stray` (n each). The duration is continuous in φ but not smooth,
-since the active limit changes; the search uses linear models over a simplex (Powell 1994, nlopt's COBYLA: of three
-methods tried it needed the fewest evaluations for its result). Where velocity limits are active, a few percent can be
-gained.
+Two kinds of parameters change a spline through m waypoints: the spacing of its knots (m - 2 ratios), and a via point in
+the middle of each interval, which may differ from the first spline by up to `stray` (n parameters each). The duration
+is continuous in φ but not smooth, since the active limit changes. The search therefore uses linear models over a
+simplex (Powell 1994, nlopt's COBYLA; of three methods tried it needed the fewest evaluations). Where velocity limits
+are active, only a few percent can be gained.
 """
 
 from collections.abc import Callable
@@ -28,10 +27,11 @@ class Shaped:
 
     Attributes:
         path: the fastest path.
-        phi: (p,) its parameters, each from -1 to 1.
-        before, after: durations [s] at φ = 0 and of `path`.
+        phi: (p,) path parameters φ of `path`, each from -1 to 1.
+        before, after: durations [s] of the path at φ = 0 (the spline through the waypoints without via points), and of
+            `path`.
         evaluations: number of paths timed.
-        refused: number of these paths without a timing within the limits.
+        refused: number of the timed paths that have no timing within the limits.
     """
 
     path: Path
@@ -43,7 +43,12 @@ class Shaped:
 
 
 def count(waypoints: np.ndarray, stray: float) -> int:
-    """Return the number of path parameters φ."""
+    """Return the number of path parameters φ that change a path: ratios of knot intervals, and offsets of via points.
+
+    Args:
+        waypoints: (m, n) joint values.
+        stray: largest offset of a via point [rad or m]; with 0, via points are not counted.
+    """
     m, n = np.shape(waypoints)
     parameters = m - 2
     if stray > 0:
@@ -52,7 +57,13 @@ def count(waypoints: np.ndarray, stray: float) -> int:
 
 
 def build(waypoints: np.ndarray, phi: np.ndarray, stray: float = 0.0) -> Path:
-    """Return path of parameters φ: log ratios of knot intervals, then the via points' offsets as shares of `stray`."""
+    """Return the path through the waypoints for parameters φ, each from -1 to 1.
+
+    Args:
+        waypoints: (m, n) joint values [rad or m].
+        phi: φ (p,), log ratios of knot intervals, then the offsets of the via points as shares of `stray`.
+        stray: largest offset of a via point from the first spline in each joint [rad or m]; 0 for no via points.
+    """
     points = checked(waypoints)
     m, n = points.shape
     ratios = np.asarray(phi)[: m - 2]
@@ -80,10 +91,12 @@ def shorten(
 
     Args:
         waypoints: (m, n) joint values [rad or m].
-        timer: duration [s] of a path; raises `NothingFeasible` or `BadInput` where it has none.
+        timer: function that returns the duration [s] of a path, and raises `NothingFeasible` or `BadInput` where no
+            timing exists.
         evaluations: largest number of paths timed.
-        stray: how far a via point may leave the first spline [rad or m]; 0 for no via points.
-        progress: called with the number of evaluations and the best duration; Ctrl-C keeps the best until then.
+        stray: largest offset of a via point from the spline of φ = 0, in each joint [rad or m]; 0 for no via points.
+        progress: called with the number of evaluations and the best duration [s]; None for no report. Ctrl-C ends the
+            search with the best path so far.
 
     Raises:
         BadInput: negative `stray`, or no evaluations.

@@ -2,17 +2,16 @@
 
     |Φ' ṡ| ≤ v_max,    |Φ' s̈ + Φ'' ṡ²| ≤ a_max,    |A s̈ + B ṡ² + Γ + f(Φ, Φ' ṡ)| ≤ τ_max
 
-With u = s̈, x = ṡ² all terms are affine but friction f (Bobrow, Dubowsky, Gibson 1985). Friction is replaced by a line
-in
-x that meets it at the profile x_k of the round before: the secant from rest where rounds differ much (feasible from any
-x_k, and for viscous friction it halves the error of log x), else the tangent (Newton's step). A plain fixed point, with
-f constant in a round, diverges where friction itself limits the speed. Each round is solved by reachability (Pham &
-Pham
-2018, toppra): backwards the controllable speeds, forwards the largest acceleration. Rows of an interval are taken at
-both of its ends (interpolation scheme), with friction's direction inside the interval.
+With u = s̈, x = ṡ² all terms except friction f are affine (Bobrow, Dubowsky, Gibson 1985). In each round, friction is
+replaced by a linear function of x that equals f at the profile x_k of the round before. Where the last rounds differ
+much, this is the secant from rest, which is feasible from any x_k and, for viscous friction, halves the error of log x.
+Otherwise it is the tangent (Newton's step). A plain fixed-point iteration, with f constant in a round, diverges where
+friction itself limits the speed. Each round is solved by reachability analysis (Pham & Pham 2018, toppra): controllable
+speeds backwards from the end, then the largest acceleration forwards. The constraints of an interval are imposed at
+both of its ends (interpolation scheme), with the direction of friction inside the interval.
 
-The result is checked by the full inverse dynamics between the grid points; where it crosses a limit, that limit is
-tightened on that interval by the excess and the path is timed again, until no limit is crossed.
+The result is checked by the full inverse dynamics between the grid points. Where it exceeds a limit, that limit is
+tightened on that interval by the excess and the path is timed again, until no limit is exceeded.
 """
 
 from dataclasses import dataclass, field, replace
@@ -25,13 +24,13 @@ from ..timing.path_limits import Law, TimingLimits
 from ..timing.profile import Profile, Sampled, dense, moved
 from ..timing.reachability import ConstraintRows, fastest
 
-# intervals: in all, between two knots where these are many, and at most
+# number of grid intervals: smallest in all, for each interval between two knots, and largest in all
 GRID = 400
 PER_SPAN = 200
 MAX_INTERVALS = 2400
-# of a limit: nearer than that it is active
+# a limit is active where the motion is nearer to it than this share of it
 ACTIVE = 0.01
-# rounds of reachability, and mean relative change of x at which friction counts as settled
+# largest number of rounds of reachability, and mean relative change of x below which friction has converged
 MAX_ROUNDS = 25
 MAX_CHANGE = 1e-4
 
@@ -44,9 +43,9 @@ class Timing:
         path: the path.
         profile: the speed along it.
         limits: the limits of velocity, acceleration and torque.
-        sampled: the motion, between the grid points too, with full inverse dynamics.
+        sampled: dense samples of the motion, also between the grid points, with torques by the full inverse dynamics.
         iterations: number of rounds of reachability.
-        tightened: largest share by which a limit was narrowed to keep it between the grid points.
+        tightened: largest share by which a limit was tightened so that the motion satisfies it between the grid points.
         history: durations of the rounds [s].
     """
 
@@ -64,17 +63,17 @@ class Timing:
 
     @property
     def used(self) -> dict[str, np.ndarray]:
-        """Share of each limit in use, (N, n) per kind of limit; 1 is the limit."""
+        """Share of each limit in use, (N, n) for each kind of limit; 1 is the limit."""
         return _shares(self.sampled, self.limits)
 
     @property
     def margins(self) -> dict[str, np.ndarray]:
-        """Margin (n,) to each kind of limit, as a share of the limit; 1 for a joint without that limit."""
+        """Smallest margin (n,) to each kind of limit, as a share of the limit; 1 for a joint without that limit."""
         return {name: 1.0 - values.max(axis=0) for name, values in self.used.items()}
 
     @property
     def active_share(self) -> float:
-        """Share of the time in which at least one limit is reached within `ACTIVE`."""
+        """Share of the time in which at least one limit is reached to within `ACTIVE`."""
         largest_by_kind = [values.max(axis=1) for values in self.used.values()]
         largest = np.max(largest_by_kind, axis=0)
         weights = self.sampled.weights
@@ -90,15 +89,15 @@ def time_optimal(
     Args:
         path: the path.
         limits: limits of velocity, acceleration and torque.
-        law: the robot's dynamics; None: kinematic limits alone.
-        rate: sampling rate of a controller [Hz], to whose samples the duration is rounded up; None: no rounding.
-        grid: number of intervals on the path; None: see `_grid_points`.
+        law: the robot's dynamics; None takes only the kinematic limits.
+        rate: sampling rate of a controller [Hz]; the duration is rounded up to a whole number of samples. None: no
+            rounding.
+        grid: number of intervals on the path; None chooses the number by the path's knots.
 
     Raises:
         BadInput: torque limits without dynamics.
-        NothingFeasible: the torque limits do not hold the robot still or moving slowly (which joint, where, by how
-            much),
-            or the timing does not converge.
+        NothingFeasible: the torque limits do not suffice to hold the robot or to move it slowly (the message gives
+            joint, position on the path and excess), or the timing does not converge.
     """
     if law is None and np.isfinite(limits.torque).any():
         raise BadInput("torque limits need the robot's dynamics; leave them infinite, or give a model")
@@ -139,7 +138,14 @@ def time_optimal(
 
 
 def _timed(path: Path, limits: TimingLimits, law: Law | None, profile: Profile) -> Timing:
-    """Return the timing of a profile, with its samples."""
+    """Return the timing of a path with a given speed profile, with its dense samples.
+
+    Args:
+        path: the path.
+        limits: the limits of velocity, acceleration and torque, to be recorded.
+        law: the robot's dynamics; None computes no torques.
+        profile: the speed profile.
+    """
     torque = None
     if law is not None:
         torque = law.torque
@@ -147,14 +153,20 @@ def _timed(path: Path, limits: TimingLimits, law: Law | None, profile: Profile) 
 
 
 def _on_samples(profile: Profile, rate: float | None) -> Profile:
-    """Return the profile slowed down to a whole number of samples at a rate [Hz]; for None the profile itself."""
+    """Return the profile slowed down to a whole number of samples at a rate [Hz]; unchanged where `rate` is None."""
     if rate is None:
         return profile
     return profile.slower(_whole(profile.duration, rate))
 
 
 def _slowed_down(timing: Timing, law: Law | None, rate: float | None) -> Timing | None:
-    """Return the timing slowed down by up to 1 % to keep the limits; None if that does not suffice."""
+    """Return the timing slowed down by up to 1 % to satisfy the limits; None if 1 % does not suffice.
+
+    Args:
+        timing: a timing that exceeds its limits slightly.
+        law: the robot's dynamics; None for none.
+        rate: sampling rate of a controller [Hz], to whose samples the duration is rounded up; None does not round.
+    """
     for factor in 1 + 1e-5 * 2.0 ** np.arange(11):
         profile = _on_samples(timing.profile.slower(factor), rate)
         slower = _timed(timing.path, timing.limits, law, profile)
@@ -164,15 +176,22 @@ def _slowed_down(timing: Timing, law: Law | None, rate: float | None) -> Timing 
 
 
 def _per_interval(values: np.ndarray, count: int) -> np.ndarray:
-    """Return the maxima (count, n) per interval of values (N, n) sampled by `dense`."""
+    """Return the maximum of `values` (N, n) on each of `count` intervals (count, n), for the samples of `dense`."""
     return values.reshape(count, -1, values.shape[1]).max(axis=1)
 
 
 def _round(
     rows: ConstraintRows, law: Law | None, x: np.ndarray | None, before: np.ndarray | None, tight: dict
 ) -> Profile:
-    """Return the fastest profile with friction linearised at the last rounds; by secants if tangents make it
-    infeasible.
+    """Return the fastest profile with friction linearised at the profiles of the last two rounds.
+
+    Tangents to friction are replaced by secants where tangents make the problem infeasible.
+
+    Args:
+        rows: geometry, dynamics and limits on the grid.
+        law: the robot's dynamics; None for no dynamics.
+        x, before: (K + 1,) ṡ² of the last profile and of the profile before it; None in the first rounds.
+        tight: for each kind of limit, the share (K, n) of the limit that may be used on each interval.
     """
     try:
         bounded = rows.bounded(rows.friction(law, x, before), tight)
@@ -183,7 +202,11 @@ def _round(
 
 
 def _shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
-    """Return the shares of the limits in use, (N, n) per kind of limit; a kind that no joint has is left out."""
+    """Return the shares of the limits in use, (N, n) for each kind of limit that some joint has.
+
+    Args:
+        sampled: dense samples of a motion.
+    """
     kinds = (
         ("velocity", sampled.v, limits.velocity),
         ("acceleration", sampled.a, limits.acceleration),
@@ -199,7 +222,12 @@ def _shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
 def _check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) -> None:
     """Raise NothingFeasible where the torque limits do not suffice to hold the robot on the path or to move it slowly.
 
-    A motion that swings through such a pose can exist; it could not be stopped there, nor rehearsed (our choice).
+    A fast motion could still pass such a pose. It could neither be stopped there nor be rehearsed at low speed, so it
+    is refused (our choice).
+
+    Args:
+        law: the robot's dynamics.
+        s: (N,) path parameters to check.
     """
     slow_speed = np.full(len(s), 1e-9)
     no_acceleration = np.zeros(len(s))
@@ -222,10 +250,11 @@ def _check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) ->
 
 
 def _grid_points(path: Path, count: int | None = None) -> np.ndarray:
-    """Return a grid on the path: even in time near start and end, including its knots and reversal points.
+    """Return grid points on the path, evenly spaced in time near start and end, with its knots and reversal points.
 
     Args:
-        count: intervals; None: `GRID`, or `PER_SPAN` between knots where these are many.
+        path: the path.
+        count: number of intervals; None takes `GRID`, or `PER_SPAN` intervals per knot span if this is more.
     """
     if not count:
         intervals = PER_SPAN * (len(path.knots) - 1)
@@ -250,7 +279,11 @@ def _whole(duration: float, rate: float) -> float:
 
 
 def _not_settled(excess: dict[str, np.ndarray]) -> NothingFeasible:
-    """Return the error that names the limit exceeded most."""
+    """Return the error that the timing did not converge, which names the limit exceeded most.
+
+    Args:
+        excess: for each kind of limit, the excess (K, n) as a share of the limit.
+    """
     name = max(excess, key=lambda key: float(excess[key].max()))
     worst = float(excess[name].max())
     by_joint = excess[name].max(axis=0)

@@ -41,14 +41,14 @@ def demo(
         payload: label=kg of a payload, with which the motions are played again; as of calib new; repeatable
     """
     from calib.apps.cell_demo import demo as demonstration
-    from calib.apps.cell_demo.summary import paths, reasons
+    from calib.apps.cell_demo.step_lines import paths, reasons
 
     with reporting() as (say, progress):
         if bring is not None:
             demonstration.simulate_next(bring, say)
             return
         if hard and robot:
-            raise UsageError(f"--robot {robot}: --hard names a robot, too; leave one out")
+            raise UsageError(f"--robot {robot} and --hard both name a robot: leave one out")
         if hard:
             robot = demonstration.HARD
         result = demonstration.run(

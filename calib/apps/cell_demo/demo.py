@@ -1,10 +1,10 @@
-"""The demonstration: a session on a simulated cell, then a comparison with the hidden truth."""
+"""The demonstration: a calibration session on a simulated cell, then a comparison with the hidden true parameters."""
 
 import resource
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.apps.cell_demo.summary import Telling, row
+from calib.apps.cell_demo.step_lines import Telling, row
 from calib.errors import SessionError, UsageError, command_line
 from calib.folders import read_estimate
 from calib.records import read_lines
 from calib.toolkit.chains import load, read_calibrated, robot_names
 from calib.toolkit.installations import read_installation
-from calib.toolkit.pose_data import IMAGES
+from calib.toolkit.pose_data import IMAGES, Positions
 from calib.toolkit.sessions import (
     DONE,
     KEPT,
@@ -46,8 +46,9 @@ from calib.toolkit.simulations import (
     Cell,
     MovingArm,
     carrying,
+    drift_path,
     limits_of,
-    measure,
+    measure_frames,
     moving_arm,
     planned_poses,
     play,
@@ -70,6 +71,8 @@ from calib.toolkit.torque_models import read_dynamics
 FIT, VALIDATION, REPEATED = 40, 20, 3
 # how far the simulated instrument wanders over a series [m]
 DRIFT = 10e-6
+# pose of the simulated LEDs in the arm's base, where there are any: beside the foot (our choice)
+BASE_LEDS = np.array([[1.0, 0.0, 0.0, 0.25], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.1], [0.0, 0.0, 0.0, 1.0]])
 # by default; where effects that no model holds are as large as those that some do
 ROBOT, HARD = "tx40", "lwr4plus"
 # little effort, for time
@@ -90,11 +93,12 @@ class DemoResult:
 
     Attributes:
         session: the session.
-        verdict: verdict of the session; empty where it stopped for an engineer.
+        verdict: verdict of the session; empty where the demonstration stopped for an engineer's work.
         seconds: wall-clock time [s].
-        asks: instructions to the engineer where it stopped; else empty.
-        nominal, calibrated: rms position errors of both arms against the hidden truth [mm]; NaN where it stopped.
-        memory: largest resident set [MB].
+        asks: instructions to the engineer where the demonstration stopped; else empty.
+        nominal, calibrated: rms position errors of the nominal and of the calibrated arm against the hidden truth [mm];
+            NaN where the demonstration stopped.
+        memory: peak memory use of the process (largest resident set) [MB].
     """
 
     session: Session
@@ -120,17 +124,17 @@ def run(
     payloads: Sequence[str] = (),
     verbose: bool = False,
 ) -> DemoResult:
-    """Return the result of a session on a simulated robot, compared with its hidden truth.
+    """Run a session on a simulated robot, compare the calibrated robot with the hidden truth, and return the result.
 
     Args:
         folder: the session's folder, to be created.
         robot: name of a robot of the library.
         seed: seed of the robot's errors, the noise, the pose selection and the motions.
-        say, progress: print a permanent line, and show a transient status.
-        dynamics: whether to identify dynamics too, where the library knows the robot's masses.
+        say, progress: functions that print a permanent line, and show a transient status.
+        dynamics: whether dynamics are identified too, where the library has the robot's masses.
         guided: stop where an engineer has to act; `simulate_next` then simulates that step.
         plots: whether figures are drawn.
-        instrument: ``cmm``, or ``camera``, which takes rendered images.
+        instrument: ``cmm``, or ``camera``, for which images of a board are rendered.
         payloads: bodies at the flange, with which the motions are played again, as of ``calib new --payload``.
         verbose: print the session's messages too.
 
@@ -145,7 +149,7 @@ def run(
     cell = virtual_cell(robot, seed)
     if dynamics and cell.nominal.inertias is None:
         supported = ", ".join(name for name in robot_names() if load(name).inertias is not None)
-        say(f"geometry only: masses are known of {supported}")
+        say(f"geometry only: masses are known for {supported} only")
         dynamics = False
     motion: dict[str, Any] = {}
     if dynamics:
@@ -189,14 +193,27 @@ def run(
 
 
 def _stopped(session: Session, waiting: StepState) -> tuple[str, ...]:
-    """Return the engineer's instructions, and the command that simulates them."""
+    """Return the engineer's instructions for the step `waiting`, and the commands that simulate it and continue.
+
+    Args:
+        session: the session.
+        waiting: the step that waits for the engineer.
+    """
     folder = session.folder
     simulate, go_on = command_line("demo", "--bring", folder), command_line("next", folder)
     return *asks(session, waiting), f"(or simulate this step: {simulate}; then: {go_on})"
 
 
 def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
-    """Return the rms tool errors [mm] of nominal and calibrated arm against the truth; print and write all errors."""
+    """Return the rms tool errors [mm] of the nominal and of the calibrated arm against the hidden truth.
+
+    All errors are printed, and written to ``truth.txt`` and ``truth.json`` in the session's folder.
+
+    Args:
+        session: the calibrated session.
+        cell: the simulated cell with its true parameters.
+        say: function that prints a line.
+    """
     cell_fit = read_installation(session.fit.path)
     urdf = read_calibrated(session.fit.path).chain
     before, after, bare = true_position_errors(cell, cell_fit, urdf)
@@ -230,10 +247,10 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
 
 
 def simulate_next(folder: Path, say: Say) -> None:
-    """Simulate the files that the session in `folder` waits for; compare a finished session with the truth.
+    """Simulate the files that the session in `folder` waits for; compare a finished session with the hidden truth.
 
     Raises:
-        UsageError: the session waits for no files, or its robot is not one of the library.
+        UsageError: the session waits for no files, or its robot is not in the library.
     """
     session = open_session(folder)
     robot = session.settings.robot.given
@@ -266,8 +283,10 @@ def _step_to_simulate(session: Session) -> str:
 
 
 def _cells_of(session: Session) -> tuple[Cell, CameraCell | None]:
-    """Return the virtual cell of a session, and the same cell with its camera (None for other instruments)."""
+    """Return the session's virtual cell, and this cell with a camera; the second is None for other instruments."""
     cell = virtual_cell(session.settings.robot.given, session.settings.seed)
+    if session.settings.instrument.reference:
+        cell = replace(cell, instrument=replace(cell.instrument, base_frame=BASE_LEDS))
     if session.settings.instrument.measures != IMAGES:
         return cell, None
     camera_cell = seen_by_camera(cell)
@@ -275,7 +294,13 @@ def _cells_of(session: Session) -> tuple[Cell, CameraCell | None]:
 
 
 def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda text: None) -> None:
-    """Simulate the files that a step waits for."""
+    """Simulate the files that a step of a session waits for, and write them into the session's folder.
+
+    Args:
+        session: the session.
+        step: name of the step.
+        say, progress: functions that print a permanent line, and show a transient status.
+    """
     seed = session.settings.seed
     cell, camera_cell = _cells_of(session)
     if step in ("measure", "validate") and camera_cell is not None:
@@ -296,25 +321,49 @@ def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda tex
 
 
 def arm_of(session: Session, cell: Cell) -> MovingArm:
-    """Return the simulated arm of a session, with its dynamics."""
+    """Return the session's simulated arm with its true dynamics, built on the simulated cell `cell`."""
     return moving_arm(cell, session.settings.robot.given, session.settings.seed)
 
 
 def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
-    """Simulate measurements of the planned poses, with three repeated at the end and drift of the CMM."""
+    """Simulate measurements of the planned poses with a drifting CMM, and write them into the session's folder.
+
+    The first three poses to fit are measured again at the end, so that the drift can be found.
+
+    Args:
+        session: the session.
+        cell: the simulated cell with its true parameters.
+        seed: seed of the noise and of the drift.
+    """
     _mark(session, cell.note)
     for number, name, q in planned_poses(session.folder, cell.nominal):
         noise = np.random.default_rng([seed, number])
-        measured = measure(cell, q, noise, warm=number * FIT)
-        write_measured(wandering(measured, DRIFT, seed), session.path(f"3-measured/{name}.csv"))
+        path = session.path(f"3-measured/{name}.csv")
+        _write_series(*measure_frames(cell, q, noise, warm=number * FIT), path, seed)
         if name == "measured":
             noise = np.random.default_rng([seed, 7])
-            repeated = measure(cell, q[:REPEATED], noise, warm=len(q))
-            write_measured(wandering(repeated, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
+            path = session.path("3-measured/drift.csv")
+            _write_series(*measure_frames(cell, q[:REPEATED], noise, warm=len(q)), path, seed, begin=1.0)
+
+
+def _write_series(measured: Positions, bases: np.ndarray | None, path: Path, seed: int, begin: float = 0.0) -> None:
+    """Write a measured series to the file `path`, in which the instrument drifts from `begin` (0 to 1) to the end.
+
+    Args:
+        measured: poses or positions in the instrument's frame.
+        bases: (m, 4, 4) base frames, which drift alike; None without base LEDs.
+        path: path of the file.
+        seed: seed of the drift's direction.
+        begin: when the series begins.
+    """
+    if bases is not None:
+        bases = bases.copy()
+        bases[:, :3, 3] += drift_path(len(bases), DRIFT, seed, begin)
+    write_measured(wandering(measured, DRIFT, seed, begin), path, bases=bases)
 
 
 def _mark(session: Session, note: str) -> None:
-    """Mark a session's files as simulated, for its certificate."""
+    """Mark a session's files as simulated, so that its certificate says so; `note` describes the simulated errors."""
     path = session.path(MARK)
     line = SIMULATED.format(note=note)
     marks = list(read_lines(path))
@@ -324,7 +373,7 @@ def _mark(session: Session, note: str) -> None:
 
 
 def _true_payloads(session: Session) -> dict[str, Payload]:
-    """Return the session's payloads by label, completed where mass or centre of mass are not stated."""
+    """Return the session's payloads by label; an unstated mass or centre of mass is that of `PAYLOAD`."""
     payloads = {}
     for label, payload in session.settings.dynamics.payloads.items():
         mass = PAYLOAD.mass if payload.mass is None else payload.mass
@@ -333,7 +382,15 @@ def _true_payloads(session: Session) -> dict[str, Payload]:
 
 
 def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
-    """Simulate recordings of the designed motions, without and with each payload."""
+    """Simulate torque recordings of the designed motions, without and with each payload.
+
+    They are written into the session's folder.
+
+    Args:
+        session: the session.
+        arm: the simulated arm with its true dynamics.
+        seed: seed of the noise.
+    """
     payloads = _true_payloads(session)
     payload_notes = [f"; payload '{label}': {payload}" for label, payload in payloads.items()]
     _mark(session, arm.note + "".join(payload_notes))

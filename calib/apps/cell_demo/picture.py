@@ -1,11 +1,11 @@
-"""The demonstration in one picture: the cell with its errors, their histogram, and the torque of one joint."""
+"""The demonstration in one picture: the cell with its position errors, their histogram, and one joint's torque."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from calib import files
-from calib.apps.cell_demo.summary import PICTURE
+from calib.apps.cell_demo.step_lines import PICTURE
 from calib.toolkit.report_charts import (
     AFTER,
     BEFORE,
@@ -38,7 +38,7 @@ def draw(session: Session) -> None:
 
 
 def _seen_from(points: np.ndarray) -> np.ndarray:
-    """Return points (..., 3) [m] projected along the viewing direction: (..., 2), rightwards and upwards [m]."""
+    """Return points (..., 3) [m] projected onto the picture: (..., 2) [m], rightwards and upwards."""
     cos_azimuth, sin_azimuth = np.cos(AZIMUTH), np.sin(AZIMUTH)
     cos_elevation, sin_elevation = np.cos(ELEVATION), np.sin(ELEVATION)
     right = [-sin_azimuth, cos_azimuth, 0.0]
@@ -47,7 +47,10 @@ def _seen_from(points: np.ndarray) -> np.ndarray:
 
 
 def _cell(session: Session) -> Panel:
-    """Return the panel of the arm at one of its poses, with the errors at all poses before and after, enlarged."""
+    """Return the panel with a session's arm at one pose and the enlarged errors at all poses.
+
+    Errors before and after calibration are drawn.
+    """
     chain = chain_of(session)
     (measured,) = drawn(session.folder).measured
     scale = measured.arrow_scale(chain)
@@ -68,7 +71,10 @@ def _cell(session: Session) -> Panel:
 
 
 def _errors(session: Session) -> Panel:
-    """Return the histogram of the errors of nominal robot and robot.urdf at held-out poses."""
+    """Return the histogram of a session's position errors at held-out poses.
+
+    It shows the errors of the nominal robot and of ``robot.urdf``.
+    """
     sets = read_fit_report(session.validation.report).sets
     (unseen,) = (rows for rows in sets if rows.unseen)
     nominal = np.array(unseen.nominal["position"])
@@ -79,7 +85,10 @@ def _errors(session: Session) -> Panel:
 
 
 def _torque(session: Session) -> Panel:
-    """Return the panel of the largest joint torque on the held-out motion: measured, predicted, residual."""
+    """Return the panel of measured torque, predicted torque and residual on a session's held-out motion.
+
+    It shows the joint with the largest torque.
+    """
     unseen = session.identification.unseen.read()
     curves = unseen.curves[0]
     t = np.array(curves.t, dtype=float).T

@@ -17,17 +17,21 @@ from calib.toolkit.result_folders import GeometryFit, Progress, Shown, joints_of
 
 
 class JointCommands(Shown, joint_commands.Commands):
-    """Joint commands that move the real tool to nominal targets. ``print`` shows which targets are reached and the
-    errors.
+    """Joint commands that move the real tool to nominal targets.
+
+    ``print`` shows which targets are reached, and the errors.
     """
 
     tab = "q reached reason left before sigma expected beyond notes save"
 
     @checked
     def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
-        """Write the joint commands as CSV and return its path; with `partial`, also if some targets were not reached.
+        """Write the joint commands as CSV and return its path.
 
-        A file that no earlier run of calib wrote, or that was changed since, is replaced only with `overwrite`.
+        Args:
+            path: the CSV file.
+            partial: also write the commands if some targets are not reached.
+            overwrite: also replace a file that no earlier run of calib wrote, or that was edited since.
         """
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
             return joint_commands.write(self, Path(path), partial)
@@ -40,10 +44,10 @@ class JointCommands(Shown, joint_commands.Commands):
 
 
 def read_fitted(folder: str | Path) -> joint_commands.Fitted:
-    """Return the fitted arm with its instrument and tools from a fit's folder.
+    """Return the fitted arm with its instrument placements and tools from a fit's folder.
 
     Raises:
-        UsageError: the folder holds no fit, an incomplete one, or that of a parallel robot.
+        UsageError: the folder has no fit, an incomplete one, or the fit of a parallel robot.
     """
     try:
         return joint_commands.read(folder)
@@ -77,7 +81,7 @@ def compensate(
             targets give and the arm can reach.
         start: (n,) joint values [rad or m] near which targets without joints are sought; None: the middle of the
             limits.
-        tolerance: largest accepted residual at a target by the calibrated model [m], [rad].
+        tolerance: largest accepted position [m] and orientation [rad] residual at a target, by the calibrated model.
         seed: seed of the starts for targets without joints.
         progress: called with a short text as the computation proceeds; None for no report.
 

@@ -79,9 +79,7 @@ def compensate(
         program = read_program(targets, controller)
         suffix = targets.suffix
     if program is not None and targets.suffix.lower() in program.controller.saved:
-        message = (
-            "lists registers that the controller saved, no program: compensate the program, or calib program --for csv"
-        )
+        message = "contains saved registers, not a program: compensate the program, or use calib program --for csv"
         raise UsageError(f"{targets}: {message}")
     written = [(out, (suffix,))]
     files.check_results(written, [targets, *geometry_results(fitted.folder)], overwrite)
@@ -96,7 +94,9 @@ def compensate(
         "start": start_q,
     }
     if program is None and (user_frame or frames or world or flange):
-        raise UsageError("--user-frame, --frames, --world and --flange are for programs; a CSV stands in --frame")
+        raise UsageError(
+            "--user-frame, --frames, --world and --flange are for programs; the frame of a CSV is stated by --frame"
+        )
     with progress() as show:
         if program is not None:
             texts = {str(path): text_of(path) for path in frames or ()}

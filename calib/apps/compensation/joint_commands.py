@@ -48,22 +48,22 @@ from calib.toolkit.result_folders import VALIDATED, ValidationFolder, lines_of, 
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
 # Thresholds are our choice.
-# position [m] and orientation [rad] that a command may leave
+# largest errors of a command that reaches its target, of position [m] and orientation [rad]
 TOLERANCE = (1e-6, 1e-5)
-# correction of one joint [rad or m] beyond which the arm is held back: it is near a singularity
+# largest correction of one joint [rad or m]; a larger one is limited, since the arm is near a singularity
 MAX_CORRECTION = 0.2
-# singular values of the Jacobian, smallest over largest
+# ratio of smallest to largest singular value of the Jacobian below which a pose is near a singularity
 SINGULAR = 0.02
-# further from a target than this no singularity is to blame [m]
+# largest distance from a target [m] that is explained by a singularity
 ASTRAY = 0.01
-# [rad or m]
+# amount by which joint values may exceed a limit, for rounding errors [rad or m]
 LIMIT_TOLERANCE = 1e-9
-# random starts for each target without joints
+# number of random starts for each target given without joint values
 STARTS = 24
 COMPONENTS = {6: "position and orientation", 5: "position and the direction of the tool's z axis", 3: "position only"}
-# targets that a message lists
+# largest number of targets in a message
 MAX_LISTED = 20
-# of COMMANDS.csv behind the status
+# columns of COMMANDS.csv after the status
 COLUMNS = (
     "left [mm]",
     "left [mrad]",
@@ -83,15 +83,16 @@ class Fitted:
     """Calibrated arm and its cell, read from the folder of a fit.
 
     Attributes:
-        folder: the folder.
-        cell: the calibrated installation, deflections included.
-        nominal: the nominal installation, placed to fit the same measurements best; without stations if that is
+        folder: the fit's folder.
+        cell: the calibrated arm with stations and tools, deflections included.
+        nominal: the nominal arm with the stations and tools that fit the measurements best; no stations if these are
             unknown.
-        free, covariance: fitted parameters and their covariance, see `read_covariance`.
+        free, covariance: indices of the fitted parameters in the cell's parameter vector, and the covariance of small
+            steps along them.
         unseen: rms error of the calibrated arm at held-out poses [m]; None without such poses.
-        fitted: rms error at the fitted poses [m]; None where the fit does not state it.
-        fitted_q: (k, n) joint values of the fitted poses [rad or m]; None where the fit does not state them.
-        discrepancy: variance model of the error at other poses; None where the fit does not state it.
+        fitted: rms error at the fitted poses [m]; None where the fit does not contain it.
+        fitted_q: (k, n) joint values of the fitted poses [rad or m]; None where the fit does not contain them.
+        discrepancy: model of the variance of position errors at other poses; None where the fit does not contain one.
     """
 
     folder: Path
@@ -106,7 +107,7 @@ class Fitted:
 
     @property
     def placed(self) -> bool:
-        """Whether the fit contains the placement of the nominal robot."""
+        """Whether the fit contains the poses of all stations relative to the nominal robot."""
         stations = self.nominal.station_names
         return bool(len(self.nominal.stations)) and set(self.cell.station_names) <= set(stations)
 
@@ -118,22 +119,21 @@ class Commands:
     Attributes:
         targets: the targets.
         fitted: the calibrated robot in its cell.
-        q: (m, n) joint values [rad or m]; for a target that is not reached, the nearest that the arm came.
+        q: (m, n) joint values [rad or m]; where a target is not reached, those of the nearest pose that was found.
         nominal: (m, n) joint values of the nominal robot at the targets [rad or m].
         reached: (m,) True where a target is reached.
         reason: (m,) why a target is not reached; empty where it is.
-        left, before: (m, 2) position [m] and orientation [rad] errors by the calibrated model at ``q``, and at
-        ``nominal``;
-            NaN for an orientation that does not count.
+        left, before: (m, 2) position [m] and orientation [rad] errors that the calibrated model predicts at the joint
+            values ``q``, and at ``nominal``; NaN where the orientation is not constrained.
         sigma: (m, 2) σ of position [m] and orientation [rad] at ``q``, from the parameters' covariance.
-        expected: (m, 2) standard deviation of the real tool's position error at ``q`` [m], model discrepancy included,
-            and the radius within which 95 % of such errors are expected; NaN where the fit has no error model.
-        beyond: (m, n) True for joints outside the range that was measured for the fit; all False if the range is
-            unknown.
-        dof: pose components that count: 6, 5 or 3.
-        notes: remarks on the frames and on anything unusual.
-        own: (m, 2) part of ``before`` due to the arm alone, its base placed where it fits the measurements best; None
-            where ``before`` is that already, or the part is unknown.
+        expected: (m, 2) expected position error of the real tool at ``q`` [m]: its standard deviation, model
+            discrepancy included, and the radius that contains 95 % of such errors; NaN where the fit has no error
+            model.
+        beyond: (m, n) True for joint values outside the range of the fitted poses; all False if the range is unknown.
+        dof: number of constrained pose components: 6, 5 or 3.
+        notes: remarks on the frames, and warnings.
+        own: (m, 2) part of ``before`` due to the arm alone, with the nominal base placed where it fits the measurements
+            best; None where ``before`` is already computed so, or where this placement is unknown.
     """
 
     targets: Targets
@@ -156,7 +156,7 @@ def read(folder: str | Path) -> Fitted:
     """Return the calibrated arm and its cell from the folder of a fit, or of a session that contains a fit.
 
     Raises:
-        UsageError: the folder holds no fit, or an incomplete one.
+        UsageError: the folder has no fit, or an incomplete one.
     """
     result = open_result(folder, "compensate")
     fit = result.fit
@@ -186,11 +186,13 @@ def read(folder: str | Path) -> Fitted:
 
 
 def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tuple[Installation, Installation]:
-    """Return the nominal and the calibrated arm in the frame of the targets, each with a single station and tool.
+    """Return the nominal and the calibrated arm relative to the targets' frame, each with one station and one tool.
 
     Args:
-        fitted: see `read`.
-        frame, tool: see the module's docstring.
+        fitted: the calibrated arm and its cell.
+        frame: frame of the targets: ``base`` (of the calibrated robot), ``nominal``, or the name of a station.
+        tool: what is at the targets: ``flange``, a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` in the flange [m,
+            rad].
 
     Raises:
         UsageError: a frame or tool that the fit does not have.
@@ -255,20 +257,21 @@ def computed(
 ) -> Commands:
     """Return the joint commands that bring the real tool to the targets.
 
-    The nominal robot's joint values determine the configuration; from them the calibrated robot is led to the target
-    with the smallest joint motion. Where a joint would move by more than `MAX_CORRECTION`, the arm is near a
-    singularity: the joint is held back, and the remaining error is reported.
+    The nominal robot's joint values determine the configuration. From them, the joint values of the calibrated robot
+    are found with the smallest joint motion. Where a joint would move by more than `MAX_CORRECTION`, the arm is near a
+    singularity: the joint's motion is limited, and the remaining error is reported.
 
     Args:
-        fitted: see `read`.
-        targets: joints or poses.
-        frame, tool: see the module's docstring.
-        dof: pose components that count, see `calib.geometry.inverse.Goal`; None for all that the targets give and the
-            arm can reach.
-        start: (n,) joint values near which targets without joints are sought [rad or m]; None for the middle of the
-            limits.
+        fitted: the calibrated arm and its cell.
+        targets: joint values or poses.
+        frame, tool: frame of the targets, and tool at them, as for `placements`.
+        dof: number of constrained pose components: 6; 5, free to turn about the tool's z axis; 3, position only; None
+            for all that the targets
+            contain and the arm can reach.
+        start: (n,) joint values near which targets without joint values are sought [rad or m]; None for the middle of
+            the limits.
         tolerance: largest accepted residual of position [m] and orientation [rad].
-        seed: seed of further starts, where the first one fails.
+        seed: seed of further starts, where the search from the first one fails.
         progress: called with a short text as the computation proceeds; None for no report.
 
     Raises:
@@ -285,7 +288,7 @@ def computed(
     goal = Goal(calibrated_cell, count, chain.lower, chain.upper)
     if start is not None and not _inside(nominal_goal, np.asarray(start)):
         limits = f"{chain.lower.tolist()} to {chain.upper.tolist()}"
-        raise UsageError(f"start {list(start)}: outside the joints' limits {limits}")
+        raise UsageError(f"start {list(start)}: outside the joints' limits {limits} [rad, m]: state values within them")
 
     say("the nominal robot at the targets")
     poses, nominal_q = _reference(nominal_goal, targets, start, seed)
@@ -336,7 +339,15 @@ def _inside(goal: Goal, q: np.ndarray) -> np.ndarray:
 
 
 def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return joint values (m, n) near `start` that reach the poses; near a singularity they stay close to `start`."""
+    """Return joint values (m, n) near `start` (m, n) that reach the poses (m, 4, 4).
+
+    Near a singularity, the motion away from `start` is limited, and the poses may not be reached.
+
+    Args:
+        goal: the arm with tool and joint limits, and the constrained pose components.
+        poses: target poses.
+        start: joint values [rad or m], one row per pose.
+    """
     clipped = np.clip(start, goal.lower, goal.upper)
     q = nearest(goal, poses, clipped, reach(goal, poses, start))
     largest_correction = np.abs(q - start).max(axis=1, initial=0.0)
@@ -346,8 +357,15 @@ def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
 
 
 def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Finding]:
-    """Return the number of pose components (6, 5 or 3) that count, and the finding on it; `requested` None: all
-    available.
+    """Return the number of constrained pose components (6, 5 or 3), and a finding that states it.
+
+    Args:
+        targets: the targets.
+        chain: the arm.
+        requested: number that the user requested; None: all components that the targets contain and the arm can reach.
+
+    Raises:
+        UsageError: another number, or more components than the targets contain.
     """
     joints_only = targets.q is not None and targets.position is None
     oriented = targets.rotation is not None or joints_only
@@ -369,7 +387,14 @@ def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Fi
 
 
 def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the targets' poses (m, 4, 4) and the nominal robot's joint values (m, n) there [rad or m]."""
+    """Return the poses (m, 4, 4) of the targets, and the nominal robot's joint values (m, n) there [rad or m].
+
+    Args:
+        goal: the nominal arm with tool and joint limits.
+        targets: joint values or poses.
+        start: (n,) joint values near which targets without joint values are sought; None: the middle of the limits.
+        seed: seed of further starts.
+    """
     if targets.position is None:
         assert targets.q is not None
         return see(goal.cell, targets.q).poses(), np.array(targets.q)
@@ -388,8 +413,15 @@ def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed
 
 
 def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Return the nominal robot's joint values (m, n) at the poses: of several solutions, the one nearest to `start`
-    (n,).
+    """Return the nominal robot's joint values (m, n) at the poses.
+
+    Of several solutions, the nearest to `start` is returned.
+
+    Args:
+        goal: the nominal arm with tool and joint limits.
+        poses: (m, 4, 4) target poses.
+        start: (n,) joint values [rad or m] from which the search begins first.
+        starts: (k, n) further joint values from which it begins.
     """
     best = np.tile(start, (len(poses), 1))
     cost = np.full(len(poses), np.inf)
@@ -405,7 +437,10 @@ def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, starts: np.ndarray
 
 
 def _sizes(difference: np.ndarray) -> np.ndarray:
-    """Return the lengths (m, 2) of position [m] and orientation [rad] differences; NaN without orientations."""
+    """Return position [m] and orientation [rad] errors (m, 2), the norms of pose differences (m, 3 or 6).
+
+    The orientation error is NaN where the differences have positions only.
+    """
     position = np.linalg.norm(difference[:, :3], axis=1)
     turn = np.full(len(position), np.nan)
     if difference.shape[1] > 3:
@@ -414,8 +449,11 @@ def _sizes(difference: np.ndarray) -> np.ndarray:
 
 
 def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
-    """Return which errors (m, 2) are within the tolerance, (m,) bool; an orientation that does not count (NaN) always
-    is.
+    """Return whether each row of errors is within the tolerance, (m,) bool.
+
+    Args:
+        sizes: (m, 2) position [m] and orientation [rad] errors; an orientation error of NaN is within any tolerance.
+        tolerance: largest position [m] and orientation [rad] error.
     """
     position, turn = sizes.T
     return (position <= tolerance[0]) & ~(turn > tolerance[1])
@@ -430,8 +468,16 @@ def _reason(
     residual: np.ndarray,
     singular: bool,
 ) -> str:
-    """Return why a target is not reached, or which joint values of a reached one are outside the measured range; else
-    empty.
+    """Return why a target is not reached; for a reached target, the joints beyond the measured range, else empty.
+
+    Args:
+        chain: the nominal arm.
+        reached: whether the target is reached.
+        extrapolated: (n,) True for joints outside the range of the fitted poses.
+        nominal: (n,) joint values of the nominal robot at the target [rad or m].
+        q: (n,) joint command [rad or m].
+        residual: (2,) position [m] and orientation [rad] errors of the command.
+        singular: whether the command was limited near a singularity.
     """
     if reached:
         names = [name for name, out in zip(chain.joint_names, extrapolated) if out]
@@ -456,11 +502,15 @@ def _reason(
 def _predicted_sigmas(
     fitted: Fitted, q: np.ndarray, frame: str, tool: str, goal: Goal
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tool's sigmas (m, 2) due to the parameters, and its expected errors (m, 2); see `Commands`.
+    """Return the tool's sigmas (m, 2) due to the parameters' covariance, and expected errors (m, 2), as in `Commands`.
 
-    A tool that the fit did not place counts as known exactly.
+    A tool whose placement was not fitted counts as exactly known.
 
-    Where the fit did not place the tool, it counts as known.
+    Args:
+        fitted: the calibrated arm and its cell.
+        q: (m, n) joint commands [rad or m].
+        frame, tool: frame of the targets, and tool at them, as for `placements`.
+        goal: the calibrated arm with the tool, and the constrained pose components.
     """
     cell, free, covariance = fitted.cell, fitted.free, fitted.covariance
     if tool in cell.tool_names:
@@ -484,7 +534,14 @@ def _predicted_sigmas(
 
 
 def _frame_note(fitted: Fitted, frame: str) -> Finding:
-    """Return the note on the frame of the targets, with the distance to the alternative frame."""
+    """Return the finding that names the targets' frame.
+
+    It includes the distance between the frames ``base`` and ``nominal``.
+
+    Args:
+        fitted: the calibrated arm and its cell.
+        frame: ``base``, ``nominal``, or the name of a station.
+    """
     if frame not in ("base", "nominal"):
         return finding("targets-in-station", station=frame)
     shift = turn = None
@@ -497,7 +554,12 @@ def _frame_note(fitted: Fitted, frame: str) -> Finding:
 
 
 def _turn_note(fitted: Fitted, dof: int) -> list[Finding]:
-    """Return a finding if targets have orientations although no orientation was measured; else an empty list."""
+    """Return a finding if orientations are constrained although none was measured for the fit; else an empty list.
+
+    Args:
+        fitted: the calibrated arm and its cell.
+        dof: number of constrained pose components.
+    """
     table = layout(fitted.cell)
     measured = np.intersect1d(fitted.free, table.index("tool"))
     axes = {table.names[k].rsplit(".", 1)[-1] for k in measured}
@@ -507,7 +569,10 @@ def _turn_note(fitted: Fitted, dof: int) -> list[Finding]:
 
 
 def _unreached(commands: Commands) -> list[str]:
-    """Return one line for each target that is not reached, with the reason; at most `MAX_LISTED` lines."""
+    """Return one line for each target that the joint commands do not reach, with the reason.
+
+    At most `MAX_LISTED` lines are returned.
+    """
     lost = np.flatnonzero(~commands.reached)
     result = [f"target {k + 1}: {commands.reason[k]}" for k in lost[:MAX_LISTED]]
     if len(lost) > MAX_LISTED:
@@ -516,10 +581,14 @@ def _unreached(commands: Commands) -> list[str]:
 
 
 def write(commands: Commands, out: Path, partial: bool = False) -> Path:
-    """Write the commands as CSV, see `calib.data.poses.pose_lists`, and return its path.
+    """Write the commands as CSV (format of `calib.data.poses.pose_lists`) and return its path.
+
+    Args:
+        out: the CSV file.
+        partial: also write the commands if some targets are not reached.
 
     Raises:
-        UsageError: some targets are not reached without `partial`, or none is; nothing is written.
+        UsageError: no target is reached, or, without `partial`, some are not; nothing is written.
     """
     fitted, targets = commands.fitted, commands.targets
     count = len(commands.q)
@@ -528,7 +597,7 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
         head = f"{targets.file}: {lost} of {count} targets are not reached; nothing was written"
         message = "\n  ".join([head, *_unreached(commands)])
         if lost != count:
-            message += "\nwith partial (--partial), all other rows are written and these stay empty"
+            message += "\nwith partial (--partial), all other rows are written, and those above stay empty"
         raise UsageError(message)
 
     q = commands.q / (targets.factors or 1.0)
@@ -547,7 +616,13 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
 
 
 def lines(commands: Commands) -> list[str]:
-    """Return the console lines: notes on frames, targets that are not reached, errors before and after."""
+    """Return the console lines on joint commands.
+
+    They are notes on frames, targets that are not reached, and errors before and after compensation.
+
+    Args:
+        commands: the joint commands.
+    """
     reached, targets, fitted = commands.reached, commands.targets, commands.fitted
     result = [*commands.notes, *targets.notes]
     if targets.ignored:
@@ -579,7 +654,10 @@ def lines(commands: Commands) -> list[str]:
 
 
 def _expectation(commands: Commands) -> Finding:
-    """Return the finding on the expected error of the real arm at these targets, by the error model if available."""
+    """Return the finding on the position error to be expected of the real arm at the targets of joint commands.
+
+    The error is that of the error model, or, without a model, the rms error at held-out poses.
+    """
     reached, unseen = commands.reached, commands.fitted.unseen
     if not np.isnan(commands.expected).all():
         sigma, radius = commands.expected[reached].T
@@ -594,7 +672,7 @@ def _expectation(commands: Commands) -> Finding:
 
 
 def _rms_pair(errors: np.ndarray) -> str:
-    """Return the rms of errors (m, 2) in position [m] and orientation [rad] as text."""
+    """Return the rms over m targets of position [m] and orientation [rad] errors (m, 2) as text."""
     position, turn = np.sqrt(np.mean(errors**2, axis=0))
     text = f"{1e3 * position:.3g} mm"
     if not np.isnan(turn):

@@ -19,23 +19,25 @@ from calib.errors import UsageError, listing
 from calib.toolkit.chains import Controller
 from calib.transforms import invert, to_xyz_rpy
 
-# [m, or as a rotation matrix] a frame that is stated and read in the program may differ by this
+# largest difference between a frame stated by the user and the frame read from the program, in any element of their
+# matrices (positions in m)
 AGREE = 5e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Statements:
-    """What the user states about a program's frames.
+    """What the user specifies about the frames of a program.
 
     Attributes:
         tool: ``flange`` (the all-zero tool), a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` in the controller's
-            flange [m, rad]; None: as the program states.
-        user: ``x,y,z[,roll,pitch,yaw]`` of the user frame in the controller's base [m, rad]; None: as the program
-            states.
-        world: (4, 4) pose of the controller's base in the arm's base; None: by the description or the controller's
-            rule.
-        flange: (4, 4) pose of the controller's flange in the arm's tip; None: as for `world`.
-        files: name to text of further files of the controller.
+            flange [m, rad]; None: the tool of each pose is read from the program.
+        user: ``x,y,z[,roll,pitch,yaw]`` of the user frame in the controller's base [m, rad]; None: the frame is read
+            from the program.
+        world: (4, 4) pose of the controller's base in the arm's base; None: known from the robot's description, or from
+            the controller's rule.
+        flange: (4, 4) pose of the controller's flange in the arm's tip; None: known from the robot's description, or
+            from the controller's rule.
+        files: file name to text, of further files of the controller.
     """
 
     tool: str | None = None
@@ -47,14 +49,14 @@ class Statements:
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Poses of a program with one tool and one configuration.
+    """Poses of a program that share one tool and one configuration.
 
     Attributes:
-        indices: numbers of the poses among the program's targets.
-        tool: the tool as `joint_commands.placements` takes it.
-        users: (m, 4, 4) user frames in the frame of the targets.
+        indices: indices of these poses among the program's targets.
+        tool: the tool, in the form that `joint_commands.placements` accepts.
+        users: (m, 4, 4) poses of the user frames in the frame of the targets.
         poses: (m, 4, 4) tool poses in the frame of the targets [m].
-        configuration: as the program writes it; empty for none.
+        configuration: the configuration as the program writes it; empty where the program has none.
     """
 
     indices: tuple[int, ...]
@@ -66,24 +68,24 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """All poses of a program in groups, and notes on their frames."""
+    """All poses of a program in the frame of the targets, in groups, and notes on the program's frames."""
 
     groups: tuple[Group, ...]
     notes: tuple[str, ...]
 
 
 def placed(fitted: Fitted, program: Program, frame: str, statements: Statements) -> Placed:
-    """Return a program's poses in the frame of the targets, with their tools.
+    """Return a program's poses in the frame of the targets, grouped by tool and configuration.
 
     Args:
         fitted: the calibrated arm.
         program: a program with poses.
-        frame: ``base``, ``nominal``, or a station of the fit, which then is the program's user frame.
-        statements: what the user states about the frames.
+        frame: ``base``, ``nominal``, or a station of the fit; a station is then the program's user frame.
+        statements: what the user specifies about the frames.
 
     Raises:
-        UsageError: frames that are neither read nor stated (all are named), or a statement that contradicts the
-            program.
+        UsageError: frames that are neither in the program nor specified (the message lists all), or a specification
+            that contradicts the program.
     """
     arm = Description.of_fit(fitted.folder, fitted.nominal.chain)
     frames = frames_in(program, statements.files)
@@ -106,12 +108,12 @@ def placed(fitted: Fitted, program: Program, frame: str, statements: Statements)
                 tools[name] = _as_option(flange.pose @ pose)
                 notes.append(f"tool {name or 'active'}: {_in_words(pose)} in {flange}")
     elif len(tools) > 1:
-        refusals.append(f"--tool states one tool, the program has {listing(sorted(tools), 5)}: --frames FILE")
+        refusals.append(f"--tool states one tool, the program has {listing(sorted(tools), 5)}: give --frames FILE")
 
     user_names = {setting.user for setting in frames.settings}
     users = dict.fromkeys(user_names, np.eye(4))
     if in_station and statements.user is not None:
-        refusals.append(f"--user-frame and --frame {frame} both say where the user frame is: state one of them")
+        refusals.append(f"--user-frame and --frame {frame} both state the user frame: give one of them")
     if in_station:
         notes.append(f"user frame {listing(sorted(users), 5)}: that of station '{frame}', as calib deliver gives it")
     else:
@@ -124,7 +126,7 @@ def placed(fitted: Fitted, program: Program, frame: str, statements: Statements)
                 notes.append(f"user frame {name or 'active'}: {_in_words(pose)} in {base}")
     if refusals:
         count = len(frames.settings)
-        head = f"{program.path}: its {count} poses stand in frames that are not known; nothing was written"
+        head = f"{program.path}: the frames of its {count} poses are missing or contradictory; nothing was written"
         raise UsageError("\n  ".join([head, *refusals]))
     if not in_station:
         warnings = [base.warning, flange.warning]
@@ -133,10 +135,17 @@ def placed(fitted: Fitted, program: Program, frame: str, statements: Statements)
 
 
 def tool_in_tip(fitted: Fitted, controller: Controller, statements: Statements) -> str:
-    """Return the stated tool as `joint_commands.placements` takes it; ``flange`` where none is stated (joint targets).
+    """Return the specified tool in the form that `joint_commands.placements` accepts; ``flange`` if none is specified.
+
+    Used for joint targets, since a program does not name a tool for them.
+
+    Args:
+        fitted: the calibrated arm with its tools.
+        controller: the program's controller, which defines the flange.
+        statements: what the user specifies about the frames.
 
     Raises:
-        UsageError: a tool that cannot be read, or a controller whose flange is not known.
+        UsageError: a tool that cannot be parsed, or a controller whose flange is not known.
     """
     names = fitted.cell.tool_names
     if statements.tool is None or statements.tool in names:
@@ -149,7 +158,7 @@ def tool_in_tip(fitted: Fitted, controller: Controller, statements: Statements) 
 
 
 def _as_option(pose: np.ndarray) -> str:
-    """Return a pose as ``x,y,z,roll,pitch,yaw`` [m, rad]."""
+    """Return a pose (4, 4) as the text ``x,y,z,roll,pitch,yaw`` [m, rad]."""
     values = np.hstack(to_xyz_rpy(pose))
     return ",".join(f"{value:.12g}" for value in values)
 
@@ -157,7 +166,14 @@ def _as_option(pose: np.ndarray) -> str:
 def _grouped(
     program: Program, program_frames: ProgramFrames, tools: Mapping[str, str], users: Mapping[str, np.ndarray]
 ) -> tuple[Group, ...]:
-    """Return the poses by tool and configuration, in the order in which these appear."""
+    """Return the program's poses grouped by tool and configuration, the groups in order of first appearance.
+
+    Args:
+        program: a program with poses.
+        program_frames: tool, user frame and configuration of each pose.
+        tools: name of a tool in the program to the tool in the form that `joint_commands.placements` accepts.
+        users: name of a user frame in the program to its pose (4, 4) in the frame of the targets.
+    """
     settings = program_frames.settings
     members: dict[tuple[str, str], list[int]] = {}
     for k, setting in enumerate(settings):
@@ -174,7 +190,15 @@ def _grouped(
 
 
 def _stated_tool(statement: str | None, names: Sequence[str]) -> np.ndarray | None:
-    """Return the stated tool's pose (4, 4) in the controller's flange; None where none is stated."""
+    """Return the specified tool's pose (4, 4) in the controller's flange; None where no tool is specified.
+
+    Args:
+        statement: ``flange`` or ``x,y,z[,roll,pitch,yaw]`` [m, rad]; None: not specified.
+        names: names of the fit's tools, for the error message.
+
+    Raises:
+        UsageError: any other text.
+    """
     if statement == "flange":
         return np.eye(4)
     try:
@@ -193,10 +217,11 @@ def _completed(
 
     Args:
         program: the program.
-        frames: frames read from it and from further files.
+        frames: frames read from the program and from further files.
         kind: ``tool`` or ``user``.
-        statement: (4, 4) pose that the user states for the frame without numbers; None: none.
-        refusals: texts of the message on unknown frames.
+        statement: (4, 4) pose that the user specifies for the frame whose numbers are not in the files; None: not
+            specified.
+        refusals: lines of the error message, one for each unknown frame; this function appends to the list.
     """
     if kind == "tool":
         option, label, numbers = "--tool", "tool", frames.tools
@@ -217,24 +242,30 @@ def _completed(
     if statement is not None and len(missing) == 1:
         return result | {missing[0]: statement}
     if statement is not None and missing:
-        refusals.append(f"{option} states one {label}, {len(missing)} have no numbers: --frames FILE instead")
+        refusals.append(f"{option} states one {label}, but {len(missing)} have no values: give --frames FILE instead")
     elif statement is not None:
         # no frame lacks numbers: the statement has to agree with those that were read
         for name, pose in result.items():
             if np.abs(pose - statement).max() > AGREE:
-                difference = f"{label} {name} is {_in_words(pose)} in the program's files"
-                refusals.append(f"{option} says {_in_words(statement)}, {difference}")
+                difference = f"but {label} {name} is {_in_words(pose)} in the program's files: correct one of them"
+                refusals.append(f"{option} states {_in_words(statement)}, {difference}")
     for name in missing:
         location = f"line {listing(lines[name], 3)}"
-        subject = f"the {label} that is active"
+        subject = f"the active {label}"
         if name:
             subject = f"{label} {name}"
-        refusals.append(f"{subject} ({location}) has no numbers here: {_advice(program, kind, option)}")
+        refusals.append(f"{subject} ({location}) has no values in these files: state {_advice(program, kind, option)}")
     return result
 
 
 def _advice(program: Program, kind: str, option: str) -> str:
-    """Return how the numbers of a tool or a user frame can be stated."""
+    """Return a text that explains how the user can specify the numbers of a tool or a user frame.
+
+    Args:
+        program: the program, whose controller names the reference frame.
+        kind: ``tool`` or ``user``.
+        option: name of the option by which the frame is specified.
+    """
     frame = program.controller.base
     if kind == "tool":
         frame = program.controller.flange
@@ -246,7 +277,7 @@ def _advice(program: Program, kind: str, option: str) -> str:
 
 
 def _in_words(pose: np.ndarray) -> str:
-    """Return a frame in millimetres and degrees."""
+    """Return a frame's pose as text in millimetres and degrees; ``zero`` for the identity."""
     if np.abs(pose - np.eye(4)).max() < 1e-12:
         return "zero"
     xyz, rpy = to_xyz_rpy(pose)
@@ -258,7 +289,10 @@ def _in_words(pose: np.ndarray) -> str:
 
 
 def user_poses(group: Group, poses: np.ndarray) -> np.ndarray:
-    """Return poses (m, 4, 4) given in the frame of the targets in the user frames of a group, as the program writes
-    them.
+    """Return poses (m, 4, 4) relative to the group's user frames, as the program writes them.
+
+    Args:
+        group: a group of poses of the program.
+        poses: (m, 4, 4) poses in the frame of the targets [m].
     """
     return invert(group.users) @ poses

@@ -36,7 +36,14 @@ from calib.toolkit.pose_data import Targets
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Commands for some targets of a program: their indices, the new numbers [controller's units], and notes."""
+    """Joint commands for some of a program's targets.
+
+    Attributes:
+        indices: indices of these targets among the program's targets.
+        commands: the joint commands.
+        values: new numbers of the targets, one row per target [the controller's units].
+        notes: remarks on these targets.
+    """
 
     indices: tuple[int, ...]
     commands: Commands
@@ -46,12 +53,12 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class CompensatedProgram:
-    """A program and new targets for it.
+    """A program and its new targets.
 
     Attributes:
         program: the program as read.
-        parts: commands of its joint targets, and of its poses by tool and configuration.
-        notes: remarks on the frames of its poses.
+        parts: joint commands of the joint targets, and of the poses in groups of one tool and one configuration.
+        notes: remarks on the frames of the poses.
     """
 
     program: Program
@@ -60,7 +67,7 @@ class CompensatedProgram:
 
     @property
     def values(self) -> list[np.ndarray | None]:
-        """The new numbers of each target in the controller's units; None for a target that is not reached."""
+        """New numbers of each target [the controller's units]; None for a target that is not reached."""
         values: list[np.ndarray | None] = [None] * len(self.program.targets)
         for part in self.parts:
             for index, numbers, reached in zip(part.indices, part.values, part.commands.reached):
@@ -70,7 +77,7 @@ class CompensatedProgram:
 
     @property
     def lost(self) -> list[str]:
-        """Targets that are not reached, each with its line and the reason."""
+        """One text for each target that is not reached: the line in the program, and the reason."""
         reasons = {}
         for part in self.parts:
             reasons |= dict(zip(part.indices, part.commands.reason))
@@ -81,7 +88,7 @@ class CompensatedProgram:
         return lost
 
     def lines(self) -> list[str]:
-        """Return the console lines: notes, and targets that are not reached."""
+        """Return the console lines: notes, and the targets that are not reached."""
         notes = list(self.notes)
         for part in self.parts:
             notes += part.notes
@@ -89,7 +96,7 @@ class CompensatedProgram:
                 notes += [line for line in lines(part.commands) if not line.startswith("not reached")]
         # a note that several parts have is said once
         result = list(dict.fromkeys(notes))
-        result += [f"not reached, left as it was: {reason}" for reason in self.lost]
+        result += [f"not reached, target unchanged: {reason}" for reason in self.lost]
         if self.program.unread:
             result.append(self.program.unread)
         return result
@@ -97,8 +104,12 @@ class CompensatedProgram:
     def write(self, out: Path, partial: bool) -> Path:
         """Write the program with its new targets and return its path.
 
+        Args:
+            out: file of the new program.
+            partial: also write the program if some targets are not reached; their numbers are unchanged.
+
         Raises:
-            UsageError: some targets are not reached without `partial`, or none is; nothing is written.
+            UsageError: no target is reached, or, without `partial`, some are not; nothing is written.
         """
         lost = self.lost
         count = len(self.values)
@@ -106,7 +117,7 @@ class CompensatedProgram:
             head = f"{self.program.path}: {len(lost)} of {count} targets are not reached; nothing was written"
             message = "\n  ".join([head, *lost])
             if len(lost) != count:
-                message += "\nwith --partial, these stay as they are"
+                message += "\nwith --partial, all other targets are written, and those above stay unchanged"
             raise UsageError(message)
         return files.write(out, self.program.rewritten(self.values))
 
@@ -121,27 +132,30 @@ def compensated(
     seed: int = 0,
     **options: Any,
 ) -> CompensatedProgram:
-    """Return a program with new targets, which bring the real tool to where the program's targets are meant.
+    """Return a program with corrected targets, which bring the real tool to the program's nominal targets.
 
     Args:
         fitted: the calibrated arm.
-        program: see `calib.apps.controller_programs.targets.read_program`.
-        frame: as for joint commands; a station is the program's user frame.
-        statements: tool and frames that the program does not state; None: none.
-        start: (n,) joint values near which the joints of poses are sought [rad]; needed where poses have no
+        program: a program, as `calib.apps.controller_programs.targets.read_program` returns it.
+        frame: frame of the targets, as for joint commands; a station is the program's user frame.
+        statements: tool and frames that the program does not contain; None: nothing is specified.
+        start: (n,) joint values near which the joint values of poses are sought [rad]; needed where poses have no
             configuration.
         seed: seed of further starts.
         options: further options of `joint_commands.computed`.
 
     Raises:
-        UsageError: another number of axes, unknown frames, or poses without configuration and without a start.
+        UsageError: a number of axes other than the arm's, unknown frames, or poses without a configuration if there is
+            no start.
     """
     statements = statements or Statements()
     joints, poses = program.of("joints"), program.of("pose")
     n = fitted.nominal.chain.n
     if joints and len(program.targets[joints[0]].values) != n:
         axes = len(program.targets[joints[0]].values)
-        raise UsageError(f"{program.path}: its targets have {axes} axes, the robot has {n} joints")
+        raise UsageError(
+            f"{program.path}: its targets have {axes} axes, but the robot has {n} joints: is it for another robot?"
+        )
     groups, notes = (), ()
     if poses:
         placement = placed(fitted, program, frame, statements)
@@ -159,7 +173,14 @@ def compensated(
 
 
 def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], start: Sequence[float] | None) -> None:
-    """Raise UsageError for poses without configuration if no start is given."""
+    """Raise UsageError if poses have no configuration and no start is given.
+
+    Args:
+        fitted: the calibrated arm, whose nominal arm may have a spherical wrist (configurations require one).
+        program: the program.
+        groups: its poses by tool and configuration.
+        start: (n,) joint values that decide between configurations; None: not given.
+    """
     if start is not None:
         return
     spherical = has_spherical_wrist(fitted.nominal.chain)
@@ -169,18 +190,26 @@ def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], s
             silent += group.indices
     if silent:
         location = f"{len(silent)} targets (the first in line {program.targets[min(silent)].line})"
-        cause = "the program does not say elbow or wrist"
+        cause = "the program does not state the configuration of elbow and wrist"
         if not spherical and any(group.configuration for group in groups):
-            cause = "configurations are read for arms whose last three axes meet, which this is not"
+            cause = "configurations are read only for arms whose last three axes meet in a point, unlike this arm"
         raise UsageError(
-            f"{program.path}: {location} are poses, and {cause}; give joints near them: --start q1,...,qn [rad]"
+            f"{program.path}: {location} are poses, and {cause}; give joint values near them: --start q1,...,qn [rad]"
         )
 
 
 def _compensated_group(
     fitted: Fitted, program: Program, group: Group, start: Sequence[float] | None, options: FieldValues
 ) -> Part:
-    """Return the commands of poses with one tool and configuration."""
+    """Return the joint commands and new numbers for the poses of one group.
+
+    Args:
+        fitted: the calibrated arm.
+        program: the program.
+        group: the poses, with one tool and one configuration.
+        start: (n,) joint values near which the joint values of poses are sought [rad]; None: not given.
+        options: frame, seed and further arguments of `joint_commands.computed`.
+    """
     controller = program.controller
     model, _ = placements(fitted, options["frame"], group.tool)
     chain = model.chain
@@ -205,21 +234,35 @@ def _compensated_group(
 
 
 def _without(commands: Commands, reasons: Sequence[str]) -> Commands:
-    """Return the commands with those that have a (non-empty) reason marked as not reached."""
+    """Return the commands, those with a non-empty text in `reasons` marked as not reached for that reason.
+
+    Args:
+        commands: m joint commands.
+        reasons: (m,) texts.
+    """
     reached = commands.reached.copy()
     command_reasons = list(commands.reason)
     for k, reason in enumerate(reasons):
         if reason:
             reached[k] = False
-            command_reasons[k] = f"{reason}; --start takes the posture nearest to it"
+            command_reasons[k] = f"{reason}; with --start q1,...,qn the posture nearest to it is taken"
     return replace(commands, reached=reached, reason=tuple(command_reasons))
 
 
 def _posture_notes(
     program: Program, group: Group, configuration: Configuration, commands: Commands, sought: Postures
 ) -> tuple[str, ...]:
-    """Return notes on poses whose configuration contradicts the start or the pose, and on commands in another
-    configuration.
+    """Return notes on poses whose configuration is contradictory, and on commands that are in another configuration.
+
+    A configuration is contradictory if no posture at the pose has it, or if the posture nearest to the start has
+    another.
+
+    Args:
+        program: the program.
+        group: the poses, with one tool and one configuration.
+        configuration: the configuration that the program prescribes.
+        commands: the joint commands at these poses.
+        sought: the nominal arm's postures at these poses.
     """
     notes = []
     reached = commands.reached
@@ -230,13 +273,11 @@ def _posture_notes(
         notes.append(f"warning: line {lines[k]}: {sought.reasons[k]}; {outcome}")
     against = lines[reached & sought.contradicted & ~unfit]
     if len(against):
-        message = f"the posture nearest to --start is not that of {configuration.text}, which is followed"
+        message = f"the posture nearest to --start is not that of {configuration.text}; the latter is taken"
         notes.append(f"line {listing(against.tolist(), 5)}: {message}")
     chain = commands.fitted.nominal.chain
     crossing = lines[reached & ~unfit & ~configuration.holds(program.controller, chain, commands.q)]
     if len(crossing):
-        message = (
-            f"the command crosses the boundary of {configuration.text}, which stays in the program: change it there"
-        )
+        message = f"the new joint values are outside {configuration.text}, which stays in the program: change it there"
         notes.append(f"warning: line {listing(crossing.tolist(), 5)}: {message}")
     return tuple(notes)

@@ -35,7 +35,7 @@ def program(
         listed: list controllers, with what each can be told of a calibration
     """
     from calib import files
-    from calib.apps.controller_programs.motion import motion_file
+    from calib.apps.controller_programs.motion_streams import motion_file
     from calib.apps.controller_programs.program import program_files
     from calib.apps.controller_programs.targets import is_program, read_program
     from calib.errors import UsageError

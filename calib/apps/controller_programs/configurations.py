@@ -57,14 +57,14 @@ SIGN_LABELS = (
 
 @dataclass(frozen=True)
 class Configuration:
-    """A program's statement on the posture at a pose.
+    """The posture (one of several inverse-kinematics solutions) that a program prescribes at a pose.
 
     Attributes:
-        text: as the program writes it.
-        before, elbow, wrist: +1 or -1 for wrist centre, elbow and axis 5 (see the module's docstring); 0 where not
-        stated.
-        ranges: joint (from 0) to least and largest angle that the controller shows [rad].
-        upright: posture (6,) [rad] in which `before` and `elbow` are +1.
+        text: the configuration as the program writes it.
+        before, elbow, wrist: signs +1 or -1 for the wrist centre (+1: in front of axis 1), the elbow (+1: as in the
+            posture `upright`) and axis 5 (the sign of its angle); 0 where the program does not prescribe one.
+        ranges: joint index (from 0) to least and largest angle that the controller shows [rad].
+        upright: (6,) posture [rad] in which `before` and `elbow` are +1.
     """
 
     text: str
@@ -79,17 +79,30 @@ class Configuration:
         return self.before, self.elbow, self.wrist
 
     def agrees(self, chain: Chain, q: np.ndarray) -> np.ndarray:
-        """Return which postures q (m, n) [rad] have the stated signs, (m,) bool; turns are not checked."""
+        """Return whether each posture q (m, n) [rad] has the prescribed signs, (m,) bool.
+
+        Whole turns are not checked.
+
+        Args:
+            chain: the arm.
+            q: postures.
+        """
         posture_signs = signs_at(chain, q, np.array(self.upright))
         required = np.array(self.signs())
         undecided = (required == 0) | (posture_signs == 0)
         return np.all(undecided | (posture_signs == required), axis=1)
 
     def wrapped(self, controller: Controller, goal: Goal, q: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """Return postures q (m, n) [rad] with whole turns added: within limits and ranges, as near to `reference` (n,)
-        as possible.
+        """Return postures q (m, n) [rad] with whole turns (2π) added, within the limits and the prescribed ranges.
 
-        A joint that no turns bring into its range is NaN.
+        Of several possible turns, the one nearest to `reference` (n,) is taken. Where no turn brings a joint into its
+        range, the joint's value is NaN.
+
+        Args:
+            controller: the controller to whose angles the prescribed ranges refer.
+            goal: the arm with its joint limits.
+            q: postures.
+            reference: joint values [rad].
         """
         lower = np.broadcast_to(goal.lower, q.shape)
         upper = np.broadcast_to(goal.upper, q.shape)
@@ -110,7 +123,13 @@ class Configuration:
         return best
 
     def holds(self, controller: Controller, chain: Chain, q: np.ndarray) -> np.ndarray:
-        """Return which postures q (m, n) [rad] have the stated signs and turns, (m,) bool."""
+        """Return whether each posture q (m, n) [rad] has the prescribed signs and turns, (m,) bool.
+
+        Args:
+            controller: the controller to whose angles the prescribed turns refer.
+            chain: the arm.
+            q: postures.
+        """
         allowed = self.agrees(chain, q)
         for joint, (smallest, largest) in self.ranges.items():
             angle = q[:, joint]
@@ -119,8 +138,9 @@ class Configuration:
 
 
 def has_spherical_wrist(chain: Chain) -> bool:
-    """Return whether an arm has six revolute joints whose last three axes meet; configurations are defined for such
-    arms only.
+    """Return whether the arm `chain` has six revolute joints of which the last three axes intersect in a point.
+
+    Configurations are defined for such arms only.
     """
     if chain.n != 6 or any(joint.kind != "revolute" for joint in chain.joints):
         return False
@@ -134,8 +154,11 @@ def has_spherical_wrist(chain: Chain) -> bool:
 
 
 def configuration_of(controller: Controller, text: str) -> Configuration | None:
-    """Return the configuration that a program states (`calib.apps.controller_programs.languages.Setting`); None if it
-    states none.
+    """Return the configuration that a program's text prescribes; None if the text is empty.
+
+    Args:
+        controller: the robot's controller, whose language determines how the text is read.
+        text: the configuration in the program, such as ``N U T, 0, 0, 0``.
     """
     readers = {"tp": _tp, "krl": _krl, "rapid": _rapid}
     reader = readers.get(controller.language)
@@ -164,7 +187,7 @@ def _tp(fields: Sequence[str], controller: Controller) -> Configuration:
 
 
 def _sign_of(letters: set[str], positive: str, negative: str) -> int:
-    """Return +1 or -1 by the letter that is among the letters; 0 where neither is."""
+    """Return +1 if the letter `positive` is in `letters`, -1 if the letter `negative` is, and 0 if neither is."""
     if positive in letters:
         return 1
     if negative in letters:
@@ -199,16 +222,15 @@ def _rapid(fields: Sequence[str], controller: Controller) -> Configuration:
 
 
 def signs_at(chain: Chain, q: np.ndarray, upright: np.ndarray) -> np.ndarray:
-    """Return the signs (m, 3) of wrist centre, elbow and axis 5 at postures q (m, 6) [rad]; 0 where a sign is
-    undefined.
+    """Return the signs (m, 3) of wrist centre, elbow and axis 5 at postures q (m, 6) [rad]; 0 where undefined.
 
-    A sign is undefined at a boundary, and where the upright posture of this arm is at a boundary: then the arm's zeros
-    are not those of the maker.
+    A sign is undefined where the posture is at the boundary between two configurations. It is also undefined where this
+    arm is at a boundary in the posture `upright`: its joint zeros then differ from the robot manufacturer's.
 
     Args:
         chain: the arm.
         q: postures.
-        upright: (6,) posture [rad] whose wrist centre and elbow have the sign +1.
+        upright: (6,) posture [rad] in which the signs of wrist centre and elbow are +1.
     """
     distances = _distances(chain, np.vstack([upright, q]))
     upright_distances = distances[0]
@@ -221,9 +243,14 @@ def signs_at(chain: Chain, q: np.ndarray, upright: np.ndarray) -> np.ndarray:
 
 
 def _distances(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return signed distances (m, 2): of the wrist centre before axis 1, and beside the line from axis 2 to axis 3.
+    """Return two signed measures (m, 2) of the wrist centre, whose signs distinguish the configurations.
 
-    The second is multiplied by the line's length. Which side is positive differs from arm to arm.
+    The first is the distance from axis 1 towards the front [m]. The second is the distance from the line between axes 2
+    and 3, multiplied by that line's length [m²]. Which side is positive differs from arm to arm.
+
+    Args:
+        chain: an arm with a spherical wrist.
+        q: (m, 6) postures [rad].
     """
     points, axes = _axes(chain, q)
     wrist = _nearest_point(points[4], axes[4], points[3], axes[3])
@@ -235,7 +262,12 @@ def _distances(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def _axes(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a point of each joint's axis, and its direction, at postures (m, n): both (n, m, 3)."""
+    """Return a point on each joint's axis [m] and the axis' direction, both (n, m, 3), in the arm's base.
+
+    Args:
+        chain: the arm.
+        q: (m, n) postures [rad].
+    """
     frames = joint_frames(chain, q)
     directions = []
     for joint, element_index in enumerate(chain.moving):
@@ -246,7 +278,12 @@ def _axes(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nearest_point(point: np.ndarray, axis: np.ndarray, second: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Return the points (m, 3) of lines (point, axis) nearest to other lines, which are not parallel to them."""
+    """Return, for each of m lines, the point (m, 3) nearest to a second line that is not parallel to it.
+
+    Args:
+        point, axis: (m, 3) a point on the line, and its unit direction.
+        second, across: (m, 3) a point on the second line, and its unit direction.
+    """
     between = second - point
     slope = np.einsum("mi,mi->m", axis, across)
     along = np.einsum("mi,mi->m", between, axis) - slope * np.einsum("mi,mi->m", between, across)
@@ -259,8 +296,9 @@ class Postures:
     """Postures of the nominal arm at m poses.
 
     Attributes:
-        q: (m, n) [rad]; where no posture has the configuration, the nearest posture of another one, or the start.
-        reasons: (m,) why no posture has the configuration, or why it is not unique; empty where exactly one has it.
+        q: (m, n) joint values [rad]; where no posture has the configuration, the nearest posture of another
+            configuration, or the start.
+        reasons: (m,) why no posture has the configuration, or why several have it; empty where exactly one has it.
         contradicted: (m,) True where the posture nearest to the start has another configuration.
     """
 
@@ -277,17 +315,17 @@ def postures(
     start: Sequence[float] | None = None,
     seed: int = 0,
 ) -> Postures:
-    """Return the posture that a configuration means at each of the poses (m, 4, 4).
+    """Return the arm's posture at each of the poses (m, 4, 4) in the prescribed configuration.
 
-    Postures are sought from random starts in the configuration, and from `start`. Of several that agree, the nearest to
-    `start` is taken; without a start they are refused as not unique.
+    Postures are sought from random starts in the configuration, and from `start`. If several postures have the
+    configuration, the nearest to `start` is returned; without a start, they are refused as not unique.
 
     Args:
         goal: the nominal arm with the tool, and its limits.
         poses: tool poses in the arm's base [m].
         configuration: configuration of all these poses.
-        controller: the controller to whose angles the ranges refer.
-        start: (n,) joint values [rad] to be near; None: none.
+        controller: the controller to whose angles the ranges of the configuration refer.
+        start: (n,) joint values [rad] near which postures are preferred; None: no preference.
         seed: seed of the random starts.
     """
     chain = goal.cell.chain
@@ -345,8 +383,14 @@ def postures(
 def _agreeing(
     goal: Goal, configuration: Configuration, controller: Controller, reached: np.ndarray, reference: np.ndarray
 ) -> np.ndarray:
-    """Return the distinct postures out of `reached` (k, n) that have a configuration, with the whole turns that it
-    states.
+    """Return the distinct postures that have the configuration, with its whole turns added.
+
+    Args:
+        goal: the nominal arm with the tool, and its limits.
+        configuration: the prescribed configuration.
+        controller: the controller to whose angles the configuration refers.
+        reached: (k, n) postures that reach the pose [rad].
+        reference: (n,) joint values to which the nearest turns are taken [rad].
     """
     in_configuration = reached[configuration.agrees(goal.cell.chain, reached)]
     wrapped = configuration.wrapped(controller, goal, in_configuration, reference)
@@ -361,21 +405,29 @@ def _agreeing(
 def _objection(
     chain: Chain, configuration: Configuration, reached: np.ndarray, agreeing: np.ndarray, started: bool
 ) -> str:
-    """Return why no posture has the configuration, or why it is not unique; else empty."""
+    """Return why no posture has the configuration, or why several have it; empty where exactly one has it.
+
+    Args:
+        chain: the arm.
+        configuration: the prescribed configuration.
+        reached: (k, n) postures that reach the pose [rad].
+        agreeing: postures with the configuration among them.
+        started: whether a start is given, which decides between several postures.
+    """
     if not len(agreeing) and configuration.agrees(chain, reached).any():
-        return f"{configuration.text} has no posture at this pose: none within the joints' limits has its turns"
+        return f"{configuration.text} has no posture at this pose: none within the joints' limits has the stated turns"
     if not len(agreeing):
         signs = signs_at(chain, reached, np.array(configuration.upright))
         alternatives = "; ".join(_sign_text(row) for row in np.unique(signs, axis=0))
         required = _sign_text(np.array(configuration.signs())) or "turns only"
         return f"{configuration.text} ({required}) is no posture at this pose; the arm reaches it with {alternatives}"
     if len(agreeing) > 1 and not started:
-        return f"{configuration.text} leaves {len(agreeing)} postures"
+        return f"{configuration.text} is ambiguous: {len(agreeing)} postures agree with it"
     return ""
 
 
 def _sign_text(signs: np.ndarray) -> str:
-    """Return signs of wrist centre, elbow and axis 5 in words; a sign of 0 is left out."""
+    """Return the signs of wrist centre, elbow and axis 5 in words; a sign of 0 is omitted."""
     labels = []
     for sign, (positive, negative) in zip(signs, SIGN_LABELS):
         if sign > 0:
@@ -386,7 +438,13 @@ def _sign_text(signs: np.ndarray) -> str:
 
 
 def _met(goal: Goal, q: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Return which postures (m, n) reach their poses (m,)."""
+    """Return whether each posture q (m, n) reaches the corresponding pose (m, 4, 4), (m,) bool.
+
+    Args:
+        goal: the arm with the tool, and the constrained pose components.
+        q: postures.
+        poses: target poses.
+    """
     difference = differences(goal, q, poses)
     position_error = np.linalg.norm(difference[:, :3], axis=1)
     turn_error = np.linalg.norm(difference[:, 3:], axis=1)

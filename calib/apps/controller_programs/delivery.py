@@ -1,11 +1,12 @@
-"""A calibration in a controller's terms: `calib deliver FIT --for NAME`.
+"""A calibration as numbers that a robot controller accepts: `calib deliver FIT --for NAME`.
 
-A controller that keeps its nominal geometry takes the frames of tool and instrument with which the nominal arm fits the
-measurements best. A controller whose axes are mastered anew takes joint offsets and the frames fitted with them: from a
-fit with ``--model offsets``, since the offsets of a richer model are not the best ones by themselves.
+A controller that keeps its nominal geometry accepts a tool frame and the instrument's frame; those with which the
+nominal arm fits the measurements best are printed. A controller whose axes can be mastered anew accepts joint offsets,
+and the frames that were fitted together with them. These are taken from a fit with ``--model offsets``, since the joint
+offsets of a model with more parameters are not the best ones when used alone.
 
-Each frame is given in the controller's base or flange (`calib.apps.controller_programs.frames`), which is printed with
-it. Where the pose of that base or flange is not known, no number is printed.
+Each frame is relative to the controller's base or flange (`calib.apps.controller_programs.frames`), which is printed
+too. Where the pose of that base or flange is not known, no numbers are printed.
 """
 
 from collections.abc import Iterator
@@ -27,14 +28,13 @@ DECIMALS = {"m": 7, "mm": 4}
 def delivery_text(
     folder: Path, controller: Controller, world: np.ndarray | None = None, flange: np.ndarray | None = None
 ) -> str:
-    """Return the numbers of a fit that a controller takes, as text for the person who enters them.
+    """Return the numbers of a fit that a controller accepts, as text for the person who enters them.
 
     Args:
         folder: folder of a fit, or of a session with a fit.
         controller: the controller.
-        world, flange: (4, 4) poses of the controller's base in the arm's base, and of its flange in the arm's tip,
-        where
-            the user states them; None: by description or rule.
+        world, flange: (4, 4) poses of the controller's base in the arm's base, and of its flange in the arm's tip, as
+            the user specifies them; None: known from the robot's description, or from the controller's rule.
 
     Raises:
         UsageError: a folder without a fit.
@@ -49,7 +49,7 @@ def delivery_text(
     frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)
     verdicts = open_result(fit, "deliver").verdicts
     lines = [f"{controller.title}: calibration of {robot.chain.name}", str(verdicts), ""]
-    lines += [f"It takes: {controller.takes}.", f"It does not: {controller.closed}.", ""]
+    lines += [f"The controller accepts: {controller.takes}.", f"It does not accept: {controller.closed}.", ""]
     if len(nominal.tools):
         lines += [
             "Frames if the controller's geometry and mastering stay as they are:",
@@ -57,7 +57,7 @@ def delivery_text(
             "",
         ]
     if not controller.mastered:
-        lines.append("Its axes are not mastered by their users.")
+        lines.append("Users cannot master the axes of this controller.")
     elif fit_folder is not None and fit_folder.metrics().model == "offsets":
         lines += [
             "Mastering, with frames that belong to it:",
@@ -76,8 +76,12 @@ def delivery_text(
 
 
 def _frames(arm: Installation, controller: Controller, base: ControllerFrame, flange: ControllerFrame) -> Iterator[str]:
-    """Yield lines with the tools and instrument frames of an arm as the controller writes them, and their reference
-    frames.
+    """Yield lines with an arm's tool frames and instrument frames in the controller's notation.
+
+    Args:
+        arm: the arm with its stations and tools.
+        controller: the controller.
+        base, flange: the controller's base and flange, located in the arm's base and tip.
     """
     for index, (name, pose) in enumerate(zip(arm.tool_names, arm.tools), 1):
         yield from _stood(f"tool {name}", controller.tool_frame, controller, pose, flange, index)
@@ -88,7 +92,16 @@ def _frames(arm: Installation, controller: Controller, base: ControllerFrame, fl
 def _stood(
     name: str, form: str, controller: Controller, pose: np.ndarray, frame: ControllerFrame, index: int
 ) -> Iterator[str]:
-    """Yield the lines of one frame: its numbers in the controller's frame, and the two frames that they relate."""
+    """Yield the lines on one frame: its numbers relative to the controller's base or flange, and this reference's name.
+
+    Args:
+        name: kind and name of the frame.
+        form: the controller's template for the text of such a frame.
+        controller: the controller.
+        pose: (4, 4) pose in the arm's base or tip.
+        frame: the controller's base or flange.
+        index: number of the frame, from 1.
+    """
     if frame.pose is None:
         yield f"  {name}: not printed, since {frame.name} is {frame.basis}"
         return
@@ -103,8 +116,11 @@ def _written(form: str, controller: Controller, pose: np.ndarray, index: int) ->
 
 
 def _mastering(robot: CalibratedChain, controller: Controller) -> Iterator[str]:
-    """Yield a line with the offset of each axis, in the controller's unit, to add to the angle that the controller
-    shows.
+    """Yield one line per axis with the offset to add to the displayed angle, in the controller's unit.
+
+    Args:
+        robot: the calibrated arm with its nominal description.
+        controller: the controller.
     """
     chain, nominal = robot.chain, nominal_of(robot)
     offsets = []

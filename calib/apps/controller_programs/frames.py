@@ -36,13 +36,13 @@ NO_TURN = [0.0, 0.0, 0.0]
 
 @dataclass(frozen=True, eq=False)
 class ControllerFrame:
-    """A controller's frame in a robot's description.
+    """Base or flange frame of a controller, located in the robot's description.
 
     Attributes:
         name: the controller's name of the frame.
-        pose: (4, 4) in the arm's base, or in its tip; None where it is not known.
-        basis: how the pose is known, or why it is not and what to state.
-        warning: contradiction of the pose with the controller's rule; empty without one.
+        pose: (4, 4) pose in the arm's base (for a base frame) or tip (for a flange); None where it is not known.
+        basis: how the pose is known; if it is not known, the reason and what to specify.
+        warning: a contradiction between the pose and the controller's rule; empty without one.
     """
 
     name: str
@@ -56,14 +56,24 @@ class ControllerFrame:
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """The nominal arm, and all links of its URDF; `tree` is None without a URDF."""
+    """The nominal arm, with the links of its URDF.
+
+    Attributes:
+        chain: the nominal arm.
+        tree: links and joints of its URDF; None without a URDF.
+    """
 
     chain: Chain
     tree: UrdfTree | None = None
 
     @classmethod
     def of_fit(cls, folder: Path, chain: Chain) -> Self:
-        """Return the description of a fit's nominal arm; its URDF keeps the links of the URDF that was fitted."""
+        """Return the description of a fit's nominal arm, with the links of the fitted URDF if the fit has one.
+
+        Args:
+            folder: the fit's folder.
+            chain: the nominal arm.
+        """
         path = FitFolder(folder).urdf
         if not path.is_file():
             return cls(chain)
@@ -72,7 +82,7 @@ class Description:
 
     @property
     def prefix(self) -> str:
-        """Prefix of the names of the arm's links, as ``left_``; empty without one."""
+        """Common prefix of the arm's link names, such as ``left_``; empty without one."""
         names = [self.chain.base, self.chain.tip]
         if self.tree is not None:
             root, _ = _fixed_to(self.tree, self.chain.base)
@@ -90,10 +100,10 @@ class Description:
         return link in self.tree.bodies
 
     def pose(self, link: str, start: str) -> np.ndarray | None:
-        """Return the pose T_start_link (4, 4) [m]; None where moving joints are between the two links.
+        """Return the pose T_start_link (4, 4) [m]; None where a moving joint is between the two links.
 
         Args:
-            link, start: names of links that exist.
+            link, start: names of existing links.
         """
         if link == start:
             return np.eye(4)
@@ -106,7 +116,7 @@ class Description:
         return invert(start_pose) @ pose
 
     def moving_joint(self, link: str) -> str:
-        """Return the name of the nearest moving joint above a link; empty without one."""
+        """Return the name of the last moving joint between the root of the URDF and a link; empty without one."""
         if self.tree is None:
             return ""
         for joint in reversed(self.tree.ancestry(link)):
@@ -116,7 +126,12 @@ class Description:
 
 
 def _fixed_to(tree: UrdfTree, link: str) -> tuple[str, np.ndarray]:
-    """Return the topmost link that a link is rigidly fixed to, and the link's pose (4, 4) in it."""
+    """Return the uppermost link to which a link is rigidly fixed, and the pose (4, 4) of `link` in that link.
+
+    Args:
+        tree: links and joints of the URDF.
+        link: name of the link.
+    """
     pose = np.eye(4)
     while link in tree.above and tree.above[link].kind == "fixed":
         pose = tree.above[link].origin @ pose
@@ -125,7 +140,11 @@ def _fixed_to(tree: UrdfTree, link: str) -> tuple[str, np.ndarray]:
 
 
 def stated_frame(statement: str | None, option: str) -> np.ndarray | None:
-    """Return the pose (4, 4) that an option states as ``x,y,z[,roll,pitch,yaw]`` [m, rad]; None where it is not given.
+    """Return the pose (4, 4) [m] that the user stated by an option; None where the option was not used.
+
+    Args:
+        statement: text ``x,y,z[,roll,pitch,yaw]`` [m, rad]; None: the option was not used.
+        option: name of the option, for the message.
 
     Raises:
         UsageError: not three or six finite numbers, or a position so large that it must be in millimetres.
@@ -151,7 +170,7 @@ def base_frame(controller: Controller, arm: Description, statement: np.ndarray |
     Args:
         controller: the controller.
         arm: the nominal arm with its links.
-        statement: (4, 4) pose that the user states, which overrides all else; None: not stated.
+        statement: (4, 4) pose that the user specifies, which overrides every other source; None: not specified.
     """
     name, chain = controller.base, arm.chain
     if statement is not None:
@@ -174,7 +193,7 @@ def base_frame(controller: Controller, arm: Description, statement: np.ndarray |
         joint = arm.moving_joint(link)
         return ControllerFrame(name, None, f"not known: link '{link}' moves with joint '{joint}'; {state}")
     if not footed and ruled is not None and _differs(pose, ruled):
-        basis = f"not known: link '{link}' is the description's root, and {name} stands {rule}; {state}"
+        basis = f"not known: link '{link}' is the description's root, and {name} is usually {rule}; {state}"
         return ControllerFrame(name, None, basis)
     relation = _relation(pose, chain.base)
     if footed:
@@ -183,13 +202,17 @@ def base_frame(controller: Controller, arm: Description, statement: np.ndarray |
             relation = _relation(pose_on_foot, foot)
     warning = ""
     if ruled is not None and _differs(pose, ruled):
-        warning = f"link '{link}' does not stand where {name} usually does ({rule}): compare with the pendant"
+        warning = f"link '{link}' is not where {name} usually is ({rule}): compare with the pendant"
     return ControllerFrame(name, pose, f"link {link}, {relation}", warning)
 
 
 def flange_frame(controller: Controller, arm: Description, statement: np.ndarray | None = None) -> ControllerFrame:
-    """Return the controller's flange (its all-zero tool), with its pose in the arm's tip; arguments as for
-    `base_frame`.
+    """Return the controller's flange frame (that of the all-zero tool), with its pose in the arm's tip.
+
+    Args:
+        controller: the controller.
+        arm: the nominal arm with its links.
+        statement: (4, 4) pose that the user specifies, which overrides every other source; None: not specified.
     """
     name, chain = controller.flange, arm.chain
     if statement is not None:
@@ -215,14 +238,13 @@ def flange_frame(controller: Controller, arm: Description, statement: np.ndarray
 
 
 def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | None, str]:
-    """Return the pose (4, 4) of the controller's base in the arm's base by the controller's rule, and the rule in
-    words.
+    """Return the controller's base (4, 4) in the arm's base by the controller's rule, and the rule in words.
 
-    The pose is None where no rule applies; the text then says why.
+    Where no rule applies, the pose is None and the text gives the reason.
     """
     foot = arm.prefix + "base_link"
     if not controller.base_at:
-        return None, f"nothing is known of {controller.title}"
+        return None, f"the base frame of {controller.title} is not documented"
     start = arm.chain.base
     if arm.has(foot):
         start = foot
@@ -232,11 +254,11 @@ def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | Non
     if controller.base_at == "axis 2":
         height = _height_of_axis_2(arm.chain, placed)
         if height is None:
-            return None, f"{controller.base}'s height, that of axis 2, is none in this arm"
+            return None, f"{controller.base} is at the height of axis 2, which this arm does not determine"
         rule = f"by rule at the height of axis 2, {height:.6g} m above {start}"
         return placed @ from_xyz_rpy([0.0, 0.0, height], NO_TURN), rule
     if not arm.has(foot):
-        return None, f"there is no link '{foot}' against which {controller.base} stands"
+        return None, f"no link '{foot}', relative to which {controller.base} is defined"
     if controller.base_at == "turned":
         turned = placed @ from_xyz_rpy(NO_SHIFT, [0.0, 0.0, np.pi])
         return turned, f"by rule {foot}, turned by 180° about z"
@@ -244,8 +266,13 @@ def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | Non
 
 
 def _height_of_axis_2(chain: Chain, foot: np.ndarray) -> float | None:
-    """Return the height of axis 2 above the frame `foot` [m]; None where axis 1 is not its z axis, or axis 2 is not
-    level.
+    """Return the height of axis 2 above the frame with pose `foot` (4, 4) in the arm's base [m].
+
+    None where axis 1 is not the frame's z axis, or axis 2 is not horizontal.
+
+    Args:
+        chain: the arm.
+        foot: pose of the frame.
     """
     if chain.n < 2:
         return None
@@ -266,7 +293,12 @@ def _height_of_axis_2(chain: Chain, foot: np.ndarray) -> float | None:
 
 
 def _line(chain: Chain, joint: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a point (3,) [m] on a joint's axis and the axis' direction (3,) at q = 0, in the arm's base."""
+    """Return a point (3,) [m] on a joint's axis and the axis' direction (3,) at q = 0, in the arm's base.
+
+    Args:
+        chain: the arm.
+        joint: index of the joint, from 0.
+    """
     frame = joint_frames(chain, np.zeros((1, chain.n)))[joint, 0]
     element = chain.elements[int(chain.moving[joint])]
     column = AXES.index(element.axis) % 3
@@ -274,7 +306,12 @@ def _line(chain: Chain, joint: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _off_axis(chain: Chain, pose: np.ndarray) -> float:
-    """Return the angle [rad] between the arm's last axis and the z axis of a frame whose pose in the tip is `pose`."""
+    """Return the angle [rad] between the arm's last axis and the z axis of a frame.
+
+    Args:
+        chain: the arm.
+        pose: (4, 4) pose of the frame in the tip.
+    """
     (tip,) = forward(chain, np.zeros((1, chain.n)))
     z = (tip @ pose)[:3, 2]
     _, last_axis = _line(chain, chain.n - 1)
@@ -289,7 +326,7 @@ def _differs(first: np.ndarray, second: np.ndarray) -> bool:
 
 
 def _relation(pose: np.ndarray, link: str) -> str:
-    """Return in words the pose of a frame relative to a link."""
+    """Return as text the pose of a frame relative to a link."""
     xyz, rpy = to_xyz_rpy(pose)
     turned, shifted = np.abs(rpy) > 1e-9, np.abs(xyz) > 1e-9
     if not turned.any() and not shifted.any():
@@ -314,10 +351,10 @@ def _relation(pose: np.ndarray, link: str) -> str:
 
 
 def check_known(frames: list[ControllerFrame], heading: str) -> None:
-    """Raise UsageError if a frame is not known.
+    """Raise UsageError if the pose of one of the frames is not known.
 
     Raises:
-        UsageError: with `heading`, and for each unknown frame what to state.
+        UsageError: the message begins with `heading`, and lists for each unknown frame what to specify.
     """
     missing = [f"  {frame.name} is {frame.basis}" for frame in frames if frame.pose is None]
     if missing:

@@ -31,11 +31,11 @@ BEHIND = 120
 
 @dataclass(frozen=True)
 class Setting:
-    """A program's statements on one of its poses.
+    """Tool, user frame and configuration that a program uses for one of its poses.
 
     Attributes:
-        tool, user: names of tool and user frame as in `ProgramFrames`; empty where not stated.
-        configuration: as the program writes it; empty where not stated.
+        tool, user: names of tool and user frame, as keys of `ProgramFrames`; empty where the program names none.
+        configuration: the configuration as the program writes it; empty where the program has none.
     """
 
     tool: str
@@ -45,10 +45,10 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class ProgramFrames:
-    """Settings of a program's poses, in the program's order, and the frames with known numbers.
+    """Tool, user frame and configuration of each pose of a program, and the frames whose numbers are known.
 
     Attributes:
-        settings: one per pose.
+        settings: one for each pose, in the program's order.
         tools, users: name to pose (4, 4) [m] of tools in the controller's flange, and of user frames in its base.
     """
 
@@ -58,20 +58,21 @@ class ProgramFrames:
 
 
 def frames_in(program: Program, further: Mapping[str, str] | None = None) -> ProgramFrames:
-    """Return the settings and frames of a program's poses, read from the program and from further files of its
-    controller.
+    """Return tool, user frame and configuration of each pose in a program, and the frames whose numbers are known.
 
     Args:
         program: the program.
-        further: file name to text; None: no further files.
+        further: file name to text of further files of the controller, which are searched too; None: no such files.
 
     Raises:
-        UsageError: a language whose frames are not read, a tool fixed in the cell, or a frame given twice with
+        UsageError: a language whose frames cannot be read, a tool fixed in the cell, or a frame defined twice with
             different numbers.
     """
     language = LANGUAGES.get(program.controller.language)
     if language is None:
-        raise UsageError(f"{program.path}: tool and user frames of {program.controller.title} are not read")
+        raise UsageError(
+            f"{program.path}: frames in programs of {program.controller.title} are not read; give the targets as a CSV"
+        )
     blank = language.without_comments(program.text)
     settings = tuple(language.setting(blank, program.targets[k]) for k in program.of("pose"))
     tools: dict[str, np.ndarray] = {}
@@ -82,7 +83,7 @@ def frames_in(program: Program, further: Mapping[str, str] | None = None) -> Pro
         for kind, frames in zip((tools, users), numbers):
             for name, pose in frames.items():
                 if name in kind and np.abs(kind[name] - pose).max() > 1e-9:
-                    raise UsageError(f"{file}: {name} is given twice, with other numbers")
+                    raise UsageError(f"{file}: {name} is given twice with different values; remove one")
                 kind[name] = pose
     tools |= dict.fromkeys(language.flange, np.eye(4))
     users |= language.base()
@@ -94,14 +95,15 @@ Frames = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Language:
-    """How a language writes frames.
+    """How a programming language of robot controllers writes frames.
 
     Attributes:
-        comment: what begins a comment; empty without comments.
-        setting: (text without comments, target) to the target's setting.
-        numbers: (text without comments, controller) to tools and user frames with numbers.
-        flange, world: names of the all-zero tool and of the controller's base.
-        files: the files that hold the numbers, in words; empty for none.
+        comment: characters that begin a comment; empty for a language without comments.
+        setting: function of (text without comments, target) that returns the target's setting.
+        numbers: function of (text without comments, controller) that returns the tools and the user frames with
+            numbers.
+        flange, world: names of the all-zero tool, and of the controller's base.
+        files: description of the files that contain the numbers; empty for none.
     """
 
     comment: str
@@ -112,30 +114,45 @@ class Language:
     files: str
 
     def base(self) -> Frames:
-        """Return the user frames that coincide with the controller's base: name to identity."""
+        """Return the user frames that coincide with the controller's base: name to identity (4, 4)."""
         return dict.fromkeys(self.world, np.eye(4))
 
     def without_comments(self, text: str) -> str:
-        """Return a text of the same length with blanks in place of comments."""
+        """Return the text with each comment replaced by as many blanks."""
         if not self.comment:
             return text
         return re.sub(f"{self.comment}[^\n]*", lambda match: " " * len(match[0]), text)
 
 
 def _frame(form: str) -> str:
-    """Return the regular expression of a frame from a short form: NUM is a number, a blank any number of blanks."""
+    """Return the regular expression for a short pattern of a frame.
+
+    Args:
+        form: the pattern, in which NUM is a number and a blank is any number of blanks.
+    """
     return form.replace(" ", r"\s*").replace("NUM", NUMBER)
 
 
 def _posed(match: re.Match[str], first: int, controller: Controller, count: int = 6) -> np.ndarray:
-    """Return the pose (4, 4) [m] from `count` numbers of a match, beginning at group `first`."""
+    """Return the pose (4, 4) [m] that consecutive groups of a regular expression's match contain.
+
+    Args:
+        match: the match.
+        first: index of the first group with a number.
+        controller: the controller, which determines units and angles.
+        count: number of numbers.
+    """
     values = [float(match[group]) for group in range(first, first + count)]
     return pose_of_values(controller, np.array([values]))[0]
 
 
 def _either(pairs: set[tuple[str, str]]) -> tuple[str, str]:
-    """Return the names of tool and user frame of several moves; where moves differ, names joined by 'or', which no
-    frame has.
+    """Return tool and user frame of the moves that use one target.
+
+    Where moves differ, their names are joined by 'or'; no frame has such a name.
+
+    Args:
+        pairs: (tool, user frame) of each move.
     """
     tools = {tool for tool, _ in pairs}
     users = {user for _, user in pairs}
@@ -163,8 +180,15 @@ def _tp_setting(text: str, target: Target) -> Setting:
 
 
 def _tp_name(text: str, kind: str, number: str) -> str:
-    """Return a frame's name; for number ``F`` (the active frame) that of the only frame the program selects, else
-    empty.
+    """Return the name of a tool or user frame from its number in a TP program.
+
+    For the number ``F`` (the active frame), it is the only frame that the program selects; empty if it selects none or
+    several.
+
+    Args:
+        text: the program without comments.
+        kind: beginning of the name, ``UTOOL`` or ``UFRAME``.
+        number: number of the frame, or ``F``.
     """
     if not number.isdigit():
         selected = set(re.findall(rf"{kind}_NUM\s*=\s*(\d+)", text))
@@ -210,7 +234,8 @@ def _krl_setting(text: str, target: Target) -> Setting:
     if data is not None:
         if re.search(r"(?i)IPO_FRAME\s+#TCP", data[0]):
             raise UsageError(
-                f"line {target.line}: {point[1]} moves about a tool in the cell (IPO_FRAME #TCP): not read"
+                f"line {target.line}: {point[1]} is relative to a tool fixed in the cell (IPO_FRAME #TCP), which is "
+                "not supported: use a tool on the flange"
             )
         return Setting(_krl_name("TOOL", data[1]), _krl_name("BASE", data[2]), configuration)
     moves = re.finditer(rf"(?im)^\s*S?(?:PTP|LIN|CIRC)\b[^\n]*\b{re.escape(point[1])}\b", text)
@@ -221,7 +246,7 @@ def _krl_setting(text: str, target: Target) -> Setting:
 
 
 def _krl_active(text: str, position: int) -> tuple[str, str]:
-    """Return the names of the tool and the base that are selected before a position in the text."""
+    """Return the names of the tool and the base that are selected before a position in a KRL program's text."""
     active = {"TOOL": "", "BASE": ""}
     for match in _KRL_SELECTED.finditer(text, 0, position):
         if match[3]:
@@ -245,7 +270,7 @@ def _krl_name(kind: str, number: str) -> str:
 
 
 def _binary(literal: str) -> int:
-    """Return the number of ``2`` or of ``B010``."""
+    """Return the integer written as a decimal (``2``) or as a binary literal (``B010``)."""
     if literal[:1].upper() == "B":
         return int(literal[1:], 2)
     return int(literal)
@@ -295,7 +320,11 @@ def _rapid_setting(text: str, target: Target) -> Setting:
 
 
 def _rapid_frames(statement: str) -> tuple[str, str]:
-    """Return the names of tool (the last argument) and work object of a move's arguments."""
+    """Return the names of the tool and the work object that a RAPID move uses.
+
+    Args:
+        statement: arguments of the move; the last one is the tool.
+    """
     work = _RAPID_WOBJ.search(statement)
     plain = re.sub(r"\\\w+(?:\s*:=\s*\w+)?", "", statement)
     tool = re.search(r",\s*([A-Za-z_]\w*)\s*$", plain)
@@ -308,14 +337,22 @@ def _rapid_numbers(text: str, controller: Controller) -> tuple[Frames, Frames]:
     tools: Frames = {}
     for match in _RAPID_TOOL.finditer(text):
         if match[2].upper() == "FALSE":
-            raise UsageError(f"tooldata {match[1]}: a tool that the robot does not hold (robhold FALSE) is not read")
+            raise UsageError(
+                f"tooldata {match[1]}: a tool fixed in the cell (robhold FALSE) is not supported: use one on the flange"
+            )
         tools[match[1].lower()] = _posed(match, 3, controller, 7)
     users: Frames = {}
     for match in _RAPID_WORK.finditer(text):
         if match[2].upper() == "TRUE":
-            raise UsageError(f"wobjdata {match[1]}: a work object that the robot holds (robhold TRUE) is not read")
+            raise UsageError(
+                f"wobjdata {match[1]}: a work object on the robot (robhold TRUE) is not supported: use one fixed in "
+                "the cell"
+            )
         if match[3].upper() == "FALSE" or match[4]:
-            raise UsageError(f"wobjdata {match[1]}: a work object on a moving mechanical unit is not read")
+            raise UsageError(
+                f"wobjdata {match[1]}: a work object on a moving mechanical unit is not supported: use one fixed in "
+                "the cell"
+            )
         user_frame = _posed(match, 5, controller, 7)
         object_frame = _posed(match, 12, controller, 7)
         users[match[1].lower()] = user_frame @ object_frame

@@ -19,7 +19,7 @@ import jinja2
 import numpy as np
 
 from calib import files
-from calib.apps.controller_programs.motion import is_motion, setpoints, stream_values
+from calib.apps.controller_programs.motion_streams import is_motion, setpoints, stream_values
 from calib.apps.controller_programs.program_settings import CSV, ProgramSettings
 from calib.apps.controller_programs.targets import formatted, is_program, read_program
 from calib.errors import UsageError
@@ -30,21 +30,21 @@ from calib.units import ANGLES, LENGTHS
 
 
 def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
-    """Return joint values (m, n) [rad] of a CSV of poses or of a program, and the joints' names.
+    """Return joint values (m, n) [rad] from a CSV of poses or from a program, and the joints' names.
 
-    In a CSV, the joints are the columns whose header states an angle (``joint1 [deg]``).
+    In a CSV, the joints are the columns whose header has the unit of an angle (``joint1 [deg]``).
 
     Args:
         path: the file.
         source: the controller of a program, where its suffix does not determine it; empty otherwise.
 
     Raises:
-        UsageError: prismatic joints, a program of poses, or no column of joint angles.
+        UsageError: prismatic joints, a program whose targets are poses, or no column of joint angles.
     """
     if source or is_program(path):
         program = read_program(path, source)
         if not program.of("joints"):
-            raise UsageError(f"{path}: its targets are poses of the tool, not joints")
+            raise UsageError(f"{path}: its targets are poses of the tool; give a list or program of joint values")
         q = program.joints()
         return q, [f"q{number}" for number in range(1, q.shape[1] + 1)]
 
@@ -58,17 +58,23 @@ def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
         elif unit.lower() in ANGLES:
             names.append(name)
     if sliding:
-        raise UsageError(f"{path}: programs have turning joints only; {', '.join(sliding)} slides")
+        raise UsageError(f"{path}: programs are for revolute joints only, not lengths: {', '.join(sliding)}")
     if not names:
         columns = ", ".join(table.header)
-        raise UsageError(f"{path}: no column of joint angles, as 'joint1 [deg]'; found {columns}")
+        raise UsageError(f"{path}: no column of joint angles with its unit, as 'joint1 [deg]'; found {columns}")
     return read_poses(path, names), names
 
 
 def joints_table(path: Path, source: str = "") -> Table:
-    """Return the joints of `joints_in` as a table [deg], with a column ``pose`` where the program numbers all of them.
+    """Return the joint values in a file as a table [deg], with a column ``pose`` where all targets are numbered.
 
-    The file may also be one in which a controller kept joints: a UR's log, a KUKA's ``.dat``, a FANUC's ``POSREG.VA``.
+    Args:
+        path: CSV of poses, program, or file to which a controller wrote joint values: a UR's log, a KUKA's ``.dat``, a
+            FANUC's ``POSREG.VA``.
+        source: the controller of a program, where its suffix does not determine it; empty otherwise.
+
+    Raises:
+        UsageError: as for `joints_in`.
     """
     q, names = joints_in(path, source)
     header = list(names)
@@ -88,19 +94,19 @@ def joints_table(path: Path, source: str = "") -> Table:
 def program_files(
     path: Path, out: Path, name: str, settings: ProgramSettings | None = None, source: str = ""
 ) -> dict[Path, str]:
-    """Return the files of a program made from the poses in a CSV file or in another program: path to text.
+    """Return the text of each file of a program made from the poses in a CSV file or in another program, by path.
 
     Args:
-        path: CSV of poses (``joint1 [deg]``) or of a motion (``t [s]``), or a program whose targets are joints.
+        path: CSV of poses (``joint1 [deg]``) or of a motion (``t [s]``), or a program whose targets are joint values.
         out: the output path; its name without suffix is the program's name. A program of one file is written to exactly
             this path; without a suffix, and for programs of several files, the suffixes are the controller's.
-        name: name of a controller, or ``csv``: the poses as a table.
+        name: name of a controller, or ``csv`` for the poses as a table.
         settings: how the program moves and waits; None: the defaults.
-        source: see `joints_in`.
+        source: the controller of a program at `path`, where its suffix does not determine it; empty otherwise.
 
     Raises:
-        UsageError: an unknown controller, a program name that it does not take, another number of axes, or an output
-            where it has none.
+        UsageError: an unknown controller, a program name that the controller does not accept, another number of axes,
+            or a digital output that the controller does not have.
     """
     settings = settings or ProgramSettings()
     if name == CSV:
@@ -118,7 +124,7 @@ def program_files(
         q, names = joints_in(path, source)
     check_controller(name, q.shape[1], settings.pulses)
     if settings.output is not None and not controller.outputs:
-        raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
+        raise UsageError(f"--output: in programs for {controller.title} the operator presses a key; leave it out")
     values: dict[str, object]
     if moving:
         templates = controller.stream
@@ -141,7 +147,7 @@ def program_files(
 
 
 def _csv_text(table: Table) -> str:
-    """Return the text of a table: units in the header, numbers with twelve digits."""
+    """Return a table as CSV text, with units in the header and numbers of twelve digits."""
     header = [f"{name} [{unit}]" if unit else name for name, unit in zip(table.header, table.units)]
     lines = [",".join(header)]
     for row in zip(*table.cells):
@@ -151,7 +157,13 @@ def _csv_text(table: Table) -> str:
 
 
 def _targets(out: Path, names: list[str], controller: Controller) -> list[Path]:
-    """Return the paths of a program's files; `names` are the controller's names for them."""
+    """Return the paths at which a program's files are written.
+
+    Args:
+        out: the output path.
+        names: file names by the controller's convention.
+        controller: the controller.
+    """
     usual = [out.with_name(name) for name in names]
     if not out.suffix:
         return usual
@@ -165,13 +177,25 @@ def _targets(out: Path, names: list[str], controller: Controller) -> list[Path]:
 
 
 def write_program(path: Path, out: Path, name: str) -> list[Path]:
-    """Write the program of a session's planned poses; return the paths of its files."""
+    """Write the program that drives a session's planned poses, and return the paths of its files.
+
+    Args:
+        path: CSV of the planned poses.
+        out: the output path.
+        name: name of a controller.
+    """
     texts = program_files(path, out, name)
     return [files.write(target, text) for target, text in texts.items()]
 
 
 def _poses(controller: Controller, q: np.ndarray, settings: ProgramSettings) -> list[list[str]]:
-    """Return poses q (m, n) [rad] as texts in the units and decimals of a controller's programs."""
+    """Return joint values (m, n) [rad] as texts in a controller's units and number of decimals.
+
+    Args:
+        controller: the controller.
+        q: joint values.
+        settings: settings of the program, of which the pulses per degree are used.
+    """
     values = controller.shown(q)
     if controller.pulses:
         values = values * np.array(settings.pulses)
@@ -179,7 +203,13 @@ def _poses(controller: Controller, q: np.ndarray, settings: ProgramSettings) -> 
 
 
 def _head(controller: Controller, names: list[str], moving: bool) -> list[str]:
-    """Return the comment lines at a program's head: what was not checked, and the names of the joints."""
+    """Return the comment lines at a program's head: safety notes and the joints' names.
+
+    Args:
+        controller: the controller.
+        names: names of the joints.
+        moving: whether the program plays a motion rather than a list of poses.
+    """
     joints = f"Joints: {', '.join(names)}"
     for axis, partner, sign in controller.coupled:
         operator = {1: "+", -1: "-"}[sign]

@@ -29,11 +29,11 @@ class Target:
     """One target in a program.
 
     Attributes:
-        line: its line in the file, from 1.
-        spans: begin and end of each of its numbers in the text.
+        line: line number in the file, from 1.
+        spans: begin and end of each number of the target in the text.
         values: the numbers, in the controller's units.
         kind: ``joints`` or ``pose``.
-        number: number of the pose, where the text before the target states one; else 0.
+        number: number of the pose, if the text before the target contains one; else 0.
     """
 
     line: int
@@ -48,10 +48,10 @@ class Program:
     """The text of a program with its targets.
 
     Attributes:
-        path: its file.
-        controller: its controller.
-        text: the file's bytes as Latin-1.
-        targets: its targets, in the order of the text.
+        path: the program's file.
+        controller: the controller for which it is written.
+        text: the file's bytes decoded as Latin-1.
+        targets: the targets, in the order of the text.
     """
 
     path: Path
@@ -60,7 +60,7 @@ class Program:
     targets: tuple[Target, ...]
 
     def of(self, kind: str) -> list[int]:
-        """Return the indices of the targets of a kind (``joints`` or ``pose``)."""
+        """Return the indices of the targets of one kind (``joints`` or ``pose``)."""
         return [k for k, target in enumerate(self.targets) if target.kind == kind]
 
     @property
@@ -70,8 +70,9 @@ class Program:
 
     @property
     def unread(self) -> str:
-        """Warning on motion statements without a target in their line, with the first of these lines; empty if all have
-        one.
+        """Warning on lines with motion statements but no target, with the first line numbers.
+
+        Empty if there are no such lines.
         """
         target_lines = {target.line for target in self.targets}
         move_lines = _lines_of_moves(self.text, self.controller)
@@ -83,7 +84,7 @@ class Program:
         return f"warning: {self.moves} moves, {len(self.targets)} targets: {reason} ({location})"
 
     def joints(self) -> np.ndarray:
-        """Return the joint targets (m, n) as joint values of a robot's description [rad]."""
+        """Return the joint targets (m, n) [rad], in the joint convention of the robot's description."""
         values = self._values("joints")
         return self.controller.described(values * ANGLES[self.controller.unit])
 
@@ -92,12 +93,14 @@ class Program:
         return pose_of_values(self.controller, self._values("pose"))
 
     def _values(self, kind: str) -> np.ndarray:
-        """Return the numbers of the targets of a kind, one row per target."""
+        """Return the numbers of the targets of one kind, one row per target [the controller's units]."""
         return np.array([target.values for target in self.targets if target.kind == kind])
 
     def rewritten(self, values: Sequence[np.ndarray | None]) -> bytes:
-        """Return the program's bytes with new numbers in its targets, in the controller's units; None leaves a target
-        unchanged.
+        """Return the program's bytes with the numbers of its targets replaced.
+
+        Args:
+            values: new numbers for each target [the controller's units]; None leaves a target unchanged.
         """
         text = self.text
         parts = []
@@ -118,7 +121,7 @@ class Program:
 
 
 def number(value: float, decimals: int) -> str:
-    """Return a number as text with fixed decimals, without a negative zero."""
+    """Return `value` as text with `decimals` decimals, and without a minus sign before zero."""
     written = f"{value:.{decimals}f}"
     if float(written) == 0.0:
         return written.removeprefix("-")
@@ -131,7 +134,7 @@ def formatted(values: np.ndarray, decimals: int) -> list[list[str]]:
 
 
 def pose_values(controller: Controller, poses: np.ndarray) -> np.ndarray:
-    """Return the numbers (m, 6 or 7) of poses (m, 4, 4) [m] as a controller's programs write them."""
+    """Return poses (m, 4, 4) [m] as the numbers (m, 6 or 7) that a controller's programs contain."""
     rotation = Rotation.from_matrix(poses[:, :3, :3])
     if controller.turn == "wxyz":
         angles = rotation.as_quat(canonical=True)[:, [3, 0, 1, 2]]
@@ -145,7 +148,12 @@ def pose_values(controller: Controller, poses: np.ndarray) -> np.ndarray:
 
 
 def pose_of_values(controller: Controller, values: np.ndarray) -> np.ndarray:
-    """Return the poses (m, 4, 4) [m] from the numbers (m, 6 or 7) that a controller's programs write."""
+    """Return the poses (m, 4, 4) [m] that a controller's programs contain as rows of numbers.
+
+    Args:
+        controller: the controller.
+        values: (m, 6 or 7) numbers [the controller's units]: position, then angles or quaternion.
+    """
     rotation = _rotation(controller.turn, values[:, 3:])
     position = values[:, :3] * controller.metres
     return pose_of(rotation, position)
@@ -161,7 +169,11 @@ def _rotation(turn: str, values: np.ndarray) -> Rotation:
 
 
 def _order(turn: str) -> tuple[str, bool]:
-    """Return the axes of a pose's angles as SciPy names them, and whether the angles are in degrees."""
+    """Return the rotation sequence of a pose's angles in SciPy's notation, and whether the angles are in degrees.
+
+    Args:
+        turn: the sequence as the table of controllers writes it: axes, ``moving`` or ``fixed``, and the unit.
+    """
     axes, axes_kind, *unit = turn.split()
     # SciPy's capitals are axes that turn with the body
     order = axes.upper() if axes_kind == "moving" else axes
@@ -169,7 +181,7 @@ def _order(turn: str) -> tuple[str, bool]:
 
 
 def is_program(path: Path) -> bool:
-    """Return whether a file is a controller's program, by its suffix."""
+    """Return whether the name of the file `path` has the suffix of a controller's program."""
     try:
         return bool(controller_of(path))
     except UsageError:
@@ -177,7 +189,7 @@ def is_program(path: Path) -> bool:
 
 
 def text_of(path: Path) -> str:
-    """Return the text of a controller's file, one character for each byte.
+    """Return the text of the controller's file at `path`, decoded so that each byte is one character.
 
     Raises:
         MeasurementError: the file cannot be read.
@@ -189,11 +201,11 @@ def text_of(path: Path) -> str:
 
 
 def read_program(path: Path, controller: str = "") -> Program:
-    """Return a program with its targets.
+    """Return the program in a file, with its targets.
 
     Args:
         path: the program's file.
-        controller: its name in ``controllers.toml``; empty: determined by the suffix.
+        controller: the controller's name in ``controllers.toml``; empty: determined by the suffix.
 
     Raises:
         MeasurementError: the file cannot be read, or has no targets.
@@ -204,14 +216,20 @@ def read_program(path: Path, controller: str = "") -> Program:
     if not targets:
         moves = listing(_lines_of_moves(text, kind), 3)
         moves_message = f"its moves are in line {moves}" if moves else "nor any moves"
-        message = f"has no targets with all their numbers, as {kind.title} writes them; {moves_message}"
+        message = f"has no complete targets in the form that {kind.title} writes; {moves_message}"
         raise MeasurementError(message, path)
     targets.sort(key=lambda target: target.spans[0])
     return Program(path, kind, text, tuple(targets))
 
 
 def _matches(text: str, pattern: str, comment: str) -> list[re.Match[str]]:
-    """Return the matches of a pattern outside comments; none for an empty pattern."""
+    """Return the matches of a regular expression outside comments; an empty list for an empty expression.
+
+    Args:
+        text: the text to be searched.
+        pattern: the expression; in it, NUM is a number.
+        comment: characters that begin a comment; empty for a language without comments.
+    """
     if not pattern:
         return []
     matches = re.finditer(pattern.replace("NUM", NUMBER), text)
@@ -226,7 +244,7 @@ def _matches(text: str, pattern: str, comment: str) -> list[re.Match[str]]:
 
 
 def _lines_of_moves(text: str, controller: Controller) -> list[int]:
-    """Return the lines of the motion statements, from 1."""
+    """Return the line numbers, from 1, of the motion statements in the text of a controller's program."""
     matches = _matches(text, controller.moves, controller.comment)
     return [_line_at(text, match.end()) for match in matches]
 
@@ -249,7 +267,13 @@ def _targets_of_kind(text: str, kind: str, controller: Controller) -> list[Targe
 
 
 def _pose_number(text: str, match: re.Match[str], controller: Controller) -> int:
-    """Return the pose number that the text before a target states; 0 where it states none."""
+    """Return the pose number in the text shortly before a target; 0 where there is none.
+
+    Args:
+        text: the program.
+        match: match of the target.
+        controller: the controller, which defines how poses are numbered.
+    """
     if not controller.numbered:
         return 0
     before = text[max(match.start() - NEAR, 0) : match.start(1)]

@@ -68,7 +68,7 @@ def fleet(calibrations: list[Path], out: Path | None = None) -> None:
             else by the day the session was made, else as given
         out: folder for the report and the priors. Default: nothing is written
     """
-    from calib.apps.fleet.report import report_fleet
+    from calib.apps.fleet.fleet_report import report_fleet
 
     report = report_fleet(calibrations)
     if out is not None:

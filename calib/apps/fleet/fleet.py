@@ -1,4 +1,4 @@
-"""Parallel run of many sessions, one folder per robot; a failed session does not stop the other sessions."""
+"""Parallel run of many sessions, one folder per robot; a failed session does not stop the others."""
 
 import time
 from collections import Counter
@@ -36,11 +36,12 @@ class FleetRow:
 
     Attributes:
         folder: the session's folder or address.
-        state: `DONE`, `WAITS`, `BUSY` (another command works on it) or `FAILED`.
+        state: `DONE`, `WAITS`, `BUSY` (another command works on the session) or `FAILED`.
         verdict: verdict of a finished session; else empty.
-        words: the file that it waits for, or the error.
+        words: the file for which the session waits, or the error message.
         asks: instructions to the engineer at the robot, one per line.
-        nominal, calibrated: position error at held-out poses, rms [mm]; None without such poses.
+        nominal, calibrated: rms position errors of the nominal and of the calibrated robot at held-out poses [mm]; None
+            without such poses.
         torque: unexplained share of the torque on the held-out motion [%]; None without dynamics.
         seconds: wall-clock time [s].
         code: exit code, as of `calib next`.
@@ -81,7 +82,9 @@ def run_sessions(
     plots: bool = True,
     command: str = "calib.run_sessions",
 ) -> Iterator[FleetRow]:
-    """Run sessions as far as possible, and yield the outcome of each; a failed session does not stop the others.
+    """Run each session until it is complete or waits for files, and yield the outcome of each.
+
+    A failed session does not stop the others.
 
     Args:
         folders: one or several folders of sessions, or their ``session.toml``. Or addresses of fsspec, with or without
@@ -107,7 +110,15 @@ def run(
     plots: bool = True,
     pace: Throughput | None = None,
 ) -> Iterator[FleetRow]:
-    """Run every session and yield each outcome; workers on other machines need identical folder paths, or addresses."""
+    """Run every session and yield each outcome as the session ends.
+
+    Args:
+        folders: the sessions' folders, or addresses. Workers on other machines need the folders at identical paths.
+        workers: context that opens the workers.
+        command: command line that the sessions record.
+        plots: whether figures are drawn.
+        pace: record of the workers' throughput, which is updated; None: not recorded.
+    """
     pace = pace or Throughput()
     run_folder = partial(run_session, command=command, plots=plots)
     with workers as crew:
@@ -124,14 +135,16 @@ def run(
 
 
 def run_session(folder: Path | str, command: str = "calib run", plots: bool = True, lease: float = LEASE) -> FleetRow:
-    """Run one session as far as possible, write its output to ``run.log`` and return the outcome. Only Ctrl-C is
-    raised.
+    """Run one session until it is complete or waits for files, and return the outcome.
+
+    Its output is written to ``run.log``. Errors become part of the outcome; only KeyboardInterrupt (Ctrl-C) is raised.
 
     Args:
         folder: the session's folder, or its address.
         command: command line that the session records.
         plots: whether figures are drawn.
-        lease: see `calib.apps.fleet.stores` [s].
+        lease: time without a sign of life after which another process may take the session over [s], see
+            `calib.apps.fleet.stores`.
     """
     if isinstance(folder, Path):
         return _run_here(folder, command, plots)
@@ -203,8 +216,12 @@ def _no_progress(message: str) -> None:
 
 
 def table(outcomes: Sequence[FleetRow]) -> RenderableType:
-    """Return the summary table, one line per robot: rms errors at held-out poses and unexplained torque on held-out
-    motions.
+    """Return the summary table, one line per robot, with errors at held-out poses and torque on held-out motions.
+
+    The columns are state, verdict, rms position errors [mm], unexplained share of the torque [%] and time [s].
+
+    Args:
+        outcomes: outcome of each session.
     """
     summary_table = Table("session", "state", "verdict", box=None, pad_edge=False)
     for name in ("nominal mm", "calibrated mm", "torque %", "s"):
@@ -231,7 +248,11 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
 
 
 def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
-    """Yield a line for each session that is not finished: the missing file, or the error."""
+    """Yield a line for each unfinished session: the file for which the session waits, or the error message.
+
+    Args:
+        outcomes: outcome of each session.
+    """
     beginnings = {WAITS: "{} waits for ", FAILED: "{} failed: "}
     for row in outcomes:
         if row.state == DONE:
@@ -241,7 +262,12 @@ def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
 
 
 def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
-    """Return one line with the number of sessions for each state and verdict."""
+    """Return one line with the number of sessions in each state, the number with each verdict, and the total time.
+
+    Args:
+        outcomes: outcome of each session.
+        seconds: the total time [s].
+    """
     states = Counter(row.state for row in outcomes)
     verdicts = Counter(row.verdict for row in outcomes)
     finished = f"{states[DONE]} of {len(outcomes)} done"

@@ -1,13 +1,12 @@
 """Sessions and studies in object storage or a shared folder, by addresses of fsspec (``s3://bucket/cell7``).
 
-A process that works on such a folder fetches it, works on the copy, and writes back changed files: every few seconds,
-and at the end; the files that mark a step as complete (`LAST`) after all others, whole or not at all. After a killed
-process the files that it had written back remain, and the next process continues from them.
+A process that works on such a folder downloads a copy, works on the copy, and uploads changed files: every few seconds,
+and at the end. The files that mark a step as complete (`LAST`) are uploaded after all others, and never in part. After
+a process was killed, the files that it had uploaded remain, and the next process continues from them.
 
-The file ``calib.claim`` in the folder names the process that works on it, which rewrites the file all the time. Where
-it
-has not changed for `LEASE` seconds, the next process takes the folder over; the earlier one, if it was only slow, then
-writes nothing more.
+The file ``calib.claim`` in the folder names the process that works on it. This process rewrites the file regularly. If
+the file has not changed for `LEASE` seconds, the next process takes the folder over. If the earlier process was only
+slow, it notices this and writes nothing more.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ LEASE = 20.0  # [s] that a claim may go unchanged (our choice)
 
 
 def is_address(path: object) -> bool:
-    """Return whether `path` is an address of fsspec rather than a path."""
+    """Return whether `path` is an address of fsspec, such as ``s3://…``, rather than a path."""
     return "://" in str(path)
 
 
 def sessions(address: str) -> list[str]:
-    """Return the addresses of the sessions that match an address with or without wildcards; empty for a path.
+    """Return the addresses of the sessions that match an address with or without wildcards; an empty list for a path.
 
     Raises:
         UsageError: the storage cannot be read, or no session matches.
@@ -46,9 +45,13 @@ def sessions(address: str) -> list[str]:
     if not is_address(address):
         return []
     files, root = _opened(address)
-    with refused_as(UsageError, Exception, f"{address} cannot be read: {{}}"):
+    with refused_as(UsageError, Exception, f"{address} cannot be read: {{}}; check address and access"):
         session_paths = sorted(files.glob(f"{root}/{SESSION}"))
-    require(session_paths, f"{address}: no session is there ({SESSION})", UsageError)
+    require(
+        session_paths,
+        f"{address}: no session ({SESSION}) is there; give the folder that contains the sessions",
+        UsageError,
+    )
     return [files.unstrip_protocol(path.rpartition("/")[0]) for path in session_paths]
 
 
@@ -56,11 +59,15 @@ def sessions(address: str) -> list[str]:
 def held(address: str, lease: float = LEASE) -> Iterator[Path]:
     """Yield a local copy of the folder at an address, claimed for this process; changed files are written back.
 
+    Args:
+        address: address of the folder.
+        lease: time after which a claim that was not renewed may be taken over [s].
+
     Raises:
         UsageError: there is no storage at the address.
         Busy: another process works on the folder.
-        CalibError: it cannot be read or written (another process took over; the storage is full). Files that were
-            written back before remain.
+        CalibError: the folder cannot be read or written (another process took it over; the storage is full). Files that
+            were written back before remain.
     """
     files, root = _opened(address)
     with refused_as(CalibError, Exception, f"cannot read or write {address}: {{}}; run the same command again"):
@@ -91,7 +98,14 @@ def _opened(address: str) -> tuple[Any, str]:
 
 
 class _Claim:
-    """The file that names the process working on a folder; creating the object takes the claim."""
+    """The file at an address that names the process working on the folder; the constructor takes the claim.
+
+    Args:
+        files: file system of fsspec.
+        address: address of the folder, for messages.
+        path: path of the file in the file system.
+        lease: time [s] after which a claim that was not renewed is taken over.
+    """
 
     def __init__(self, files: Any, address: str, path: str, lease: float) -> None:
         self.files, self.address, self.path, self.beats = files, address, path, 0
@@ -113,14 +127,14 @@ class _Claim:
         self.files.pipe_file(self.path, f"{self.owner} {self.beats}".encode(), mode=mode)
 
     def _read(self) -> str | None:
-        """Return the claim's text; None where there is no claim."""
+        """Return the claim's text; None where no process has a claim."""
         try:
             return self.files.cat_file(self.path).decode()
         except FileNotFoundError:
             return None
 
     def renew(self) -> None:
-        """Rewrite the claim, which shows that this process is alive; raise CalibError if another process took over."""
+        """Rewrite the claim file to show that this process is alive; raise CalibError if another process took over."""
         holder = self._read() or ""
         message = f"{self.address} was taken over by {holder or 'nobody'}; nothing more was written there"
         require(holder.startswith(self.owner), message)
@@ -128,14 +142,14 @@ class _Claim:
         self._write("overwrite")
 
     def release(self) -> None:
-        """Remove the claim if it still belongs to this process."""
+        """Remove the claim file if it still names this process."""
         with refused_as(CalibError, Exception, f"cannot write {self.address}: {{}}"):
             if (self._read() or "").startswith(self.owner):
                 self.files.rm_file(self.path)
 
 
 class _Copy:
-    """A local copy of a folder, with the last known state of its files at the address."""
+    """A local copy of a folder at an address, with the state of its files when they were last transferred."""
 
     def __init__(self, files: Any, root: str, folder: Path, claim: _Claim) -> None:
         self.files, self.root, self.folder, self.claim = files, root, folder, claim
@@ -149,15 +163,16 @@ class _Copy:
         self.known = self._now()
 
     def _now(self) -> dict[str, tuple[int, int]]:
-        """Return modification time [ns] and size [bytes] of each file of the copy, by name."""
+        """Return the modification time [ns] and size [bytes] of each file in the local copy, by name."""
         paths = (path for path in self.folder.rglob("*") if path.is_file() and path.suffix not in PASSING)
         return {
             path.relative_to(self.folder).as_posix(): (path.stat().st_mtime_ns, path.stat().st_size) for path in paths
         }
 
     def keep(self, stop: Event, period: float) -> None:
-        """Renew the claim and write back changed files every `period` seconds until `stop`; errors are reported at the
-        end only.
+        """Renew the claim and write back changed files every `period` seconds until the event `stop`.
+
+        Errors are ignored here; those that persist are raised by the last transfer, at the end.
         """
         while not stop.wait(period):
             try:
@@ -166,7 +181,7 @@ class _Copy:
                 continue
 
     def put_back(self) -> None:
-        """Write changed files to the address, those in `LAST` last."""
+        """Write changed files to the address, those in `LAST` after all others."""
         self.claim.renew()
         state = self._now()
         changed = [name for name in state if state[name] != self.known.get(name)]

@@ -1,4 +1,4 @@
-"""Throughput of workers: who ran how many tasks, and how fast."""
+"""Throughput of workers: the number of tasks that each worker completed, and the time per task."""
 
 import os
 import socket
@@ -11,13 +11,19 @@ from calib.workers import Workers
 
 
 class Throughput:
-    """Durations [s] of every task by worker (host and process), since this object was made."""
+    """Durations [s] of completed tasks, by worker (host and process), since this object was created."""
 
     def __init__(self) -> None:
         self.began, self.spent = time.monotonic(), dict[str, list[float]]()
 
     def completed(self, crew: Workers, function: Callable[..., object], tasks: Iterable[object]) -> Iterator[tuple]:
-        """Yield (number of the task, its result) as `Workers.completed` does, noting the worker and its time."""
+        """Yield (index of the task, result) as tasks are completed, and record the worker and the duration of each.
+
+        Args:
+            crew: the workers.
+            function: the function to call for each task.
+            tasks: the arguments, one per task.
+        """
         for number, answer in crew.completed(partial(_signed, function), tasks):
             if isinstance(answer, TaskLost):
                 yield number, answer
@@ -27,7 +33,7 @@ class Throughput:
             yield number, result
 
     def lines(self, limit: int = 8) -> list[str]:
-        """Return one line per worker, the slowest first, at most `limit`; none for a single worker."""
+        """Return one line per worker, the slowest first, at most `limit` lines; an empty list for a single worker."""
         minutes = max((time.monotonic() - self.began) / 60.0, 1e-9)
         ranked = sorted(self.spent.items(), key=lambda item: len(item[1]))
         if len(ranked) < 2:
@@ -45,7 +51,7 @@ class Throughput:
 
 
 def _signed(function: Callable[..., object], task: object) -> tuple[object, str, float]:
-    """Run a task; return its result, the worker (host and process), and the wall-clock time [s]."""
+    """Run function(task); return its result, the worker (host and process), and the wall-clock time [s]."""
     started = time.monotonic()
     result = function(task)
     return result, f"{socket.gethostname()}:{os.getpid()}", time.monotonic() - started

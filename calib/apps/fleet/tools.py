@@ -1,4 +1,4 @@
-"""Tools of a fleet: whether a tool that several arms share is bent or loose, judged against arms with other tools."""
+"""Tools of a fleet: tests whether a tool that several arms share is bent or loose, against arms with other tools."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,33 +8,34 @@ from scipy import stats
 
 from calib.errors import Finding, finding
 
-# with the tool, and with others, that a comparison needs (our choice)
+# smallest numbers of arms for a comparison: with the tool, and with other tools (our choice)
 MIN_ARMS = 2, 3
-# between medians, above it a tool is named: 99 %, as of other findings
+# significance of the difference of medians, in sigmas, above which a tool is reported: 99 %, as for other findings
 SIGMAS = 2.6
-# times the typical distance from the median, which larger ones count as (our choice)
+# distances from the median are limited to this multiple of the typical distance (our choice)
 MAX_DISTANCE = 3.0
-# share of the degrees of freedom that remains by that (our choice)
+# share of the degrees of freedom that remains after this limitation (our choice)
 FREEDOM_SHARE = 0.8
-# [m, or of a logarithm]
+# smallest scatter, of positions [m] and of logarithms of errors
 MIN_SCATTER = 1e-6
-# of the others' error, below it a tool is not called loose (our choice)
+# smallest ratio of the arms' error with a loose tool to the error of the other arms (our choice)
 MIN_TIMES = 1.5
 
 
 @dataclass(frozen=True)
 class ToolUse:
-    """Comparison of the arms with one tool with arms of the same type that have other tools.
+    """Comparison of arms with one tool against arms of the same type with other tools.
+
+    `moved`, `moved_sigmas`, `times` and `times_sigmas` are None where there are too few arms.
 
     Attributes:
-        tool: its name in the measurements (``tool`` of the options file).
+        tool: the tool's name in the measurements (``tool`` in the options file).
         arms: names of the arms with this tool.
-        moved: distance of the tool's median position from that of the other tools [m].
-        moved_sigmas: significance of `moved`, as the deviation of a normal variable that is as unlikely, given the
-            scatter among arms with one tool.
+        moved: distance between the tool's median position and that of the other tools [m].
+        moved_sigmas: significance of `moved`: the deviation, in σ, of a normal variable with the same probability,
+            given the scatter among arms with one tool.
         times: median rms error of these arms, divided by that of the other arms.
-        times_sigmas: significance of log(times), in the same sense as `moved_sigmas`. All four are None where too few
-            arms are compared.
+        times_sigmas: significance of log(times), defined as for `moved_sigmas`.
     """
 
     tool: str
@@ -45,7 +46,7 @@ class ToolUse:
     times_sigmas: float | None = None
 
     def findings(self) -> list[Finding]:
-        """Return the finding that the tool is bent or loose; empty where it is neither."""
+        """Return the finding that the tool is bent or loose; an empty list where it is neither."""
         bent = loose = None
         if self.moved_sigmas is not None and self.moved_sigmas > SIGMAS:
             bent = self.moved
@@ -57,10 +58,10 @@ class ToolUse:
 
 
 def tools(tool_uses: Mapping[str, tuple[str, np.ndarray, float]]) -> list[ToolUse]:
-    """Return the comparison for each tool.
+    """Return the comparison of each tool with the other tools.
 
     Args:
-        tool_uses: arm to (tool, its position (3,) in the tip's frame [m], rms error of the calibrated arm [m]).
+        tool_uses: arm to (tool, the tool's position (3,) in the tip's frame [m], rms error of the calibrated arm [m]).
     """
     names = sorted({tool for tool, _, _ in tool_uses.values()})
     return [_use(name, tool_uses) for name in names]
@@ -96,10 +97,15 @@ def _use(name: str, tool_uses: Mapping[str, tuple[str, np.ndarray, float]]) -> T
 
 
 def _sigmas(step: np.ndarray, groups: Sequence[np.ndarray]) -> float:
-    """Return the significance of the difference `step` (k,) of two groups' medians, as deviation of a normal variable.
+    """Return the significance, in σ of a normal variable, of the difference `step` (k,) between two groups' medians.
 
-    The scatter is that of the arms (n, k) about the median of their group, as if all of it were along the difference: a
-    tool's position scatters most along the last axis, where it cannot be separated from the arm's last link.
+    The scatter is estimated from the deviations of the arms from the median of their group. All of it is taken to be
+    along the difference: a tool's position scatters most along the last axis, where it cannot be separated from the
+    arm's last link.
+
+    Args:
+        step: (k,) difference of the two medians, such as of positions (k = 3) [m].
+        groups: the groups, each (n, k) with one row per arm.
     """
     distances = []
     freedom = 0

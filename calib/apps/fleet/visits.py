@@ -1,12 +1,12 @@
-"""Calibrations of a fleet by arm: finished ones only, grouped by serial number, in order of time."""
+"""Finished calibrations of a fleet, grouped by arm (serial number) and sorted by date."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
 
-from calib.apps.monitoring.comparison.calibrations import Calibration, read_fit
-from calib.apps.monitoring.comparison.places import Place, place_of
+from calib.apps.monitoring.comparison.calibration_sources import Place, place_of
+from calib.apps.monitoring.comparison.geometry_calibration import Calibration, read_fit
 from calib.errors import Finding, UsageError, finding, listing, require
 from calib.result_kinds import refusal
 from calib.toolkit.sessions import folders_of
@@ -19,10 +19,10 @@ class Visits:
     """The finished calibrations of a fleet.
 
     Attributes:
-        by_arm: serial number, or the name of a calibration that states none, to that arm's calibrations, earliest
-            first.
-        noticed: findings on calibrations that were left out, count as separate arms, or are taken as an arm's current
-            one.
+        by_arm: serial number to that arm's calibrations, earliest first; a calibration without a serial number has its
+            name as the key.
+        noticed: findings on calibrations that were left out, that count as separate arms, or that are taken as an arm's
+            current calibration.
     """
 
     by_arm: Mapping[str, Sequence[Calibration]]
@@ -36,7 +36,7 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
         calibrations: folders of fits or sessions.
 
     Raises:
-        UsageError: a folder that holds no fit or is given twice, or fewer than two finished calibrations.
+        UsageError: a folder without a fit or given twice, or fewer than two finished calibrations.
     """
     places = [place_of(folder, "fleet") for folder in folders_of(calibrations)]
     unfinished: list[str] = []
@@ -57,10 +57,10 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
         visits_by_arm.setdefault(arm, []).append((source, calibration))
 
     finished_count = len(places) - len(unfinished)
-    counts = f"{finished_count} of {len(places)} left, nothing to compare"
+    counts = f"{finished_count} of {len(places)} have one, too few to compare"
     message = f"sessions without a verdict yet: {listing(unfinished)}; {counts}"
     enough = finished_count > 1 or not unfinished
-    require(enough, f"{message} (calib next, or calib run, goes on with them)", UsageError)
+    require(enough, f"{message}; continue them with calib next or calib run", UsageError)
 
     unnamed = []
     current = []
@@ -80,9 +80,13 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
 
 
 def _dates(arm_visits: Sequence[Visit]) -> tuple[str, list[date]]:
-    """Return what one arm's dates refer to (measurement or session), and the dates; no dates where some are not known.
+    """Return the kind of dates by which one arm's calibrations are sorted, and the dates.
 
-    Dates of measurement are taken where any is stated, else those on which the sessions were made.
+    The kind is "measurement" if any calibration has a date of measurement, otherwise "the session" (the date on which
+    the session was created). The list of dates is empty if a calibration has no such date.
+
+    Args:
+        arm_visits: the arm's calibrations.
     """
     settings = [source.session.settings for source, _ in arm_visits if source.session]
     dated_thing = "measurement"
@@ -100,7 +104,13 @@ def _dates(arm_visits: Sequence[Visit]) -> tuple[str, list[date]]:
 
 
 def _in_time(arm_visits: Sequence[Visit]) -> list[Visit]:
-    """Return one arm's calibrations, earliest first; those of one day, and those without dates, in the given order."""
+    """Return one arm's calibrations, earliest first.
+
+    Calibrations of one day remain in the given order; so do all of them where dates are missing.
+
+    Args:
+        arm_visits: the arm's calibrations in the order given by the user.
+    """
     _, dates = _dates(arm_visits)
     if not dates:
         return list(arm_visits)
@@ -109,7 +119,12 @@ def _in_time(arm_visits: Sequence[Visit]) -> list[Visit]:
 
 
 def _current(arm: str, arm_visits: Sequence[Visit]) -> Finding:
-    """Return the finding that names the calibration taken as an arm's current one, and the reason."""
+    """Return the finding that names the calibration taken as an arm's current one, and the reason.
+
+    Args:
+        arm: serial number of the arm.
+        arm_visits: its calibrations in the order given by the user.
+    """
     dated_thing, dates = _dates(arm_visits)
     current = _in_time(arm_visits)[-1][1].name
     last = arm_visits[-1][1].name

@@ -1,4 +1,4 @@
-"""Measured points joined with the joints of a robot's controller: calib join."""
+"""Join measured points with the joint values from a robot's controller: `calib join`."""
 
 OFFERS = {"commands": "commands:app", "planned_poses": "planned:read_planned", "formats": ":FORMATS"}
 FORMATS = {

@@ -1,13 +1,11 @@
-"""A step of a clock inside a stream, or its wandering, which a line through the offsets would mistake for drift.
+"""Test for a step or a wandering of a clock within a stream, which a fit of offset and drift would take for drift.
 
-About the fit of clock and arm (`calib.apps.joining.clocks.fitted`) the offset may change at a time T by a free size;
-all
-fitted parameters, and backlash, are free too. The least-squares estimate of the size, divided by its σ, is largest at
-the
-true T. A clock that wanders smoothly (temperature) gives sizes at many T: a step must explain more than a polygon of
-`KNOTS` offsets does, or be significant beside the polygon. Where the stamps of the rows depart from an even step by
-that
-size, the file and the row of the step are known. Thresholds are our choice.
+At a time T, the clocks' offset may change by an unknown size. The size is estimated by least squares, linearised about
+the fit of clock and arm (`calib.apps.joining.clocks.fitted`), together with all fitted parameters and the joints'
+backlash. The size divided by its σ is largest at the true T. A clock that wanders smoothly (temperature) gives sizes at
+many T. A step is therefore accepted only if it explains more than a piecewise linear offset with `KNOTS` knots does, or
+if it is significant in addition to that. Where the time stamps of a file's rows are uneven by the size of the step, the
+file and the row of the step are known. The thresholds are our choice.
 """
 
 from __future__ import annotations
@@ -19,26 +17,27 @@ import numpy as np
 
 from calib.apps.joining.stream_files import Stream
 
-# by which a joint comes to rest before where it was sent, from either side [rad or m]
+# prior standard deviation of the backlash by which a joint stops short of its commanded value, from either side
+# [rad or m]
 BACKLASH = 1e-4
-# of the polygon, ends included
+# number of knots of the polygon, ends included
 KNOTS = 6
-# number of times at which a step is tried, evenly, then between the neighbours of the best
+# number of times at which a step is tried: first evenly spaced, then between the neighbours of the best of these
 COARSE_TIMES, FINE_TIMES = 120, 40
-# smallest step that is reported [s]
+# smallest step of the clock that is reported [s]
 MIN_STEP = 3e-3
-# its least size in σ, alone and beside the polygon
+# smallest size of a reported step in σ: without, and in addition to, the polygon
 CERTAIN_ALONE, CERTAIN_BESIDE_POLYGON = 5.0, 7.0
-# share of the size by which the stamps may differ from it
+# share of a step's size by which the jump of a file's time stamps may differ from it, for the file to show the step
 STAMPED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Whitened least squares about a fit of clock and arm.
+    """Whitened linear least-squares equations about a fit of clock and arm.
 
     Attributes:
-        matrix: (rows + priors, p), parameters in any units.
+        matrix: (rows + priors, p) derivatives by the parameters, in any units.
         target: (rows + priors,) right-hand side.
         offset_slope: (rows,) derivative by the clock's offset [1/s].
         backlash_slopes: (rows, joints) derivative by each joint's backlash [1/rad or 1/m].
@@ -54,15 +53,21 @@ class Equations:
 
 @dataclass(frozen=True)
 class Step:
-    """Change of instrument's clock against the controller's by `size` ± `sigma` [s] at the instrument's `time` [s]."""
+    """Step of the instrument's clock against the controller's.
+
+    Attributes:
+        time: time of the step by the instrument's clock [s].
+        size, sigma: the step and its standard deviation [s].
+    """
 
     time: float
     size: float
     sigma: float
 
     def place(self, log: Stream, stream: Stream, log_time: float) -> str:
-        """Return the file whose stamps show the step, with time and row; where neither shows it, the times in both
-        files.
+        """Return as text where the step is: the file whose time stamps show it, with time and row.
+
+        Where the stamps of neither file show the step, the text has its times by both clocks.
 
         Args:
             log: the controller's log.
@@ -79,8 +84,15 @@ class Step:
         return stream_row
 
     def _stamp(self, file: Stream, size: float, time: float) -> tuple[float, str]:
-        """Return the misfit of a file's stamps to a step of `size` [s] near `time` [s], as a share of `size`, and its
-        row.
+        """Return how badly a file's time stamps match a step of `size` [s] near `time` [s], and where they match best.
+
+        The first number is the difference between the best matching interval of the stamps and the step, divided by
+        `size`. The place is a text with row and time.
+
+        Args:
+            file: the file with its time stamps.
+            size: size of the step [s].
+            time: approximate time of the step by the file's clock [s].
         """
         intervals = np.diff(file.t)
         row_counts = np.diff(file.rows)
@@ -97,10 +109,13 @@ class Step:
 
 
 def find_step(equations: Equations) -> tuple[Step | None, float]:
-    """Return the most significant step, None without one, and the clock's deviation from a line of offset and drift
-    [s].
+    """Return the most significant step, and the clock's largest deviation from a line of offset and drift [s].
 
-    The deviation is 0 where a line is as good as a polygon.
+    The step is None where no step is significant. The deviation is 0 where a piecewise linear offset explains the data
+    no better than a line.
+
+    Args:
+        equations: least-squares equations of the fit of clock and arm.
     """
     begin, end = float(equations.t.min()), float(equations.t.max())
     # the polygon: offsets at the inner knots, each with a hat function of the time
@@ -130,8 +145,13 @@ def find_step(equations: Equations) -> tuple[Step | None, float]:
 
 
 def _search(equations: Equations, beside: np.ndarray) -> tuple[Step, float]:
-    """Return the most significant step at any time, and the sum of squares that it explains; searched coarsely, then
-    closely.
+    """Return the most significant step at any time, and the decrease of the sum of squared residuals that it achieves.
+
+    Times are searched on a coarse grid, then on a fine one.
+
+    Args:
+        equations: least-squares equations of the fit of clock and arm.
+        beside: (n, rows) other changes of the offset [s], whose sizes are estimated too.
     """
     begin, end = float(equations.t.min()), float(equations.t.max())
     times, spacing = np.linspace(begin, end, COARSE_TIMES + 2, retstep=True)
@@ -141,12 +161,12 @@ def _search(equations: Equations, beside: np.ndarray) -> tuple[Step, float]:
 
 
 def _best(equations: Equations, times: np.ndarray, beside: np.ndarray) -> tuple[Step, float]:
-    """Return the most significant of steps at `times` (k,) [s], and the sum of squares that it explains.
+    """Return the most significant of the steps at `times` (k,), and the decrease of the sum of squares by it.
 
     Args:
-        equations: the fit.
-        times: the instrument's times of the steps [s].
-        beside: (n, rows) other changes of the offset [s], whose sizes are free.
+        equations: least-squares equations of the fit of clock and arm.
+        times: candidate times by the instrument's clock [s].
+        beside: (n, rows) other changes of the offset [s], whose sizes are estimated too.
     """
     steps = equations.t > times[:, None]
     errors, *columns = _projected(equations, [*beside, *steps])
@@ -168,12 +188,13 @@ def _best(equations: Equations, times: np.ndarray, beside: np.ndarray) -> tuple[
 
 
 def _projected(equations: Equations, changes: list[np.ndarray]) -> np.ndarray:
-    """Return residuals after projecting out all free parameters: of the target (first row), and of each change of the
-    offset.
+    """Return the residuals (1 + k, rows) that remain after all fitted parameters and backlash are projected out.
+
+    The first row is the residual of the right-hand side; each further row is that of one change of the offset.
 
     Args:
-        equations: the fit.
-        changes: changes (rows,) of the offset [s].
+        equations: least-squares equations of the fit of clock and arm.
+        changes: k changes (rows,) of the clock's offset [s].
     """
     rows, joints = equations.backlash_slopes.shape
     count = len(equations.target)

@@ -1,12 +1,12 @@
-"""Clock of an instrument against a controller's, from points measured while the arm moves.
+"""Clock of an instrument relative to a controller's, from points measured while the arm moves.
 
-A point at the instrument's time t belongs to the joints q(t - offset - drift (t - middle)) of the log. Start values are
-found without any frame: the speed of the nominal arm's tip is correlated with that of the points at every offset; the
-best few offsets are tried by placing instrument and target. Then offset, drift, both placements and the arm's geometry
-are fitted together (Gauss-Newton), since errors of the arm would otherwise be taken for errors of the clock. The prior
-size of an effect's terms is estimated from the data (`calib.estimation.relevance`): with a fixed size, σ of the clock
-is
-too large for arms with smaller effects, and too small for arms with larger ones. Thresholds are our choice.
+A point at the instrument's time t was measured at the joint values q(t - offset - drift (t - middle)) of the log. Start
+values of the offset need no frames: the speed of the nominal arm's tip is correlated with that of the points at every
+offset. For the offsets with the highest correlation, instrument and target are placed by least squares, and the best is
+taken. Then offset, drift, both placements and the arm's geometry are fitted together (Gauss-Newton), since errors of
+the arm would otherwise be taken for errors of the clock. The prior standard deviation of an effect's terms is estimated
+from the data (`calib.estimation.relevance`): with a fixed one, σ of the clock is too large for arms with smaller
+effects, and too small for arms with larger ones. Thresholds are our choice.
 """
 
 from __future__ import annotations
@@ -41,45 +41,46 @@ from calib.toolkit.pose_data import Positions, take
 from calib.toolkit.statistics import gram, relevance, robust_weights, spread
 from calib.transforms import invert, rotation_vector
 
-# step of the grid of offsets that are tried first [s]
+# spacing of the offsets that are tried first [s]
 GRID = 0.05
-# lever arms by which the tip's turning counts as speed, since the target's place at the tip is unknown [m]
+# lever arms [m] that are tried to convert the tip's rotation to speed, since the target's position on the tip is
+# unknown
 LEVERS = (0.0, 0.15, 0.4)
-# number of offsets that are tried for each lever, and their least distance [s]
+# number of offsets that are tried for each lever arm, and the smallest distance between them [s]
 PEAKS, PEAK_DISTANCE = 3, 1.0
-# share of the shorter file that the longer one has, at least
+# smallest share of the shorter file that has to overlap in time with the longer one
 OVERLAP = 0.5
-# percent of the residuals that an offset is assessed by
+# percentage of the residuals, smallest first, whose rms is the misfit of an offset
 TRIMMED = 90
-# rows that placements are guessed from
+# number of rows from which placements are guessed
 PLACED = 300
-# residual of the nominal arm over the points' spread up to which a log is of the same motion
+# largest ratio of the nominal arm's residual to the spread of the points for a log of the same motion
 MAX_RATIO = 0.15
-# times the residual of the best offset, up to which another one is as good
+# an offset is as good as the best one if its residual is less than this factor times the best residual
 RIVAL = 1.3
-# prior standard deviation of a clock's drift
+# prior standard deviation of a clock's drift [s/s]
 MAX_DRIFT = 1e-3
-# difference of times by which speeds are computed [s]
+# step of the central differences by which velocities are computed [s]
 TIME_STEP = 1e-3
 # highest order of the harmonics that are fitted
 ORDERS = 6
-# most rounds of Gauss-Newton
+# largest number of Gauss-Newton iterations
 ROUNDS = 12
-# change of the offset below which the rounds end [s]
+# change of the offset below which the iteration ends [s]
 SETTLED = 1e-6
-# least and largest size of terms over their guessed size
+# smallest and largest ratio of the terms' prior standard deviations to their first guesses
 TERM_SIZES = (1e-3, 5.0)
 _NONE = np.array([], dtype=int)
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Clock of an instrument against the controller's.
+    """Clock of an instrument relative to the controller's.
 
     Attributes:
         offset, sigma: the instrument's time minus the controller's at `middle`, and its standard deviation [s].
-        drift, drift_sigma: change of the offset with time, and its standard deviation [s/s].
-        middle: the instrument's time to which `offset` refers [s].
+        drift, drift_sigma: rate of change of the offset, and its standard deviation [s/s].
+        middle: the instrument's time at which the difference is `offset` [s].
     """
 
     offset: float
@@ -89,18 +90,18 @@ class Clock:
     middle: float = 0.0
 
     def controller(self, t: np.ndarray) -> np.ndarray:
-        """Return the controller's times of the instrument's times t (m,) [s]."""
+        """Return the controller's times for the instrument's times t (m,) [s]."""
         return t - self.offset - self.drift * (t - self.middle)
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A motion in both recordings.
+    """A motion that both the controller and the instrument recorded.
 
     Attributes:
-        log: the controller's joints.
-        stream: the instrument's rows.
-        points: these rows as measurements, without joint values.
+        log: joint values over time from the controller.
+        stream: rows over time from the instrument.
+        points: the stream's rows as measurements, without joint values.
     """
 
     log: Stream
@@ -112,16 +113,25 @@ class Run:
         return CubicSpline(self.log.t, self.log.values)
 
     def joints(self, clock: Clock, rows: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the log's joint values (m, n) at the times of rows, or their derivative of an order; beyond the log,
-        its ends.
+        """Return the log's joint values (m, n) at the times of the stream's rows, or their time derivative.
+
+        Times outside the log are replaced by its first or last time.
+
+        Args:
+            clock: the instrument's clock.
+            rows: (m,) indices of rows of the stream.
+            order: order of the derivative; 0 for the joint values.
         """
         times = clock.controller(self.stream.t[rows])
         start, end = self.log.t[[0, -1]]
         return self._path(np.clip(times, start, end), order)
 
     def known(self, clock: Clock, count: int | None = None) -> np.ndarray:
-        """Return the rows whose times lie between two rows of the log without a gap; `count` of them, evenly, or all
-        for None.
+        """Return the indices of the stream's rows whose times are within the log and outside the log's gaps.
+
+        Args:
+            clock: the instrument's clock.
+            count: number of rows to return, evenly chosen; None for all.
         """
         log = self.log
         t = clock.controller(self.stream.t)
@@ -134,17 +144,28 @@ class Run:
         return rows[evenly(len(rows), count)]
 
     def lines(self) -> list[str]:
-        """Return the remarks on both files."""
+        """Return the remarks on the rows of both files."""
         return [*self.log.lines(), *self.stream.lines()]
 
     def at(self, clock: Clock, rows: np.ndarray) -> Positions:
-        """Return the given rows as measurements with their joint values."""
+        """Return rows of the stream as measurements with their joint values.
+
+        Args:
+            clock: the instrument's clock, which determines the joint values.
+            rows: (m,) indices of the rows.
+        """
         return replace(take(self.points, rows), q=self.joints(clock, rows))
 
 
 @dataclass(frozen=True, eq=False)
 class _Start:
-    """Nominal arm placed at one offset of the clocks; `misfit` is the rms of the smallest residuals [m]."""
+    """Nominal arm with the placements that fit one offset of the clocks.
+
+    Attributes:
+        misfit: rms of the smallest residuals [m].
+        clock: the clock with this offset.
+        cell: the nominal arm with placed station and tool.
+    """
 
     misfit: float
     clock: Clock
@@ -152,7 +173,13 @@ class _Start:
 
 
 def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...]]:
-    """Return the nominal arm placed, the clock to begin with, and other offsets that fit as well [s].
+    """Return start values: the nominal arm with stations and tools placed, the clock, and other possible offsets [s].
+
+    With the other offsets, the rms residual is at most `RIVAL` times the smallest one.
+
+    Args:
+        chain: the nominal arm.
+        run: the recordings of controller and instrument.
 
     Raises:
         MeasurementError: no offset brings the points onto the nominal arm's path.
@@ -176,9 +203,9 @@ def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...
     if best_misfit > min(MAX_RATIO * extent, MAX_MISFIT * chain.stretched_length()):
         refuse_data(
             run.stream.file,
-            f"at no offset of the clocks its points are on the path of the nominal arm by {run.log.file} (the best "
+            f"no offset of the clocks puts its points on the nominal arm's path of {run.log.file} (the best "
             f"leaves {1e3 * best_misfit:.3g} mm of a motion of {1e3 * extent:.3g} mm): is it the log of this "
-            "motion, and of this robot, did instrument and target stay in place, and did no clock jump? "
+            "motion and of this robot, did instrument and target stay in place, and did no clock jump? "
             f"({'; '.join(run.lines())})",
         )
     alike = [start for start in starts if start.misfit < RIVAL * best_misfit]
@@ -192,7 +219,12 @@ def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...
 
 
 def _offsets(chain: Chain, run: Run) -> list[float]:
-    """Return offsets of the clocks [s] at which the speeds of the arm and of the points correlate."""
+    """Return offsets of the clocks [s] at which the speeds of the arm's tip and of the points correlate best.
+
+    Args:
+        chain: the nominal arm.
+        run: the recordings of controller and instrument.
+    """
     arm = forward(chain, _even(run.log))
     arm_steps = _step_lengths(arm[:, :3, 3])
     rotations = invert(arm[:-1])[:, :3, :3] @ arm[1:, :3, :3]
@@ -226,19 +258,23 @@ def _step_lengths(positions: np.ndarray) -> np.ndarray:
 
 
 def _even(stream: Stream) -> np.ndarray:
-    """Return a stream's values (m, k) interpolated at even times, `GRID` [s] apart."""
+    """Return a stream's values (m, k) interpolated at times `GRID` [s] apart."""
     t = np.arange(stream.t[0], stream.t[-1], GRID)
     columns = [np.interp(t, stream.t, column) for column in stream.values.T]
     return np.column_stack(columns)
 
 
 def _cut(speed: np.ndarray) -> np.ndarray:
-    """Return speeds (m,) minus their median, with jumps clipped."""
+    """Return speeds (m,) minus their median, with outliers clipped."""
     return np.minimum(speed, 2.0 * np.quantile(speed, 0.95)) - np.median(speed)
 
 
 def _alike(series_a: np.ndarray, series_b: np.ndarray) -> np.ndarray:
-    """Return the correlation coefficient of two series where they overlap, at every lag."""
+    """Return the correlation coefficient of two time series at every lag, over the samples where they overlap.
+
+    Args:
+        series_a, series_b: (a,) and (b,) samples at equal time steps.
+    """
     ones_a, ones_b = np.ones(len(series_a)), np.ones(len(series_b))
     count = np.maximum(np.round(correlate(ones_a, ones_b)), 1.0)
     mean_a = correlate(series_a, ones_b) / count
@@ -251,14 +287,28 @@ def _alike(series_a: np.ndarray, series_b: np.ndarray) -> np.ndarray:
 
 
 def residuals(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> np.ndarray:
-    """Return the residuals (3 or 6, m) of rows: positions [m], then orientations [rad]."""
+    """Return the residuals (3 or 6, m) of the stream's rows: positions [m], then orientations [rad].
+
+    Args:
+        cell: the arm with station and tool.
+        run: the recordings of controller and instrument.
+        rows: (m,) indices of rows of the stream.
+        clock: the instrument's clock, which determines the joint values of the rows.
+    """
     (block,) = prepare(cell, [run.at(clock, rows)])
     parts = observe(cell, block, _NONE)
     return np.concatenate([part.value for part in parts])
 
 
 def velocities(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> np.ndarray:
-    """Return velocities (3 or 6, m) [m/s, then rad/s] of the target at rows, by the installation's arm and the log."""
+    """Return velocities (3 or 6, m) [m/s, then rad/s] of the target at the stream's rows, from arm and log.
+
+    Args:
+        cell: the arm with station and tool.
+        run: the recordings of controller and instrument.
+        rows: (m,) indices of rows of the stream.
+        clock: the instrument's clock.
+    """
     later = replace(clock, offset=clock.offset + TIME_STEP)
     sooner = replace(clock, offset=clock.offset - TIME_STEP)
     difference = residuals(cell, run, rows, later) - residuals(cell, run, rows, sooner)
@@ -268,16 +318,19 @@ def velocities(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> 
 def fitted(
     cell: Installation, run: Run, rows: np.ndarray, clock: Clock, arm: bool = True, backlash: bool = False
 ) -> tuple[Installation, Clock, Equations]:
-    """Return the installation and the clock that fit the given rows best, and the last equations.
+    """Return the installation and the clock that fit the given rows best, and the equations linearised about them.
 
-    σ of the clock holds for independent rows.
+    σ of the clock is computed for independent rows.
 
     Args:
-        cell, clock: where to start: the nominal arm, about which its parameters have a wide prior.
-        arm: whether the arm, with all effects that a model of `calib fit` may have, is fitted, too, not placements,
-            offset and drift alone.
-        backlash: whether the backlash of its joints is, too, which else passes for a clock that is late; rows are then
-            taken to have no outliers.
+        cell: the arm with stations and tools, as the start value. The arm is nominal; its parameters get a wide prior.
+        run: the recordings.
+        rows: (m,) indices of the stream's rows to fit.
+        clock: the clock as the start value.
+        arm: whether the arm's geometry is fitted, with all effects that a model of `calib fit` may have; otherwise only
+            placements, offset and drift are fitted.
+        backlash: whether backlash of the joints is fitted, which otherwise looks like a delay of the clock. Rows are
+            then assumed to have no outliers.
     """
     families = list[list[Term]]()
     terms = list[Term]()
@@ -365,13 +418,13 @@ def fitted(
 def _sized(
     matrix: np.ndarray, target: np.ndarray, pulled: np.ndarray, guess: np.ndarray, group: np.ndarray
 ) -> np.ndarray:
-    """Return the prior standard deviations (p,); those of a family of terms are scaled by the most probable factor.
+    """Return the prior standard deviations (p,), with those of each family of terms scaled by the most probable factor.
 
     Args:
-        matrix, target: whitened rows of the data, (rows, p) and (rows,).
-        pulled: (p,) the prior's mean minus the present values.
+        matrix, target: whitened equations matrix · step = target of the data, (rows, p) and (rows,).
+        pulled: (p,) the prior's mean minus the current values.
         guess: (p,) prior standard deviations before scaling.
-        group: (p,) number of a term's family; -1 for other columns.
+        group: (p,) number of each parameter's family; -1 for parameters that are not terms of an effect.
     """
     ungrouped = group < 0
     prior_rows = ungrouped & np.isfinite(guess)

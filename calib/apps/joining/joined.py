@@ -1,4 +1,4 @@
-"""Joint values and points in one table, and the names of the columns by which files are joined."""
+"""Table of joint values with measured points, and the column names by which files are joined."""
 
 import re
 from collections.abc import Sequence
@@ -15,7 +15,10 @@ CLOCKS = ("t", "time", "timestamp", "datetime")
 
 
 def column_of(table: Table, names: Sequence[str]) -> str:
-    """Return the table's first column that has one of the `names`, in any spelling; empty if it has none."""
+    """Return the name of the table's first column whose name is one of `names`; empty if there is none.
+
+    Upper and lower case and punctuation are ignored.
+    """
     # of two columns with the same plain name the first
     plain = dict[str, str]()
     for name in table.header:
@@ -28,11 +31,12 @@ def column_of(table: Table, names: Sequence[str]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """Joint values and points in one table.
+    """Joint values with measured points in one table.
 
     Attributes:
         table: one row per measured pose.
-        poses: index of each row's pose among the joints; by motion, of its point in the points' file.
+        poses: for each row, the index of its pose in the joints' file; if joined by motion, the index of its point in
+            the points' file.
         notes: how the files were joined, and what is missing.
     """
 

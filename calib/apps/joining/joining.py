@@ -48,19 +48,19 @@ from calib.toolkit.result_folders import lines_of
 from calib.units import TIMES
 
 METHODS = ("name", "time", "row", "geometry", "motion")
-# what the files need for each of the methods without motion
-REQUIREMENTS = ("both files need a column of names (name, pose, id …)", "of times (t)", "as many rows", "give --robot")
+# requirements of each method except motion, for messages
+REQUIREMENTS = ("both files need names (a column name, pose, id …)", "times (column t)", "as many rows", "give --robot")
 
 # Thresholds are our choice.
-# distance of two readings of one pose [m], where nothing is known of their scatter
+# largest distance of two readings of one pose [m], where their scatter is not known
 MAX_DISTANCE = 1e-3
-# times the median distance of two readings of one pose, up to which they are one
+# largest distance of two readings of one pose, as a multiple of the median of such distances
 MAX_DISTANCE_RATIO = 10.0
-# degrees of freedom of a scatter that is stated as sigma
+# smallest number of degrees of freedom of a scatter that is written as sigma
 MIN_REPEATS = 5
-# before and after a point the arm stands [s], moving at most
+# time before and after a point during which the arm has to stand still [s]
 STANDSTILL = 0.25
-# of a joint's whole travel
+# largest motion of a joint during this time, as a share of the joint's whole travel
 MAX_MOTION = 1e-3
 _MEASURED = re.compile(r"[xyz]\d*(_meas|_measured)?")
 
@@ -78,20 +78,22 @@ def join(
     """Join a controller's joint values and an instrument's points to one table of measured poses.
 
     Args:
-        joints: CSV file of joint values, one row per pose, or a log over time; or the file in which a controller kept
-            the joints of `calib program`.
+        joints: CSV file of joint values, one row per pose, or a log over time; or the file to which a program of `calib
+            program` wrote the joint values at the controller.
         points: CSV file of measured points.
-        by: ``name``, ``time``, ``row``, ``geometry`` or ``motion``; empty: the first of these that both files have
-            columns for, but not ``motion``.
-        robot, base, tip: the nominal robot, as for `calib.load`, by whose geometry the order is checked or found.
+        by: ``name``, ``time``, ``row``, ``geometry`` or ``motion``; empty: the first of these for which both files have
+            columns, except ``motion``.
+        robot: the nominal robot, by whose geometry the order is checked or found: library name, file, folder of a fit,
+            or in memory; None: not checked.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
 
     Returns:
-        The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` takes. By
+        The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` reads. By
         motion, also the clock (`calib.apps.joining.streams.Streamed`).
 
     Raises:
         UsageError: an unknown `by`, one for which the files have no columns, or ``motion`` without a robot.
-        MeasurementError: the files do not belong together.
+        MeasurementError: the points were not measured at the poses of the joints' file.
     """
     one_of(by or "row", METHODS, "by", UsageError)
     joints_file, points_file = Path(joints), Path(points)
@@ -99,7 +101,7 @@ def join(
         robot = load_calibrated(robot, base, tip)
     if by == "motion":
         if robot is None:
-            raise UsageError("by motion the clocks are found from the nominal arm's path: give --robot")
+            raise UsageError("joining by motion needs the nominal arm's path: give --robot")
         return join_streams(joints_file, points_file, robot.complete)
     if is_program(joints_file):
         joint_table = joints_table(joints_file)
@@ -131,7 +133,9 @@ def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joine
     elif by == "name":
         pose = _same_names(joints, points, *name_columns)
         if not (pose >= 0).any():
-            raise MeasurementError(f"{points.file}: no name is one of {joints.file}")
+            raise MeasurementError(
+                f"{points.file}: none of its names is in {joints.file}: name the poses alike in both files"
+            )
     else:
         pose = np.arange(len(points))
     if chain is not None and by != "time":
@@ -147,14 +151,17 @@ def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joine
 def ordered(
     chain: Chain, q: np.ndarray, points: Table, candidates: dict[str, np.ndarray], sheet: Sheet | None = None
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the index (m,) of each point's pose among q (n, joints), -1 for none, and notes on the order.
+    """Return for each of m points the index of its pose among q (n, joints), -1 for none, and notes on the order.
 
     Args:
-        candidates: orders to try first, in words → (m,) index of each point's pose.
-        sheet: the points with the options for reading them.
+        chain: the nominal arm.
+        q: joint values of the poses [rad or m].
+        points: table of the measured points.
+        candidates: orders that are tried first: description of the order to (m,) index of each point's pose.
+        sheet: the points with the options for reading them; None: the default options.
 
     Raises:
-        MeasurementError: where no order explains the points.
+        MeasurementError: no order explains the points.
     """
     position = _positions(sheet or Sheet(points))
     measured = np.flatnonzero(np.isfinite(position).all(axis=1))
@@ -180,19 +187,19 @@ def ordered(
         limit = 1e3 * MAX_MISFIT * chain.stretched_length()
         refuse_data(
             points.file,
-            f"its {len(measured)} points are not those of these {len(q)} poses in {searched} (within {limit:.0f} mm of "
-            f"the nominal arm): is it this robot and this list, and did instrument and target stay in place?{advice}",
+            f"its {len(measured)} points do not fit the {len(q)} poses in {searched} (within {limit:.0f} mm of "
+            f"the nominal arm): is this the right robot and list, and did instrument and target stay in place?{advice}",
         )
     pose = np.full(len(position), -1)
     pose[measured] = order.pose
     notes = [f"{len(measured)} points, {order.origin} ({1e3 * order.rms:.2g} mm rms from the nominal arm)"]
     strange = measured[order.pose < 0]
     if len(strange):
-        notes.append(f"belonging to no pose, left out: rows {listing(points.rows[strange])}")
+        notes.append(f"left out, since they are near no pose: rows {listing(points.rows[strange])}")
     if order.rivals:
         doubtful = measured[list(order.rivals)]
         pose[doubtful] = -1
-        notes.append(f"poses too close together to tell apart, left out: rows {listing(points.rows[doubtful])}")
+        notes.append(f"left out, since several poses are equally near: rows {listing(points.rows[doubtful])}")
     return pose, tuple(notes)
 
 
@@ -204,11 +211,13 @@ def merged(
     keys: Collection[str],
     name_missing: bool = True,
 ) -> Joined:
-    """Return the joints' rows joined with their points, several readings of one pose averaged.
+    """Return the rows of joint values with their points; several readings of one pose are averaged.
 
     Args:
+        joints, points: tables of joint values and of points.
         pose: (m,) index of each point's row of joints; -1 for none.
-        keys: columns by which they were joined, left out.
+        notes: notes on the joining, to be extended.
+        keys: names of the columns by which the files were joined; these columns are left out.
         name_missing: whether a note names the poses without a point.
     """
     position = _positions(Sheet(points))
@@ -219,7 +228,7 @@ def merged(
     stray = points.rows[pose < 0]
     groups, inconsistent = _consistent(position, groups, label, points)
     if not groups:
-        raise MeasurementError(f"{points.file}: none of its {len(points)} points is left")
+        raise MeasurementError(f"{points.file}: none of its {len(points)} points belongs to a pose of {joints.file}")
     notes = [*notes, *inconsistent]
     if missing and name_missing:
         notes.append(f"without a point: {len(missing)} of {len(joints)} poses: {listing(missing)}")
@@ -250,7 +259,9 @@ def merged(
             errors = position[rows] - position[rows].mean(axis=0)
             squares = squares + (errors**2).sum(axis=0)
         sigma = 1e3 * np.sqrt(squares / repeats)
-        notes.append(f"{counted(repeats, 'repeated reading')} averaged, σ of one {np.mean(sigma):.2g} mm per axis")
+        notes.append(
+            f"{counted(repeats, 'repeated reading')} averaged, σ of one reading {np.mean(sigma):.2g} mm per axis"
+        )
         has_sigma = any(name.startswith("sigma") for name in point_names)
         if repeats >= MIN_REPEATS and not has_sigma and np.all(sigma):
             header += SIGMA.names
@@ -261,7 +272,10 @@ def merged(
 
 
 def _positions(sheet: Sheet) -> np.ndarray:
-    """Return measured positions (m, 3) [m], of several targets those of the first; NaN where it was not measured."""
+    """Return measured positions (m, 3) [m] of the m rows of `sheet`; NaN where none was measured.
+
+    Of several targets, the first one is used.
+    """
     columns = sheet.family(POSITION.names) or sheet.family(POSITION.names, "1")
     if not columns:
         refuse_data(sheet.table.file, f"has no x, y, z; found {', '.join(sheet.table.header)}")
@@ -271,7 +285,14 @@ def _positions(sheet: Sheet) -> np.ndarray:
 def _consistent(
     position: np.ndarray, groups: dict[int, np.ndarray], label: Sequence[str], points: Table
 ) -> tuple[dict[int, np.ndarray], list[str]]:
-    """Return the groups of readings without those whose readings contradict each other, and remarks on the latter."""
+    """Return the groups of readings whose readings agree, and remarks on the other groups.
+
+    Args:
+        position: (m, 3) measured positions [m].
+        groups: pose to indices of its readings.
+        label: name of each pose.
+        points: table of the points, for the remarks.
+    """
     distances = {}
     for k, rows in groups.items():
         if len(rows) > 1:
@@ -290,8 +311,15 @@ def _consistent(
 
 
 def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position: np.ndarray) -> np.ndarray:
-    """Return a column of points, one cell per group: the mean of measured numbers, else the cell of the reading nearest
-    to the mean position.
+    """Return a column of the points with one cell per group of readings.
+
+    The cell is the mean for measured numbers; otherwise it is the cell of the reading nearest to the mean position.
+
+    Args:
+        points: table of the m points.
+        name: name of the column.
+        groups: pose to indices of its readings.
+        position: (m, 3) measured positions [m].
     """
     cells = points.cells[points.index(name)]
     if _MEASURED.fullmatch(name) and cells.dtype == float:
@@ -305,7 +333,7 @@ def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position:
 
 
 def _labels(joints: Table) -> list[str]:
-    """Return a name for each row of joints: from the column of names, else the row numbers from 1."""
+    """Return a name for each row of joints: from the column of names if there is one, else the row numbers from 1."""
     name = column_of(joints, NAMES)
     if name:
         return joints.texts(name)
@@ -313,7 +341,12 @@ def _labels(joints: Table) -> list[str]:
 
 
 def _same_names(joints: Table, points: Table, joint_column: str, point_column: str) -> np.ndarray:
-    """Return the row of joints (m,) that has each point's name, -1 where none has."""
+    """Return for each point the row of joints with the point's name, (m,); -1 where no row has it.
+
+    Args:
+        joints, points: tables of joint values and of points.
+        joint_column, point_column: names of the columns with the names of poses.
+    """
     point_names = points.texts(point_column)
     joint_names = joints.texts(joint_column)
     # first by the whole names, then by their numbers
@@ -328,13 +361,16 @@ def _same_names(joints: Table, points: Table, joint_column: str, point_column: s
 
 
 def _plain(text: str) -> str:
-    """Return a name in comparable form: lower-case letters and digits, without leading zeros: ``P_007`` is ``p7``."""
+    """Return the name `text` in comparable form: lower-case letters and digits, without leading zeros.
+
+    ``P_007`` becomes ``p7``.
+    """
     plain = re.sub(r"[^a-z0-9]", "", text.lower())
     return re.sub(r"(?<!\d)0+(?=\d)", "", plain)
 
 
 def _number(text: str) -> str:
-    """Return the last number in a name, or the name where it has none."""
+    """Return the last number in the name `text` without leading zeros; the whole name if it has no number."""
     numbers = re.findall(r"\d+", text) or [text]
     return numbers[-1].lstrip("0")
 
@@ -342,7 +378,12 @@ def _number(text: str) -> str:
 def _at_times(
     joints: Table, points: Table, joint_column: str, point_column: str
 ) -> tuple[Table, np.ndarray, tuple[str, ...]]:
-    """Return joints at the times of the points, the pose index (m,) of each point (-1 if the arm moved), and notes."""
+    """Return joints at the times of the points, the pose index (m,) of each point (-1 if the arm moved), and notes.
+
+    Args:
+        joints, points: tables of joint values and of points, with times of one clock.
+        joint_column, point_column: names of the columns of times.
+    """
     t = _seconds(joints, joint_column)
     point_times = _seconds(points, point_column)
     not_after = np.flatnonzero(np.diff(t) <= 0.0)
@@ -382,12 +423,21 @@ def _at_times(
 
 
 def _interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the values (m, k) at `times` (m,) of series (N, k) at t (N,)."""
+    """Return the values of a time series, linearly interpolated at other times: (m, k).
+
+    Args:
+        times: (m,) times of the result [s].
+        t: (N,) times of the series [s], rising.
+        values: (N, k) the series.
+    """
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
 def _seconds(table: Table, name: str) -> np.ndarray:
-    """Return a column of times (m,) [s]: numbers in the header's unit, or dates and times by ISO 8601."""
+    """Return the column `name` of a table as times (m,) [s].
+
+    The column contains numbers in the header's unit, or ISO 8601 dates and times.
+    """
     column = table.index(name)
     if table.cells[column].dtype == float:
         return table.numbers(name, None) * table.factor(column, TIMES, "")

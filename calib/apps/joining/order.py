@@ -1,11 +1,11 @@
-"""Which pose of a robot each measured point belongs to, found from the nominal arm.
+"""Assignment of measured points to a robot's poses, found from the nominal arm's geometry.
 
-A point p of pose i is S (a_i + R_i t) + noise: a_i, R_i the nominal tip, S the instrument's placement, t the target in
-the tip's frame. Distances between points depend on neither the order nor S: t is first chosen so that the sorted
-distances between the predicted points agree with those between the measured ones; triples of poses whose three
-distances are those of three measured points each give a placement (random sample consensus, Fischler and Bolles 1981);
-the best placements are refined, in turns: points to poses by the assignment of least cost (clipped, so that gross
-errors do not count), then S and t by least squares.
+A point p measured at pose i is S (a_i + R_i t) + noise, with a_i, R_i the nominal tip, S the instrument's placement,
+and t the target in the tip's frame. Distances between points depend on neither the order nor S. First, t is chosen so
+that the sorted distances between the predicted points agree with those between the measured ones. Then a triple of
+poses and a triple of measured points with the same three distances give a candidate for S (random sample consensus,
+Fischler and Bolles 1981). The best candidates are refined by alternating two steps: points are assigned to poses with
+least total cost (clipped, so that gross errors have no influence), and S and t are fitted by least squares.
 """
 
 from __future__ import annotations
@@ -24,34 +24,35 @@ from calib.toolkit.installations import install
 from calib.toolkit.pose_data import PoseMeasurements
 
 # Thresholds are our choice.
-# of the arm's length: what nominal errors leave in the right order, at most
+# largest misfit of the right order due to the errors of the nominal arm, as a share of the arm's length
 MAX_MISFIT = 0.02
-# below which an order is not checked: placing instrument and target takes all they say
+# smallest number of points to check an order: fewer points suffice only to place instrument and target
 MIN_POINTS = 6
-# below which no order is looked for: of 10 points in 40 poses, one in twelve was wrong
+# smallest number of points to search for an order: of orders found for 10 points in 40 poses, one in twelve was wrong
 MIN_FOUND = 12
-# another pose is possible if its point is nearer than so many rms residuals
+# another pose is possible if its predicted point is nearer than this number of rms residuals
 AMBIGUOUS = 3.0
-# tools to start from, measured triples, placements that are refined
+# number of tool positions to start from, of triples of measured points, and of placements that are refined
 STARTS, TRIPLES, REFINED = 6, 12, 8
-# tried where these fail [m]
+# tool positions that are tried where those do not lead to an order [m]
 TOOLS = [np.array(tool) for tool in product((-0.1, 0.0, 0.1), repeat=3)]
-# of an assignment and a placement
+# largest number of iterations of assignment and placement
 MAX_ROUNDS = 10
-# points that a placement is scored by
+# number of points by which the misfit of a placement is computed
 SCORED = 15
-# of poses that are compared with one triple of points
+# largest number of triples of poses that are compared with one triple of points
 MAX_TRIPLES = 20_000
 
 
 @dataclass(frozen=True, eq=False)
 class Order:
-    """Poses to which m points belong.
+    """Assignment of m measured points to poses.
 
     Attributes:
-        pose: (m,) index of each point's pose, -1 where it belongs to none; several readings of one pose share it.
-        error: (m,) distance of each point from the nominal arm's point in that pose [m].
-        rivals: indices of points that could as well belong to another pose.
+        pose: (m,) index of each point's pose, -1 for none; several readings of one pose have the same index.
+        error: (m,) distance of each point from the point that the nominal arm predicts for that pose [m].
+        rivals: indices of points that another pose explains nearly as well, with an error below `AMBIGUOUS` times the
+            rms.
         origin: how the order was found, in words.
     """
 
@@ -62,17 +63,20 @@ class Order:
 
     @property
     def rms(self) -> float:
-        """Root mean square of the errors of the points that belong to a pose [m]."""
+        """Root mean square of the errors of all points that are assigned to a pose [m]."""
         errors = self.error[self.pose >= 0]
         return float(np.sqrt(np.mean(errors**2)))
 
 
 def find_order(chain: Chain, q: np.ndarray, points: np.ndarray, candidates: dict[str, np.ndarray]) -> Order | None:
-    """Return the pose among q (n, joints) of each of the points (m, 3) [m]; None if no order explains the points.
+    """Return the assignment of points (m, 3) [m] to the poses q (n, joints); None if no order explains the points.
 
     Args:
         chain: the nominal arm.
-        candidates: orders to try first, in words → (m,) index of each point's pose, -1 where it does not say.
+        q: joint values of the poses [rad or m].
+        points: measured positions.
+        candidates: orders that are tried first: description of the order to (m,) index of each point's pose, -1 for
+            none.
     """
     limit = MAX_MISFIT * chain.stretched_length()
     for origin, pose in candidates.items():
@@ -104,7 +108,15 @@ def find_order(chain: Chain, q: np.ndarray, points: np.ndarray, candidates: dict
 def _orders_from(
     chain: Chain, q: np.ndarray, points: np.ndarray, starts: Iterable[np.ndarray], limit: float
 ) -> list[Order]:
-    """Return the orders refined from each start, up to the first in which nearly all points belong to a pose."""
+    """Return the orders refined from each start, up to the first order that assigns nearly all points to poses.
+
+    Args:
+        chain: the nominal arm.
+        q: (n, joints) joint values of the poses [rad or m].
+        points: (m, 3) measured positions [m].
+        starts: orders to begin from, each (m,) the index of each point's pose, -1 for none.
+        limit: largest distance of a point from its pose's predicted point [m].
+    """
     orders = list[Order]()
     for pose in starts:
         order = _refined(chain, q, points, pose, limit)
@@ -119,7 +131,16 @@ def _orders_from(
 def _refined(
     chain: Chain, q: np.ndarray, points: np.ndarray, pose: np.ndarray, limit: float, prefer: np.ndarray | None = None
 ) -> Order | None:
-    """Return the order refined from the start `pose`; None if most of the points then belong to no pose."""
+    """Return the order refined from the start `pose` (m,); None if most points are then assigned to no pose.
+
+    Args:
+        chain: the nominal arm.
+        q: joint values of the poses [rad or m].
+        points: measured positions (m, 3) [m].
+        pose: index of each point's pose, -1 for none.
+        limit: largest distance of a point from its pose's predicted point [m].
+        prefer: (m,) poses that are taken where they are possible, -1 for none; None: no preference.
+    """
     rounds = 0
     while True:
         assigned = np.flatnonzero(pose >= 0)
@@ -154,8 +175,19 @@ def _refined(
 def _predicted(
     chain: Chain, q: np.ndarray, points: np.ndarray, pose: np.ndarray, assigned: np.ndarray
 ) -> np.ndarray | None:
-    """Return the nominal points (n, 3) [m] of all poses, instrument and target placed by the `assigned` points; None if
-    these do not determine the placement.
+    """Return the predicted points (n, 3) [m] of all poses, in the instrument's frame.
+
+    Instrument and target are placed by least squares over the assigned points.
+
+    Args:
+        chain: the nominal arm.
+        q: (n, joints) joint values of the poses [rad or m].
+        points: (m, 3) measured positions [m].
+        pose: (m,) index of each point's pose.
+        assigned: indices or mask of the points to use.
+
+    Returns:
+        The points; None if the assigned points do not determine the placement.
     """
     block = PoseMeasurements.of(q[pose[assigned]], points[assigned], joint_names=chain.joint_names)
     try:
@@ -167,10 +199,12 @@ def _predicted(
 
 
 def _assigned(cost: np.ndarray, bound: float, prefer: np.ndarray | None) -> np.ndarray:
-    """Return the pose (m,) of each point by the assignment of least total clipped cost; -1 where the cost exceeds
-    `bound`.
+    """Return the pose (m,) of each point by the assignment of least total clipped cost; -1 for costs above `bound`.
 
-    `prefer` (m,) are poses taken where their cost is below `bound`, -1 for none; None: no preference.
+    Args:
+        cost: (m, n) cost of assigning each point to each pose: their distance [m].
+        bound: value at which costs are clipped.
+        prefer: (m,) poses that are taken where their cost is below `bound`, -1 for none; None: no preference.
     """
     clipped = np.minimum(cost, bound)
     if prefer is not None:
@@ -185,7 +219,13 @@ def _assigned(cost: np.ndarray, bound: float, prefer: np.ndarray | None) -> np.n
 
 
 def _by_distances(arm: np.ndarray, points: np.ndarray, tools: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yield start orders (m,) from distances between points: the best of many triples of poses."""
+    """Yield start orders (m,) from the best of many triples of poses whose distances match those of measured points.
+
+    Args:
+        arm: (n, 4, 4) poses of the nominal arm's tip.
+        points: (m, 3) measured positions [m].
+        tools: possible positions (3,) of the target in the tip's frame [m], to be tried one after the other.
+    """
     rng = np.random.default_rng(0)
     scored_points = rng.permutation(len(points))[:SCORED]
     bound = 0.06 * float(np.linalg.norm(np.std(points, axis=0)))
@@ -209,12 +249,24 @@ def _by_distances(arm: np.ndarray, points: np.ndarray, tools: Iterable[np.ndarra
 
 
 def _tool_points(arm: np.ndarray, tool: np.ndarray) -> np.ndarray:
-    """Return the points (n, 3) of the arm's tips (n, 4, 4) at the offset `tool` (3,) in their frames."""
+    """Return the positions (n, 3) [m] of a point fixed to the tip.
+
+    Args:
+        arm: (n, 4, 4) poses of the tip.
+        tool: (3,) coordinates of the point in the tip's frame [m].
+    """
     return arm[:, :3, 3] + arm[:, :3, :3] @ tool
 
 
 def _tools(arm: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
-    """Return offsets (3,) of the target in the tip's frame [m] for which distances between points agree best."""
+    """Return possible positions (3,) of the target in the tip's frame [m].
+
+    For these, the distances between predicted points are distributed most like those between measured points.
+
+    Args:
+        arm: (n, 4, 4) poses of the nominal arm's tip.
+        points: (m, 3) measured positions [m].
+    """
     share = np.linspace(0.02, 0.98, 60)
     measured = np.quantile(pdist(points), share)
 
@@ -229,7 +281,12 @@ def _tools(arm: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
 
 
 def _wide_triples(points: np.ndarray, rng: np.random.Generator) -> Iterator[np.ndarray]:
-    """Yield triples of points (indices) that span large triangles."""
+    """Yield triples of indices of points that span large triangles.
+
+    Args:
+        points: (m, 3) positions [m].
+        rng: generator for the choice of triples.
+    """
     drawn = np.array([rng.permutation(len(points))[:3] for _ in range(20 * TRIPLES)])
     a, b, c = np.moveaxis(points[drawn], 1, 0)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -238,7 +295,14 @@ def _wide_triples(points: np.ndarray, rng: np.random.Generator) -> Iterator[np.n
 
 
 def _similar(between: np.ndarray, triangle: np.ndarray, bound: float, rng: np.random.Generator) -> np.ndarray:
-    """Return triples (k, 3) of poses whose distances differ by less than `bound` from those of a triangle (3, 3)."""
+    """Return triples (k, 3) of poses whose mutual distances match those of a triangle (3, 3) within `bound`.
+
+    Args:
+        between: (n, n) distances between the poses' predicted points [m].
+        triangle: corners of the triangle [m].
+        bound: largest accepted difference of a distance [m].
+        rng: generator for the choice among many pairs.
+    """
     ab, ac, bc = pdist(triangle)
     a, b = np.nonzero(np.abs(between - ab) < bound)
     max_pairs = max(MAX_TRIPLES * 50 // len(between), 1)
@@ -252,7 +316,13 @@ def _similar(between: np.ndarray, triangle: np.ndarray, bound: float, rng: np.ra
 
 
 def _moved(triangle: np.ndarray, targets: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the points (k, m, 3) after the motions that lay a triangle (3, 3) on each target (k, 3, 3)."""
+    """Return the points after the rigid motions that map a triangle (3, 3) onto each of k triangles: (k, m, 3).
+
+    Args:
+        triangle: corners of the triangle.
+        targets: (k, 3, 3) corners of the triangles onto which it is moved.
+        points: (m, 3) points to move.
+    """
     centre = triangle.mean(axis=0)
     middle = targets.mean(axis=1)
     covariance = np.einsum("kia,ib->kab", targets - middle[:, None], triangle - centre)

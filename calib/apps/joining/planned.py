@@ -1,4 +1,4 @@
-"""Points that an instrument measured at planned poses, without joint values: the planned joints are used."""
+"""Points that an instrument measured at planned poses, without joint values: the planned joint values are used."""
 
 from __future__ import annotations
 
@@ -26,26 +26,28 @@ from calib.toolkit.pose_data import (
 )
 from calib.toolkit.result_folders import joints_of, lines_of
 
-# between a commanded and a reached joint position [rad or m] (our choice)
+# standard deviation of the difference between commanded and reached joint position [rad or m] (our choice)
 SIGMA_JOINT = 1e-4
-# of the differences that propagate it [rad or m]
+# step of the central differences that propagate this standard deviation to the tip [rad or m]
 STEP = 1e-6
 
 
 def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMeasurements]:
-    """Return the points of the file at `path` with the joints of the poses planned in ``options.planned``.
+    """Return the points of a file, joined with the planned joint values from the file ``options.planned``.
 
-    The poses are those whose numbers the points' names contain, else those in the list's order; where the nominal arm
-    contradicts both, the order is found from it (`calib.apps.joining.order`).
+    Poses are identified by the numbers in the points' names, otherwise by the order of the rows. Where the nominal arm
+    contradicts both, the order is found from the arm's geometry (`calib.apps.joining.order`).
 
-    The poses are those that the points' names number, else those in the list's order; where the nominal arm
-    contradicts both, their order is found from it (`calib.apps.joining.order`).
+    Args:
+        path: the file of the points.
+        chain: the nominal arm.
+        options: how the file is read; ``planned`` is the file of the planned poses.
 
     Returns:
-        One block; none where the file has joint columns, or no positions.
+        One block; an empty list where the file has joint columns, or no positions.
 
     Raises:
-        MeasurementError: where the points are not those of the planned poses in any order.
+        MeasurementError: the points were not measured at the planned poses, in whatever order.
     """
     points = read_table(path)
     sheet = Sheet(points, options)
@@ -79,7 +81,12 @@ def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMea
 
 
 def _stated_orders(points: Table, count: int) -> dict[str, np.ndarray]:
-    """Return orders that the file may state, by names or by rows: description to index (m,) of each point's pose."""
+    """Return the orders that the file suggests, by names or by rows: description to (m,) index of each point's pose.
+
+    Args:
+        points: table of the m points.
+        count: number of planned poses.
+    """
     orders = dict[str, np.ndarray]()
     name = column_of(points, NAMES)
     if name:
@@ -100,12 +107,19 @@ def _stated_orders(points: Table, count: int) -> dict[str, np.ndarray]:
 
 
 def _in_plan(pose: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices of poses, -1 for those beyond the `count` planned ones."""
+    """Return the indices of poses, with -1 in place of those beyond the `count` planned ones."""
     return np.where(pose < count, pose, -1)
 
 
 def _stop_sigma(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the standard deviation (m,) [m] per axis of the tip's position from `SIGMA_JOINT` at each joint."""
+    """Return the standard deviation (m,) [m] per axis of the tip's position due to the accuracy of stopping.
+
+    Each joint is assumed to have the standard deviation `SIGMA_JOINT`.
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+    """
     squares = []
     for axis in np.eye(chain.n):
         ahead = forward(chain, q + STEP * axis)

@@ -1,10 +1,9 @@
 """Files of rows over time (a tracker's stream, a controller's log), read in pieces; unusable rows are counted.
 
-A row is left out where a required cell is not a number or out of range, where all cells are zero (the tracker lost its
-target), where the number of cells is wrong, and where its time is not later than all times before. A clock that goes
-back
-and continues from there was restarted: the file is refused, since half of its rows would be left out. Of the other rows
-only as many are kept as the resolution asks for, and at most `HELD`, so that memory is bounded.
+A row is unusable where a required cell is not a number or out of range, where all cells are zero (the tracker lost its
+target), where the number of cells is wrong, and where its time is not later than all times before. If the times jump
+back and continue from there, the clock was restarted: the file is refused, since half of its rows would be unusable. Of
+the usable rows only as many are kept as the requested resolution needs, and at most `HELD`, so that memory is bounded.
 """
 
 from __future__ import annotations
@@ -25,18 +24,18 @@ from calib.toolkit.recordings import GAP
 from calib.units import TIMES
 
 # Thresholds are our choice.
-# rows read at once
+# number of rows that are read at once
 PIECE = 50_000
-# rows held, at most: beyond them every second one
+# largest number of rows in memory; beyond it, every second row is dropped
 HELD = 500_000
-# time between two rows of a stream, at most [s]
+# largest time between two rows of a stream [s]
 SLOWEST = 0.2
-# of a stream
+# smallest number of usable rows of a stream
 MIN_ROWS = 200
-# by which a clock that was restarted goes back, at least [s]
+# smallest jump back of a clock that was restarted [s]
 RESTART = 1.0
-# reasons for which rows are left out
-DAMAGED, LATE = "damaged, empty or not seen", "with a time not after the row before"
+# reasons for which rows are ignored, for messages
+DAMAGED, LATE = "damaged, empty or not seen", "with a time not after that of the row before"
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +43,13 @@ class Stream:
     """The usable rows of a file over time.
 
     Attributes:
-        file: its path.
-        t: (m,) times, rising [s].
-        values: (m, k) [SI].
+        file: the file's path.
+        t: (m,) times, increasing [s].
+        values: (m, k) values [SI].
         rows: (m,) row numbers in the file, from 1.
         step: median time between two rows [s].
         read: number of rows in the file.
-        dropped: reason to number of rows left out.
+        dropped: reason to number of rows that were left out for it.
     """
 
     file: str
@@ -63,11 +62,11 @@ class Stream:
 
     @property
     def gap(self) -> float:
-        """Time between two rows above which the values between them count as unknown [s]."""
+        """Longest time between two rows across which values are interpolated [s]."""
         return max(GAP, 5.0 * self.step)
 
     def lines(self) -> list[str]:
-        """Return the remarks on the file's rows."""
+        """Return the remarks on the file's rows: their number, those left out, and gaps."""
         name = Path(self.file).name
         summary = f"{name}: {self.read} rows, {self.t[-1] - self.t[0]:.4g} s"
         reasons = _reasons(self.dropped)
@@ -83,13 +82,14 @@ class Stream:
 
 @dataclass(frozen=True)
 class Kind:
-    """How the values of a file's rows are read.
+    """How the values of a file's rows are read and checked.
 
     Attributes:
-        names: table to the names of its required columns.
-        values: table of numbers to values (m, k) [SI].
-        sound: values to whether each row (m,) is possible.
-        refuse: (table, values); raises MeasurementError where most rows are impossible, with the likely cause.
+        names: function from a table to the names of its required columns.
+        values: function from a table of numbers to values (m, k) [SI].
+        sound: function from values to whether each row is physically possible, (m,) bool.
+        refuse: function of (table, values) that raises MeasurementError, with the likely cause, where most rows are
+            impossible.
         resolution: approximate time between the rows that are kept [s].
     """
 
@@ -102,7 +102,12 @@ class Kind:
 
 @dataclass(frozen=True)
 class _Jump:
-    """A jump of a file's clock by more than `RESTART`: number of the row after it, times before and after [s]."""
+    """A jump of a file's clock by more than `RESTART`.
+
+    Attributes:
+        row: number of the row after the jump.
+        before, after: times of the rows before and after the jump [s].
+    """
 
     row: int
     before: float
@@ -111,29 +116,33 @@ class _Jump:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Times (m,) [s], values (m, k) and row numbers (m,) of the rows kept from a piece of a file."""
+    """Times (m,) [s], values (m, k) and row numbers (m,) of the rows that are kept from one piece of a file."""
 
     t: np.ndarray
     values: np.ndarray
     rows: np.ndarray
 
     def every(self, stride: int) -> _Part:
-        """Return the rows whose number in the file is a multiple of `stride`, counted from row 1."""
+        """Return every `stride`-th row of the file: those with the numbers 1, 1 + `stride`, 1 + 2 `stride`, …."""
         multiple = (self.rows - 1) % stride == 0
         return _Part(self.t[multiple], self.values[multiple], self.rows[multiple])
 
 
 def _reasons(dropped: Counter[str]) -> str:
-    """Return as text how many rows were left out for each reason; empty if none was."""
+    """Return as text how many rows were left out for each reason; empty if no row was left out.
+
+    Args:
+        dropped: reason to number of rows.
+    """
     return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
 
 
 def read_stream(path: Path, kind: Kind) -> Stream:
-    """Return the usable rows of the file at `path`.
+    """Return the usable rows of the file at `path`; `kind` describes how they are read.
 
     Raises:
-        MeasurementError: a file without times, one that was measured at stops, one whose clock was restarted, or one
-            most of whose rows are unusable.
+        MeasurementError: a file without times, a file measured at stops rather than as a stream, a clock that was
+            restarted, or a file with mostly unusable rows.
     """
     dropped = Counter[str]()
     jumps = list[_Jump]()
@@ -176,7 +185,7 @@ def read_stream(path: Path, kind: Kind) -> Stream:
         reasons = _reasons(dropped)
         if reasons:
             message += f" ({reasons})"
-        refuse_data(path, f"{message}: is it a stream, and one recording?")
+        refuse_data(path, f"{message}: is it a stream, recorded without interruption?")
     parts = [part for part in parts if len(part.t)]
     t = np.concatenate([part.t for part in parts])
     values = np.concatenate([part.values for part in parts])
@@ -186,7 +195,9 @@ def read_stream(path: Path, kind: Kind) -> Stream:
 
 
 def _refuse_restart(path: Path, jumps: Sequence[_Jump]) -> None:
-    """Raise MeasurementError where a file's times go back and do not return (a copied block of rows does return).
+    """Raise MeasurementError where a file's times jump back for good.
+
+    A copied block of rows is no restart: after it, the times jump forward again.
 
     Args:
         path: the file.
@@ -201,7 +212,12 @@ def _refuse_restart(path: Path, jumps: Sequence[_Jump]) -> None:
 
 
 def _piece(table: Table, kind: Kind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times (m,) [s] and values (m, k) [SI] of a table, and whether each row is possible, (m,) bool."""
+    """Return times (m,) [s] and values (m, k) [SI] of a table, and whether each row is possible, (m,) bool.
+
+    Args:
+        table: a piece of a file.
+        kind: how its values are read.
+    """
     clock = table.index(_clock(table))
     t = table.cells[clock] * table.factor(clock, TIMES, "")
     sound = np.isfinite(t)
@@ -222,7 +238,7 @@ def _piece(table: Table, kind: Kind) -> tuple[np.ndarray, np.ndarray, np.ndarray
 
 
 def _clock(table: Table) -> str:
-    """Return the name of the column of times."""
+    """Return the name of the table's column of times."""
     clock = column_of(table, CLOCKS)
     if not clock:
         columns = f"found {listing(table.header)}. What was measured at stops is joined by name, time or row"
@@ -231,7 +247,12 @@ def _clock(table: Table) -> str:
 
 
 def _step(t: np.ndarray, table: Table) -> float:
-    """Return the time between rows [s]; raise MeasurementError for a file that was measured at stops."""
+    """Return the median time between rows [s]; raise MeasurementError for a file measured at stops.
+
+    Args:
+        t: (m,) times of the rows [s].
+        table: the file's table, which the message names.
+    """
     step = float(np.median(np.diff(t)))
     if step > SLOWEST:
         message = f"its rows are {step:.3g} s apart, a stream's {SLOWEST:g} s at most. Is t in ms ('t [ms]')?"
@@ -240,8 +261,9 @@ def _step(t: np.ndarray, table: Table) -> float:
 
 
 def _pieces(path: Path) -> Iterator[Table]:
-    """Yield the table at `path` in pieces of at most `PIECE` rows; a cell that is not a number is NaN, a date its
-    seconds.
+    """Yield the table at `path` in pieces of at most `PIECE` rows.
+
+    A cell with a date becomes seconds; a cell that is not a number becomes NaN.
     """
     first_row = 1
     with (
@@ -270,7 +292,13 @@ def _data_lines(lines: Iterable[str]) -> Iterator[str]:
 
 
 def _row(line: str, separator: str, width: int) -> list[float]:
-    """Return the numbers of a line; all NaN if it does not have `width` cells."""
+    """Return the numbers of a line; all NaN if it does not have `width` cells.
+
+    Args:
+        line: the line.
+        separator: character between cells; a blank is any white space.
+        width: expected number of cells.
+    """
     cells = line.split() if separator == " " else line.split(separator)
     if len(cells) != width:
         return [np.nan] * width
@@ -278,7 +306,7 @@ def _row(line: str, separator: str, width: int) -> list[float]:
 
 
 def _number(cell: str) -> float:
-    """Return the number in a cell, or the seconds of a date and time; NaN for anything else."""
+    """Return the number in a cell, or a date and time as seconds since 1970; NaN for anything else."""
     try:
         return float(cell)
     except ValueError:

@@ -1,11 +1,11 @@
 """Points measured while an arm moves, joined with the log of its controller, and thinned to independent rows.
 
-The joints are those of the log at the points' times (`calib.apps.joining.clocks`). Left out are points far from
-what the arm, fitted to them, predicts, and those where the speed times the uncertainty of a time exceeds the noise:
-there residuals along the motion are larger than those across it. Residuals of neighbours are correlated (air,
-vibration, what no model holds): N rows count as N / τ (`calib.estimation.whiteness.inflation`), and a fit to all of
-them would state sigmas √τ times too small. At distances of 1 + 1.5 (τ - 1) steps the correlation is 0.05 where it dies
-away exponentially. Thresholds are our choice.
+The joint values are those of the log at the points' times (`calib.apps.joining.clocks`). Points far from the prediction
+of the fitted arm are left out. So are points at which the speed times the uncertainty of the time exceeds the noise:
+there, residuals along the motion are larger than across the motion. Residuals of neighbouring rows are correlated (air,
+vibration, effects that no model describes). N rows are worth N / τ independent ones
+(`calib.estimation.whiteness.inflation`), and a fit to all of them would report sigmas that are √τ times too small. At a
+distance of 1 + 1.5 (τ - 1) steps, an exponentially decaying correlation has fallen to 0.05. Thresholds are our choice.
 """
 
 from __future__ import annotations
@@ -41,36 +41,36 @@ from calib.toolkit.result_folders import joints_of, lines_of
 from calib.toolkit.statistics import autocorrelation, inflation, spread
 from calib.units import JOINT
 
-# time between the rows that are held, of instrument and log [s]
+# smallest time between the rows in memory, of the instrument and of the log [s]
 RESOLUTION, LOG_RESOLUTION = 0.004, 0.008
-# travel of a joint [rad or m] and of the points [m]
+# smallest travel of some joint [rad or m], and of the points [m]
 MIN_MOTION = 1e-3
-# rows that clock and geometry are fitted to first
+# number of rows to which clock and geometry are fitted first
 FITTED = 1500
-# robust sigmas
+# number of robust sigmas from which on a residual is an outlier
 OUTLIER = 6.0
-# of the table
+# smallest and largest number of rows of the table
 MIN_ROWS, MAX_ROWS = 20, 20_000
-# rows that are searched at once for one in which the arm has moved
+# number of rows that are searched at once for the next row at which the arm has moved
 PIECE = 64
-# by which a joint moves at least between two rows of the table [rad or m]
+# smallest motion of some joint between two rows of the table [rad or m]
 MOVED = 1e-3
-# by which a clock may leave a line of offset and drift [s]
+# largest deviation of a clock from a line of offset and drift [s]
 MAX_WANDER = 5e-3
-# times that σ of a fit to all rows would be too small
+# factor by which σ of a fit to all rows would be too small, from which on it is reported
 WORTH_SAYING = 1.05
 
 
 @dataclass(frozen=True, eq=False)
 class Streamed(Joined):
-    """Points of a stream with the joints at their times, thinned; the table also has a column of the instrument's time.
+    """Points of a stream with the joint values at their times, thinned; the table also has the instrument's time.
 
     Attributes:
-        clock: the instrument's.
-        sigma: robust standard deviation of the residuals of positions, per axis [m].
-        correlation: τ of the residuals before thinning [s].
-        factor: √ of how many steps count as one: by so much a fit to all of them would state too small sigmas.
-        left: correlation of neighbours after thinning.
+        clock: the instrument's clock.
+        sigma: robust standard deviation of the position residuals, per axis [m].
+        correlation: correlation time τ of the residuals before thinning [s].
+        factor: √(τ / time between rows), the factor by which sigmas would be too small if all rows were fitted.
+        left: correlation of neighbouring residuals after thinning.
     """
 
     clock: Clock
@@ -81,15 +81,17 @@ class Streamed(Joined):
 
 
 def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
-    """Return the points of an instrument's stream with the joints of a controller's log, thinned to independent ones.
+    """Return the points of an instrument's stream with the joint values of a controller's log, thinned.
+
+    Thinning keeps rows whose errors are independent.
 
     Args:
-        log_file: times and joint values, by the controller's clock.
-        file: times and positions, with or without quaternions, by the instrument's clock.
+        log_file: file with times and joint values, by the controller's clock.
+        file: file with times and positions, with or without quaternions, by the instrument's clock.
         chain: the nominal arm.
 
     Raises:
-        MeasurementError: where the files are no streams, the arm hardly moves, or the two do not belong together.
+        MeasurementError: the files are no streams, the arm moves too little, or the files are not of the same motion.
     """
     log = read_stream(log_file, _joints(chain))
     stream = _fresh(read_stream(file, _target()))
@@ -131,7 +133,7 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     if len(rows) < MIN_ROWS:
         notes = "; ".join([*run.lines(), *lines_of([thinned])])
         message = (
-            "too few rows are independent: did a clock jump, or instrument or target move? Else measure for longer"
+            "too few rows are independent: did a clock jump, or did instrument or target move? Else measure for longer"
         )
         refuse_data(file, f"{message}, over more of the workspace ({notes})")
 
@@ -185,18 +187,31 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
 
 
 def _check_motion(recording: Stream, count: int, unit: str) -> None:
-    """Raise MeasurementError for a recording whose first `count` columns hardly change."""
+    """Raise MeasurementError for a recording in which no quantity changes by more than `MIN_MOTION`.
+
+    Args:
+        recording: the recording.
+        count: number of columns to check, from the first one on.
+        unit: unit of the columns, for the message.
+    """
     travel = float(np.ptp(recording.values[:, :count], axis=0).max())
     if not travel > MIN_MOTION:
-        message = f"hardly moves (by {travel:.2g}{unit}), and without motion no clock is found: is the unit right?"
+        message = f"moves by only {travel:.2g}{unit}, too little to identify the clocks' offset: is the unit right?"
         refuse_data(recording.file, message)
 
 
 def _refuse(step: Step | None, wander: float, run: Run, clock: Clock) -> NoReturn:
-    """Raise MeasurementError for recordings in which a clock steps, or wanders (`step` is None) by `wander` [s]."""
+    """Raise MeasurementError for recordings in which a clock steps or wanders.
+
+    Args:
+        step: the step; None for a clock that wanders.
+        wander: largest deviation from a line of offset and drift [s].
+        run: the recordings.
+        clock: the fitted clock.
+    """
     file = run.stream.file
     if step is None:
-        message = f"the clocks' offset leaves a line of offset and drift by {1e3 * wander:.2g} ms"
+        message = f"the clocks' offset deviates from a line of offset and drift by {1e3 * wander:.2g} ms"
         refuse_data(file, f"{message}: cut the file into shorter parts, and join each part on its own")
     size = f"{1e3 * step.size:+.3g} ± {1e3 * step.sigma:.2g} ms"
     log_time = float(clock.controller(np.array(step.time)))
@@ -206,10 +221,15 @@ def _refuse(step: Step | None, wander: float, run: Run, clock: Clock) -> NoRetur
 
 
 def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Finding]]:
-    """Return the usable rows, their residuals (3 or 6, m) and velocities (3, m), and findings; unusable rows are
-    counted.
+    """Return the usable rows (m,), their residuals (3 or 6, m) and velocities (3, m), and findings.
 
-    Residuals have the variance σ² across the motion, and σ² + v² σ_t² along it.
+    Unusable rows are counted in the stream. Residuals are taken to have the variance σ² across the motion, and σ² + v²
+    σ_t² along the motion at speed v, with σ_t the uncertainty of the time.
+
+    Args:
+        cell: the fitted arm with station and tool.
+        run: the recordings of controller and instrument.
+        clock: the fitted clock.
     """
     stream = run.stream
     usable = run.known(clock)
@@ -237,7 +257,11 @@ def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.
 
 
 def _joints(chain: Chain) -> Kind:
-    """Return how a log's joint values are read: columns, values, limits."""
+    """Return how a log's joint values are read and checked for an arm: columns, units and joint limits.
+
+    Args:
+        chain: the arm.
+    """
     robot = joints_of(chain)
     # limits, and for a joint without any a bound of the right unit
     travel = max_travel(robot.kinds)
@@ -261,7 +285,7 @@ def _joints(chain: Chain) -> Kind:
 
 
 def _target() -> Kind:
-    """Return how an instrument's positions [m], and its quaternions where the file has some, are read."""
+    """Return how an instrument's positions [m] are read and checked, with quaternions where the file has them."""
 
     def names(table: Table) -> tuple[str, ...]:
         sheet = Sheet(table)
@@ -293,7 +317,7 @@ def _target() -> Kind:
 
 
 def _fresh(stream: Stream) -> Stream:
-    """Return the stream without readings equal to the one before, in which nothing new was measured."""
+    """Return the stream without rows equal to the row before, in which the instrument only repeated a reading."""
     changed = np.diff(stream.values, axis=0).any(axis=1)
     fresh = np.concatenate([[True], changed])
     stream.dropped["repeating the reading before"] = int((~fresh).sum())
@@ -301,11 +325,15 @@ def _fresh(stream: Stream) -> Stream:
 
 
 def _thinned(t: np.ndarray, q: np.ndarray, min_interval: float) -> tuple[np.ndarray, dict[str, float | None]]:
-    """Return indices of times t (m,) at least `min_interval` [s] apart, with a motion of some joint of q (m, n) between
-    them.
+    """Return indices of rows at least `min_interval` [s] apart between which some joint moves.
 
-    Also returns the values of a finding: `apart`, the median time between these rows [s]; `most`, the largest number of
-    rows if that limited them; `moved`, the smallest motion of a joint if that did; else None.
+    Also returns the values for a finding: `apart`, the median time between these rows [s]; `most`, the largest number
+    of rows, if it was the limit; `moved`, the smallest motion of a joint, if it was the limit; else None.
+
+    Args:
+        t: (m,) times [s].
+        q: (m, n) joint values at these times [rad or m].
+        min_interval: shortest time between two rows.
     """
     step = float(np.median(np.diff(t)))
     full = float(t[-1] - t[0]) / MAX_ROWS
@@ -337,8 +365,14 @@ def _thinned(t: np.ndarray, q: np.ndarray, min_interval: float) -> tuple[np.ndar
 
 
 def _table(chain: Chain, q: np.ndarray, stream: Stream, rows: np.ndarray, velocity: np.ndarray) -> Table:
-    """Return rows of a stream with their joint values q (m, n) and velocities (3, m) [m/s] as a table of measured
-    poses.
+    """Return rows of a stream as a table of measured poses.
+
+    Args:
+        chain: the nominal arm.
+        q: (m, n) joint values [rad or m] at the rows.
+        stream: the instrument's stream.
+        rows: (m,) indices of the rows.
+        velocity: (3, m) velocities of the target [m/s].
     """
     header, units, cells = ["time"], ["s"], [stream.t[rows]]
     for name, kind, series in zip(chain.joint_names, joint_kinds(chain), q.T):

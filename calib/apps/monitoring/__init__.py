@@ -1,3 +1,3 @@
-"""A robot over time: two calibrations compared, drift during a measurement, the log of a robot's certificates."""
+"""A robot over time: comparison of two calibrations, drift during a measurement, and a log of all calibrations."""
 
 OFFERS = {"commands": "commands:app"}

@@ -72,7 +72,14 @@ def log(sessions: list[Path], out: Folder = None, plots: bool = True, mixed: boo
 
 
 def _shown(outcome: Any, out: Path | None, plots: bool, result: bool = False) -> None:
-    """Write a result where asked to, print it (tables, too, if they are the `result`), and exit with 1 if it fails."""
+    """Print a result, write it to the folder `out` if one is given, and exit with code 1 if its verdict is fail.
+
+    Args:
+        outcome: the result.
+        out: folder for the result; None: it is not written.
+        plots: whether figures are written.
+        result: whether the tables are the command's result, and are therefore printed to standard output.
+    """
     if out is not None:
         outcome.save(out, plots=plots)
     say(*outcome.renderables(), result=result)

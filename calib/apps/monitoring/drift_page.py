@@ -1,4 +1,4 @@
-"""Drift during a measurement with its figures, as `calib drift` shows it."""
+"""Result of `calib drift`: drift of the target during a measurement, with its figures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.apps.monitoring import pages
+from calib.apps.monitoring import report_folder
 from calib.apps.monitoring.settings import DEFAULT_DRIFT, DriftSettings
 from calib.arguments import checked
 from calib.errors import Finding, UsageError, require
@@ -33,12 +33,14 @@ if TYPE_CHECKING:
 
 TABLE = "trends.csv"
 HEADER = ("column", "unit", "x", "dx [mm]", "dy [mm]", "dz [mm]")
-CAPTION = "Targets of repeated poses less the arm's prediction."
+CAPTION = "Targets of repeated poses minus the arm's prediction."
 
 
 @dataclass(frozen=True, eq=False)
 class DriftFound(ChartedResult, ReportedResult):
-    """Drift of the target over a measurement. ``print`` shows verdict, trends and repeated poses.
+    """Drift of the target over a measurement.
+
+    ``print`` shows verdict, trends and repeated poses.
 
     Attributes:
         robot: name of the robot.
@@ -55,28 +57,31 @@ class DriftFound(ChartedResult, ReportedResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the drift matters."""
+        """Verdict on whether the drift is acceptable."""
         totals = [f"{trend.what}: {1e3 * trend.total:.2g} mm in all" for trend in self.trends]
         return Verdict.of("; ".join(totals) or "no column of time or temperature", self.noticed)
 
     def section(self) -> Section:
-        """Return a report section with the trends, and the distances between readings of repeated poses."""
+        """Return the report section with the trends, and the distances between readings of repeated poses."""
         columns = [
             RecordColumn("with", "{0.what}", number=False),
             RecordColumn("poses", "{0.poses}"),
             RecordColumn("visits", "{0.x.size}"),
             RecordColumn("slope", _rate),
-            RecordColumn("x mm", lambda trend: f"{1e3 * trend.slope[0]:+.2g}"),
-            RecordColumn("y mm", lambda trend: f"{1e3 * trend.slope[1]:+.2g}"),
-            RecordColumn("z mm", lambda trend: f"{1e3 * trend.slope[2]:+.2g}"),
-            RecordColumn("in all mm", lambda trend: f"{1e3 * trend.total:.3g}"),
-            RecordColumn("σ", lambda trend: f"{trend.sigmas:.1f}"),
+            RecordColumn("x mm", _slope_x_mm),
+            RecordColumn("y mm", _slope_y_mm),
+            RecordColumn("z mm", _slope_z_mm),
+            RecordColumn("in all mm", _total_mm),
+            RecordColumn("σ", "{0.sigmas:.1f}"),
         ]
         blocks = [Text("Notes", notes_of(self.noticed), "note"), table("Drift of the target", columns, self.trends)]
         return Section("Drift", blocks, self.verdict.level, self.verdict.reason)
 
     def charts(self) -> dict[str, Chart]:
-        """Return the figures by name: the motion of repeated poses' targets, with the slope; empty without trends."""
+        """Return the figures by name: displacement of the target at repeated poses, with the trend.
+
+        The mapping is empty if there are no trends.
+        """
         from calib.toolkit.report_charts import AFTER, QUIET, Chart, Panel, line
 
         panels = []
@@ -92,7 +97,14 @@ class DriftFound(ChartedResult, ReportedResult):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write a folder with report.html, trends.csv, metrics.json, and the figure as PNG; return the folder."""
+        """Write the result into a folder and return its path.
+
+        The folder contains report.html, trends.csv, metrics.json, and the figure as PNG.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
+        """
         rows: list[tuple[object, ...]] = []
         for trend in self.trends:
             for x, displacement in zip(trend.x, trend.moved):
@@ -100,7 +112,7 @@ class DriftFound(ChartedResult, ReportedResult):
         charts: dict[str, Chart] = {}
         if plots:
             charts = self.charts()
-        part = pages.ResultPart(self.section(), charts, [CAPTION], (TABLE, HEADER, rows))
+        part = report_folder.ResultPart(self.section(), charts, [CAPTION], (TABLE, HEADER, rows))
         verdict = self.verdict
         numbers: dict[str, object] = {
             "robot": self.robot,
@@ -116,11 +128,27 @@ class DriftFound(ChartedResult, ReportedResult):
                 "total": trend.total,
             }
         title = f"Drift of {self.robot}"
-        return pages.save(Path(out), "drift", title, {"robot": self.robot}, [part], plain(numbers), [TABLE])
+        return report_folder.save(Path(out), "drift", title, {"robot": self.robot}, [part], plain(numbers), [TABLE])
 
 
 def _rate(trend: Trend) -> str:
     return f"{1e3 * trend.size:.2g} ± {1e3 * trend.sigma:.1g} mm/{trend.unit}"
+
+
+def _slope_x_mm(trend: Trend) -> str:
+    return f"{1e3 * trend.slope[0]:+.2g}"
+
+
+def _slope_y_mm(trend: Trend) -> str:
+    return f"{1e3 * trend.slope[1]:+.2g}"
+
+
+def _slope_z_mm(trend: Trend) -> str:
+    return f"{1e3 * trend.slope[2]:+.2g}"
+
+
+def _total_mm(trend: Trend) -> str:
+    return f"{1e3 * trend.total:.3g}"
 
 
 def drift(
@@ -134,11 +162,12 @@ def drift(
     """Return how the target drifts with time and temperature, from poses that were measured more than once.
 
     Args:
-        robot, base, tip: the arm, as for `calib.load`.
-        measured: CSV files with some poses measured several times, and columns ``time`` or ``temperature``; all
-            from one station of the instrument.
-        settings: displacement above which drift matters, and the instrument's σ.
-        options: as for `fit_geometry`.
+        robot: the arm: library name, file (URDF, or MDH table in TOML), or folder of a fit.
+        measured: CSV files with some poses measured several times, and columns ``time`` or ``temperature``; all from
+            one station of the instrument.
+        settings: displacement above which the drift is not acceptable, and σ of the instrument.
+        options: options for reading the files (`calib formats options`): TOML file, or in memory; None: defaults.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
 
     Raises:
         UsageError: no pose was measured twice.

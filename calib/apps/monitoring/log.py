@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.apps.monitoring import pages
+from calib.apps.monitoring import report_folder
 from calib.apps.monitoring.comparison.change_part import plus_minus
 from calib.apps.monitoring.comparison.change_test import ParameterChange
 from calib.apps.monitoring.comparison.geometry_change import GeometryChange
@@ -47,13 +47,14 @@ HEADER = (
 
 @dataclass(frozen=True, eq=False)
 class LogLine:
-    """A calibration of the log.
+    """One calibration in the log.
 
     Attributes:
-        folder, date, serial, verdict: of the session.
+        folder, date, serial, verdict: folder, date, serial number of the robot, and verdict of the session.
         errors: rms errors of nominal and calibrated robot at held-out poses [mm]; None without such poses.
-        torque: unexplained share of the torque on the held-out motion [%]; None without.
-        change: change of the geometry since the previous line; None in the first, and where one of the two has no fit.
+        torque: unexplained share of the torque on the held-out motion [%]; None without dynamics.
+        change: change of the geometry since the previous line; None in the first line, and where one of the two
+            sessions has no fit.
     """
 
     folder: str
@@ -66,8 +67,9 @@ class LogLine:
 
     @property
     def moved(self) -> tuple[float, float] | None:
-        """Rms motion of the tool since the previous line, and the motion expected from the covariances [mm]; None
-        without change.
+        """Rms motion of the tool since the previous line, and the motion expected from the covariances [mm].
+
+        None where the change is unknown.
         """
         if self.change is None:
             return None
@@ -76,21 +78,28 @@ class LogLine:
 
     @property
     def first(self) -> ParameterChange | None:
-        """The parameter that explains most of the change; None where nothing changed."""
+        """The parameter whose change alone explains most since the previous line.
+
+        None where no change is significant.
+        """
         if self.change is None or not self.change.changed:
             return None
         return self.change.parameters[0]
 
     @property
     def parameter(self) -> str:
-        """Name, change and σ of the parameter in `first`; empty without."""
+        """Name, change and σ of the parameter in `first`, as text; empty where `first` is None."""
         change = self.first
         if change is None:
             return ""
         return f"{change.name} {plus_minus(change.alone, change.alone_sigma, change.unit)}"
 
     def row(self, robot: str) -> tuple[object, ...]:
-        """Return the cells of the log's table, in the order of `HEADER`."""
+        """Return the cells of the log's table for this calibration, in the order of `HEADER`.
+
+        Args:
+            robot: name of the robot.
+        """
         nominal, calibrated = self.errors or (None, None)
         motion, sigma = self.moved or (None, None)
         change: tuple[object, ...] = ("", None, None, "")
@@ -102,7 +111,7 @@ class LogLine:
 
 @dataclass(frozen=True, eq=False)
 class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
-    """The calibrations of one robot, oldest first. ``print`` shows a line for each."""
+    """The calibrations of one robot, oldest first; ``print`` shows one line for each."""
 
     robot: str
     lines: tuple[LogLine, ...]
@@ -111,7 +120,7 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
     tab = "robot lines plot save"
 
     def section(self) -> Section:
-        """Return a report section with a line per calibration."""
+        """Return the report section with one line per calibration."""
         columns = [
             RecordColumn("date", "{0.date}", number=False),
             RecordColumn("folder", "{0.folder}", number=False),
@@ -126,7 +135,7 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         return Section("Log", [table(f"Calibrations of {self.robot}", columns, self.lines)])
 
     def charts(self) -> dict[str, Chart]:
-        """Return the figure by name: errors of each calibration, and the tool's motion since the previous one."""
+        """Return the figure by name: errors of each calibration, and motion of the tool between calibrations."""
         from calib.toolkit.report_charts import AFTER, BEFORE, Chart, Panel, line
 
         errors = []
@@ -146,21 +155,30 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         ]
         panels = [
             Panel(errors_drawn, "error on unseen poses [mm]", xnames=dates),
-            Panel(motion_drawn, "the tool moved since the one before [mm]", xnames=dates),
+            Panel(motion_drawn, "motion of the tool since the last calibration [mm]", xnames=dates),
         ]
         return {"log": Chart(panels, 2.6, 2)}
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write a folder with report.html, log.csv, metrics.json, and the figure as PNG; return the folder."""
+        """Write the log into a folder and return its path.
+
+        The folder contains report.html, log.csv, metrics.json, and the figure as PNG.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
+        """
         charts: dict[str, Chart] = {}
         if plots:
             charts = self.charts()
         rows = [log_line.row(self.robot) for log_line in self.lines]
-        part = pages.ResultPart(self.section(), charts, ["Errors, and motion of the tool."], (TABLE, HEADER, rows))
+        part = report_folder.ResultPart(
+            self.section(), charts, ["Errors, and motion of the tool."], (TABLE, HEADER, rows)
+        )
         lines = [dict(zip(HEADER, row)) for row in rows]
         numbers = plain({"robot": self.robot, "lines": lines})
         title = f"Calibrations of {self.robot}"
-        return pages.save(Path(out), "log", title, {"robot": self.robot}, [part], numbers, [TABLE])
+        return report_folder.save(Path(out), "log", title, {"robot": self.robot}, [part], numbers, [TABLE])
 
 
 def _nominal_error(log_line: LogLine) -> str:
@@ -193,11 +211,11 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
 
     Args:
         folders: folders of finished sessions, or their ``session.toml``.
-        mixed: accept sessions of different names or serial numbers.
+        mixed: accept sessions with different robot names or serial numbers.
 
     Raises:
-        UsageError: the sessions state different robots or serial numbers, without `mixed`.
-        RobotError: their nominal geometries differ.
+        UsageError: the sessions have different robot names or serial numbers, without `mixed`.
+        RobotError: the nominal geometries of the sessions' robots differ.
         SessionError: a session has no verdict yet.
     """
     sessions = [open_result(path, "session").require_session() for path in folders_of(folders)]
@@ -231,9 +249,15 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
 
 
 def _check_same(attribute: str, names: Sequence[str], mixed: bool) -> None:
-    """Raise UsageError for sessions that state several names, unless `mixed`; one that states none is accepted."""
+    """Raise UsageError if sessions have different names (or serial numbers) of the robot, unless `mixed`.
+
+    Args:
+        attribute: what differs, for the message, such as "serial numbers".
+        names: name or serial number of each session; empty texts are ignored.
+        mixed: whether different ones are accepted.
+    """
     different = list(dict.fromkeys(name for name in names if name))
-    message = f"the sessions have different {attribute} ({', '.join(different)}); --mixed takes them for one robot"
+    message = f"the sessions have different {attribute} ({', '.join(different)}); give --mixed if they are of one robot"
     require(len(different) < 2 or mixed, message, UsageError)
 
 

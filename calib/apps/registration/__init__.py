@@ -1,3 +1,3 @@
-"""Quick verbs: tool, base and hand-eye calibration, the arm's geometry left as it is."""
+"""Quick commands: tool, base and hand-eye calibration, without changing the arm's geometry."""
 
 OFFERS = {"commands": "commands:app"}

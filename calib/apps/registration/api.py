@@ -1,7 +1,7 @@
 """Placements of tool, base, camera and board in Python: `calib.tool`, `calib.base`, `calib.hand_eye`.
 
-All three are the fit of model ``frames`` (`calib.fit_geometry`), which places the instrument and its targets, and does
-not change the arm; they differ in the frames that are shown.
+All three are the fit of the model ``frames`` (`calib.fit_geometry`): instrument and targets are placed, and the arm's
+geometry is not changed. The three differ in the frames that are printed.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class Placed(NamedTuple):
 
     Attributes:
         name: names of the frame and of its reference frame.
-        pose: (4, 4) in the reference frame [m].
-        sigma: (6,) σ of its position [m] and of turns about the axes [rad], along the axes of the reference frame; NaN
-            where the measurements do not identify it.
+        pose: (4, 4) pose in the reference frame [m].
+        sigma: (6,) σ of the position [m] and of small rotations [rad] along the axes of the reference frame; NaN where
+            the measurements do not identify a component.
     """
 
     name: str
@@ -57,13 +57,19 @@ class Placed(NamedTuple):
 
 
 class Placements(GeometryFit):
-    """A fit of base and tool placement. ``print`` shows the frames with σ, then the verdict."""
+    """A fit of base and tool placement.
+
+    ``print`` shows the frames with σ, then the verdict.
+    """
 
     tab = f"placed {GeometryFit.tab}"
 
     @property
     def placed(self) -> tuple[Placed, ...]:
-        """The placed frames: targets in the tip, the arm's base in each instrument, and each instrument in the base."""
+        """The placed frames.
+
+        They are each target in the arm's tip, the arm's base in each instrument, and each instrument in the arm's base.
+        """
         fit = self.selection.fit
         chain = self.robot.chain
         cell = fit.cell
@@ -88,14 +94,18 @@ class Placements(GeometryFit):
         return tuple(frames)
 
     def lines(self, *first: str) -> Iterator[str]:
-        """Yield what a command prints: the verdict, and the frames whose names begin with one of `first`."""
+        """Yield the console lines: verdict, residual, and frames.
+
+        Args:
+            *first: beginnings of the names of the frames to print.
+        """
         poses = self.fit.poses
         yield str(self.verdict)
         for frame in self.placed:
             if frame.name.startswith(first):
                 yield str(frame)
         rms_mm = 1e3 * self.fit.errors[1].rms
-        yield f"{poses} poses, {rms_mm:.3g} mm rms residual; σ follows from it, the arm's random errors included"
+        yield f"{poses} poses, {rms_mm:.3g} mm rms residual (with the arm's random errors), from which σ is computed"
         yield from map(str, self.warnings)
         if poses < USUAL_POSES:
             yield f"{poses} poses are few: measure {USUAL_POSES}, with the wrist turned by 90° and more between them"
@@ -105,15 +115,21 @@ class Placements(GeometryFit):
 
 
 def _turned(pose: np.ndarray) -> np.ndarray:
-    """Return the Jacobian (6, 6) from the fit's small motions, along the frame's own axes, to those along its reference
-    axes.
+    """Return the Jacobian (6, 6) of small motions along the reference axes by those along a frame's own axes.
+
+    Args:
+        pose: (4, 4) pose of the frame in the reference frame.
     """
     return np.kron(np.eye(2), pose[:3, :3])
 
 
 def _sigma(estimate: Estimate, name: str, jacobian: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (6,) of `jacobian` times the six small motions of a frame; NaN where not
-    identified.
+    """Return σ (6,) of `jacobian` times the six small motions of a frame; NaN where a component is not identified.
+
+    Args:
+        estimate: the fit's estimate with its covariance.
+        name: name of the frame.
+        jacobian: (6, 6) derivative of the wanted components by the small motions.
     """
     identified = np.zeros(6, dtype=bool)
     index = []
@@ -133,7 +149,11 @@ def _sigma(estimate: Estimate, name: str, jacobian: np.ndarray) -> np.ndarray:
 
 
 def _stated(values: np.ndarray, sigmas: np.ndarray) -> str:
-    """Return values with three decimals and their standard deviations, in the same unit."""
+    """Return as text values with three decimals and their standard deviations.
+
+    Args:
+        values, sigmas: values and standard deviations, in one unit.
+    """
     texts = []
     for value, sigma in zip(values, sigmas):
         if np.isnan(sigma):
@@ -156,10 +176,13 @@ def tool(
     """Calibrate the tool (TCP): the target's placement in the arm's tip, from a dozen measured poses.
 
     Args:
-        robot, base, tip: the arm, as for `calib.load`; its geometry is not changed.
-        measured: CSV files, folders of images, or the result of `read_poses`, as for `fit_geometry`.
-        settings: tolerance, share held out.
-        options, progress: as for `fit_geometry`.
+        robot: the arm, whose geometry is not changed: library name, file (URDF, or MDH table in TOML), folder of a fit,
+            or a robot in memory.
+        measured: one or several CSV files of measured poses, folders of images, or results of `read_poses`.
+        settings: tolerance, and share of the poses to hold out.
+        options: options for reading the files (`calib formats options`): TOML file, or in memory; None: defaults.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
+        progress: called with a text on each step; None: no report.
 
     Returns:
         The fit: ``placed`` has the frames with σ, ``verdict`` the verdict.
@@ -174,9 +197,7 @@ def base(
 ) -> Placements:
     """Calibrate the base: the arm's placement in the instrument's frame, from a dozen measured poses.
 
-    The fit is that of `tool`, with its arguments (robot, measured, settings, and further ones by their names).
-
-    It is the fit of `tool`, with the same arguments (robot, measured, settings, and more by their names).
+    The arguments (robot, measured, settings, and further ones by name) and the fit are those of `tool`.
     """
     return tool(robot, measured, settings, **arguments)
 
@@ -186,8 +207,6 @@ def hand_eye(
 ) -> Placements:
     """Calibrate camera and board, one carried by the arm and the other fixed beside it, from a dozen images.
 
-    The fit is that of `tool`, with its arguments (robot, measured, settings, and further ones by their names).
-
-    It is the fit of `tool`, with the same arguments (robot, measured, settings, and more by their names).
+    The arguments (robot, measured, settings, and further ones by name) and the fit are those of `tool`.
     """
     return tool(robot, measured, settings, **arguments)

@@ -1,4 +1,4 @@
-"""Quick commands of one frame each: tool, base, hand-eye."""
+"""Quick commands, each of which calibrates and prints some frames: tool, base, hand-eye."""
 
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +19,13 @@ Options = Annotated[Path | None, typer.Option("--options", help="TOML, see calib
 
 
 def _add(name: str, frames: tuple[str, ...], help_text: str) -> None:
-    """Add a command that calibrates the placements, and prints the frames whose names begin with one of `frames`."""
+    """Add a command that fits placements of instrument and targets.
+
+    Args:
+        name: name of the command.
+        frames: beginnings of the names of the frames that it prints.
+        help_text: help text of the command.
+    """
 
     def place(
         robot: Robot,

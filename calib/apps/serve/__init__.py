@@ -1,3 +1,3 @@
-"""A page of a session on this machine's network, for the engineer at the robot: `calib serve`."""
+"""Web page of a session on the local network, for the engineer at the robot: `calib serve`."""
 
 OFFERS = {"commands": "commands:app"}

@@ -63,7 +63,10 @@ def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min
 
 
 def _own_address() -> str:
-    """Return this computer's address towards other networks, or its name where it has none; nothing is sent."""
+    """Return this computer's IP address in the local network, or its host name if it has no such address.
+
+    The address is that of the interface that would route to another network; nothing is sent.
+    """
     import socket
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route:

@@ -1,4 +1,4 @@
-"""The pages of a served session, and who may ask for them."""
+"""The web pages of a served session, and the check of who may request them."""
 
 import atexit
 import hmac
@@ -47,7 +47,15 @@ SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox
 
 
 class Guard:
-    """Refuses requests without token, with another host's name (DNS rebinding), and posts from other sites' pages."""
+    """Middleware that refuses requests without the token.
+
+    It also refuses requests for another host name (DNS rebinding), and POST requests from other sites' pages.
+
+    Args:
+        app: the web application.
+        token: the token; empty: none is required.
+        host: host name that is accepted besides numeric addresses and this computer's names.
+    """
 
     def __init__(self, app: ASGIApp, token: str, host: str) -> None:
         self.app = app
@@ -63,10 +71,12 @@ class Guard:
         await responder(scope, receive, send)
 
     def _answer(self, request: Request) -> Response | None:
-        """Return the answer given instead of a page; None for a request that may pass."""
+        """Return the response to a refused request, or to one that sets the token's cookie; None for other requests."""
         requested_host = request.headers.get("host", "")
         if not self._is_ours(requested_host):
-            return PlainTextResponse("This page is not served under that name: use the address printed.", 403)
+            return PlainTextResponse(
+                "This page is not served under this host name: open the address that calib serve printed.", 403
+            )
         if request.method != "GET":
             origin = request.headers.get("origin")
             other_origin = origin is not None and urlsplit(origin).netloc != requested_host
@@ -128,7 +138,7 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
 
 
 def refused(request: Request, error: Exception) -> Response:
-    """Return a page with an error's message."""
+    """Return a page that shows the message of the error that a request caused."""
     message = str(error)
     foreseen = complaint(error)
     if foreseen:
@@ -138,7 +148,7 @@ def refused(request: Request, error: Exception) -> Response:
 
 
 def page(request: Request) -> Response:
-    """Return the page with the session's present state."""
+    """Return the page with the current state of the session."""
     work: Work = request.app.state.work
     session = open_session(work.folder)
     states = step_states(session)
@@ -157,20 +167,23 @@ def page(request: Request) -> Response:
     if session.path(RECORDING).exists():
         recording = RECORDING
     paths = _files(session)
+    tasks = [re.sub(r"^\d+ ", "", line) for line in task.splitlines()]
+    pictures = [_name(session, path) for path in paths if path.suffix in PICTURES]
+    file_names = [_name(session, path) for path in paths]
     values = {
         "session": session,
         "states": states,
         "ahead": ahead,
         "work": work,
         "to_bring": to_bring,
-        "tasks": [re.sub(r"^\d+ ", "", line) for line in task.splitlines()],
+        "tasks": tasks,
         "verdicts": verdicts,
         "kinds": _kinds(session),
         "notes": _notes(session),
         "pages": _pages(session),
         "recording": recording,
-        "pictures": [_name(session, path) for path in paths if path.suffix in PICTURES],
-        "files": [_name(session, path) for path in paths],
+        "pictures": pictures,
+        "files": file_names,
     }
     headers = {"Content-Security-Policy": POLICY, "Cache-Control": "no-store"}
     return HTMLResponse(filled(TEMPLATES, "page.html", **values), headers=headers)
@@ -185,7 +198,7 @@ def _notes(session: Session) -> dict[str, tuple[str, ...]]:
 
 
 def _kinds(session: Session) -> list[tuple[str, str, list[str]]]:
-    """Return the kinds of files that the session takes: name, description, and the files that were brought."""
+    """Return the kinds of files that can be uploaded to the session: name, description, and paths of existing files."""
     labels = dict(step.brings for step in steps_of(session))
     if session.geometric:
         labels["drift"] = DRIFT
@@ -213,12 +226,12 @@ def _files(session: Session) -> list[Path]:
 
 
 def script(request: Request) -> Response:
-    """Return the page's script; the page works without it."""
+    """Return the page's script; the page also works without the script."""
     return FileResponse(Path(__file__).with_name("page.js"))
 
 
 def file(request: Request) -> Response:
-    """Return a file of the session's folder."""
+    """Return the file of the session's folder that the request's path names."""
     session = open_session(request.app.state.work.folder)
     path = session.folder / request.path_params["name"]
     if path not in _files(session) or not path.resolve().is_relative_to(session.folder.resolve()):
@@ -231,7 +244,10 @@ def file(request: Request) -> Response:
 
 
 def view(request: Request) -> Response:
-    """Redirect to the 3-D view of the session's recording; only on this computer, where Rerun's server listens."""
+    """Redirect to the 3-D view of the session's recording.
+
+    This works only for browsers on this computer, since Rerun's server listens only there.
+    """
     recording = open_session(request.app.state.work.folder).path(RECORDING)
     if not recording.exists():
         return PlainTextResponse("no recording yet", 404)
@@ -241,7 +257,10 @@ def view(request: Request) -> Response:
 
 
 def go_on(request: Request) -> Response:
-    """Start a run of `calib next`, or of `calib redo` if path names a step; no second one while a run is under way."""
+    """Start a run of `calib next`, or of `calib redo` if the request's path contains a step.
+
+    The request is ignored while a run is in progress.
+    """
     work = request.app.state.work
     step = request.path_params.get("step", "")
     task = NEXT
@@ -253,12 +272,12 @@ def go_on(request: Request) -> Response:
 
 
 async def bring(request: Request) -> Response:
-    """Store uploaded files, and have them checked."""
+    """Store the files of an uploaded form in the session's folder, and queue their check."""
     work = request.app.state.work
     kind = request.path_params["kind"]
     session = open_session(work.folder)
     if kind not in [name for name, _, _ in _kinds(session)]:
-        return PlainTextResponse("this session takes no such files", 404)
+        return PlainTextResponse("this session does not accept such files", 404)
     try:
         await uploads.receive(session, kind, request.headers.get("content-type", ""), request.stream())
     except ClientDisconnect:
@@ -268,7 +287,7 @@ async def bring(request: Request) -> Response:
 
 
 def set_aside(request: Request) -> Response:
-    """Move a file that was brought into the folder ``aside`` beside it, where the session does not read it."""
+    """Move the uploaded file of the request into the subfolder ``aside``, where the session does not read it."""
     work = request.app.state.work
     name = request.path_params["name"]
     session = open_session(work.folder)

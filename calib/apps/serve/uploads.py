@@ -1,4 +1,4 @@
-"""Files brought over the network: streamed to the session's folder under names that it reads, whole or not at all."""
+"""Upload of files: streamed to the session's folder, under names that the session reads, and never stored in part."""
 
 import os
 import tempfile
@@ -19,7 +19,7 @@ BAG = "metadata.yaml"
 
 
 def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
-    """Return the paths at which files of a kind (a key of `BROUGHT`) are stored, by the sender's file names.
+    """Return the paths at which uploaded files of a kind (a key of `BROUGHT`) are stored, from the sender's file names.
 
     Raises:
         UsageError: names that are empty or equal, or that the session would not read as files of this kind.
@@ -30,7 +30,7 @@ def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
         last_part = name.replace("\\", "/").rpartition("/")[2]
         plain.append(last_part.lstrip("."))
     distinct = all(plain) and len(set(plain)) == len(plain)
-    require(distinct, "two files of one name, or one without: rename them", UsageError)
+    require(distinct, "two uploaded files have the same name, or one has no name: rename them", UsageError)
 
     subject = "log"
     suffixes: tuple[str, ...] = (".csv",)
@@ -55,7 +55,7 @@ def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
         message = f"{name}: expected {' or '.join(suffixes)}; nothing was stored"
         require(name.lower().endswith(suffixes), message, UsageError)
         for start in other_prefixes:
-            message = f"{name}: a name that begins with '{start}' says other files; upload it there, or rename it"
+            message = f"{name}: files named '{start}…' have another upload on this page; use that, or rename it"
             require(not name.lower().startswith(start), message, UsageError)
         stored_name = name
         if not name.lower().startswith(prefix):
@@ -65,12 +65,18 @@ def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
 
 
 async def receive(session: Session, kind: str, content_type: str, chunks: AsyncIterator[bytes]) -> list[Path]:
-    """Store the files of a form as it arrives, and return their paths.
+    """Store the files of an uploaded form, and return their paths.
 
-    They are written beside the session's files, and put into place once all have arrived.
+    The files are first written to a temporary folder within the session's folder, and moved once all have arrived.
+
+    Args:
+        session: the session.
+        kind: kind of the files, a key of `BROUGHT`.
+        content_type: the request's header with the form's boundary.
+        chunks: the request's body.
 
     Raises:
-        UsageError: for an incomplete form, and what `targets` refuses; nothing is stored.
+        UsageError: an incomplete form, or file names that `targets` refuses; nothing is stored.
     """
     prefix, suffix = files.staged_name(Path("upload"))
     with tempfile.TemporaryDirectory(suffix, prefix, session.folder) as staging:

@@ -1,4 +1,4 @@
-"""The 3-D view of a session's recording: Rerun's web viewer, which only browsers on this computer can reach."""
+"""The 3-D view of a session's recording: Rerun's web viewer, which accepts connections from this computer only."""
 
 import os
 import signal
@@ -20,7 +20,7 @@ START_TIME = 20.0
 
 
 class WebViewer:
-    """The viewer's process, started at the first request and anew for a new recording."""
+    """The viewer's process; it is started at the first request, and restarted when the recording is replaced."""
 
     def __init__(self) -> None:
         self.process: subprocess.Popen[bytes] | None = None
@@ -29,7 +29,7 @@ class WebViewer:
         self.version = (Path(), 0)
 
     def address_of(self, recording: Path) -> str:
-        """Return the address at which the viewer shows a recording.
+        """Return the web address at which the viewer shows a recording.
 
         Raises:
             CalibError: Rerun does not start.
@@ -49,7 +49,7 @@ class WebViewer:
         return self.address
 
     def close(self) -> None:
-        """End the viewer."""
+        """Stop the viewer's process."""
         if self.process is not None:
             with suppress(ProcessLookupError):
                 # Rerun's command starts its viewer as a process of its own

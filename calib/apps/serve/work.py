@@ -1,8 +1,7 @@
-"""The worker of a served session: one process per run of `calib next` or check of files, one at a time.
+"""The worker of a served session: jobs run one at a time, each in a separate process.
 
-Messages of a run are kept here, so that every page, reloaded or in another tab, shows the same progress.
-
-What a run says is kept here, so that every page, reloaded or in another tab, shows the same progress.
+A job is a run of `calib next` or `calib redo`, or a check of uploaded files. Its messages are stored here, so that
+every page, reloaded or in another tab, shows the same progress.
 """
 
 import os
@@ -31,15 +30,15 @@ _spawned = get_context("spawn")
 
 @dataclass
 class Job:
-    """A run or a check, and its messages so far.
+    """A run or a check, and its messages until now.
 
     Attributes:
         task: `CHECK`, `NEXT` or `REDO`.
-        subject: the kind of files to check, or the step to repeat.
+        subject: the kind of files to check, or the step to repeat; empty for `NEXT`.
         lines: permanent messages.
         words: the last transient message.
-        problem: why it failed; empty otherwise.
-        began: time at which it began, by `time.monotonic` [s].
+        problem: why the job failed; empty otherwise.
+        began: time at which the job began, by `time.monotonic` [s].
     """
 
     task: str
@@ -51,7 +50,7 @@ class Job:
 
     @property
     def seconds(self) -> int:
-        """Seconds since the job began, rounded."""
+        """Whole seconds since the job began."""
         return round(time.monotonic() - self.began)
 
 
@@ -59,9 +58,9 @@ class Work:
     """Runs jobs on a session's folder one after the other, each in a separate process.
 
     Attributes:
-        current: the running job, or None.
-        last: the last run, or None.
-        checks: the last check of each kind of files.
+        current: the job in progress; None if there is none.
+        last: the last run of `calib next` or `calib redo`; None if there was none.
+        checks: kind of files to their last check.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -74,7 +73,15 @@ class Work:
         self._process: Any = None
 
     def ask(self, task: str, subject: str = "") -> bool:
-        """Queue a job and return True; return False where a run is under way, or this job is queued already."""
+        """Queue a job and return whether it was queued.
+
+        A job is not queued if an equal one is already queued, or if it is a run and another run is queued or in
+        progress.
+
+        Args:
+            task: `CHECK`, `NEXT` or `REDO`.
+            subject: the kind of files to check, or the step to repeat; empty for `NEXT`.
+        """
         with self._lock:
             jobs = list(self._waiting)
             if self.current and task != CHECK:
@@ -118,7 +125,7 @@ class Work:
                 self._begin()
 
     def stop(self) -> None:
-        """Interrupt the running job, as Ctrl-C does; the session can be resumed."""
+        """Interrupt the job in progress, as Ctrl-C does, and discard queued ones; the session can be resumed."""
         self._waiting.clear()
         if self._process is not None and self._process.is_alive():
             with suppress(ProcessLookupError):
@@ -128,7 +135,14 @@ class Work:
 
 
 def _run(sender: Connection, folder: Path, task: str, subject: str) -> None:
-    """Run a job in this (separate) process, and send its messages."""
+    """Run a job in this (separate) process, and send its messages through a pipe.
+
+    Args:
+        sender: the pipe.
+        folder: the session's folder.
+        task: `CHECK`, `NEXT` or `REDO`.
+        subject: the kind of files to check, or the step to repeat; empty for `NEXT`.
+    """
     from calib.toolkit.sessions import go_on
 
     def send(kind: str, text: object) -> None:
@@ -156,7 +170,11 @@ def _run(sender: Connection, folder: Path, task: str, subject: str) -> None:
 
 
 def checked(session: Session, kind: str) -> list[str]:
-    """Check the brought files of a kind as the session's step does, and return notes.
+    """Check uploaded files as the session's step would, and return notes on them.
+
+    Args:
+        session: the session.
+        kind: kind of the files, a key of `calib.apps.serve.uploads.BROUGHT`.
 
     Raises:
         CalibError: files that the step would refuse.

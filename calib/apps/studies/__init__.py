@@ -1,8 +1,8 @@
 """Monte Carlo studies that compare identification methods over robots, noise, sampling rates and model errors.
 
-A condition (`conditions`) is an experiment whose truth is known (`experiment`); one pure function makes a row of a
-condition, a method and a seed (`trial`); rows are keyed and kept (`rows`), run wherever workers are (`run`), and summed
-up so that methods can be ranked (`summary`).
+Each condition (`conditions`) defines a simulated experiment with known true parameters (`experiment`). A trial applies
+one method to one simulated data set and yields a row of figures of merit (`trial`). Rows are stored by key (`store`),
+computed by workers (`run`), and summarised to rank the methods (`summary`).
 """
 
 OFFERS = {"commands": "commands:app", "formats": ":FORMATS"}

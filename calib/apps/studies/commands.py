@@ -160,7 +160,11 @@ def compare(
 
 
 def _names(text: str | None) -> list[str] | None:
-    """Return the methods of a comma-separated list after a check of their names; None for all."""
+    """Return the names in a comma-separated list of methods, after a check that the methods exist.
+
+    Args:
+        text: the list; None: all methods, and None is returned.
+    """
     from calib.toolkit.torque_models import METHODS
 
     if text is None:

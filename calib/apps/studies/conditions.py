@@ -80,7 +80,7 @@ Count = Annotated[int, Whole(0, 1_000_000)]
 @strict
 @dataclass(frozen=True)
 class Noise:
-    """Noise of encoders [rad] and logged torques [N m], with a name."""
+    """Named noise levels: σ of the encoders [rad] and of the logged torques [N m]."""
 
     name: Name
     sigma_q: Annotated[float, Real(least=0, most=0.1, unit="rad", quantity="angle")]
@@ -115,21 +115,21 @@ class StudyFile:
 
 @dataclass(frozen=True)
 class Condition:
-    """One experiment, without the seed of its noise.
+    """One simulated experiment, without the seed of its noise.
 
     Attributes:
         name: name in tables; not part of the key.
         robot: one of `ROBOTS`.
         sigma_q, sigma_tau: σ of the encoders in the loop [rad], and of the logged torque [N m].
         decimation: factor of the parallel decimation.
-        cutoff: cut-off frequency of the positions' filter [Hz]; 0 for none.
-        mismatch: what the methods assume wrongly, one of `MISMATCHES`.
+        cutoff: cut-off frequency of the filter of the positions [Hz]; 0 for none.
+        mismatch: the wrong assumption of the methods, one of `MISMATCHES`.
         duration: duration of the motion [s].
-        guess: relative error of the start parameters, for methods that need some.
+        guess: relative error of the start parameters, for methods that need start parameters.
         resimulated: number of data sets for which the survey's position error is computed.
-        motion: one of `MOTIONS`, or the folder of a `calib excite`.
-        rate: sampling rate of the log [Hz]; 0 for the robot's own.
-        guesses: start values per data set; trial k uses data set k // guesses and guess k % guesses.
+        motion: one of `MOTIONS`, or the folder of a motion by `calib excite`.
+        rate: sampling rate of the log [Hz]; 0 for the robot's own rate.
+        guesses: number of start values per data set; trial k uses data set k // guesses and start value k % guesses.
     """
 
     name: str
@@ -148,7 +148,7 @@ class Condition:
 
     @property
     def digest(self) -> str:
-        """Key of the condition's rows in the store; conditions that differ only in name have the same key."""
+        """Key of the condition's rows in the store; conditions that differ only in name share it."""
         content = asdict(self)
         del content["name"], content["resimulated"]
         for key, value in _LATER.items():
@@ -165,8 +165,8 @@ class Study:
     Attributes:
         name, about: name and description of the study.
         conditions: the conditions, with distinct names.
-        runs: for each condition in this order, name of a method to number of data sets.
-        seeds: for each condition, number of the first data set.
+        runs: one mapping per condition: name of a method to number of data sets.
+        seeds: for each condition, the number of the first data set.
     """
 
     name: str
@@ -188,11 +188,11 @@ def shipped() -> dict[str, Path]:
 
 
 def read_study(files: Sequence[str | Path], methods: Sequence[str] | None = None, runs: int | None = None) -> Study:
-    """Return the study of one or several files.
+    """Return the study that one or several files define together.
 
     Args:
-        files: paths, names of shipped studies, or patterns of these (``MCS-*``).
-        methods, runs: replace those of the files; None: as in the files.
+        files: paths, names of shipped studies, or patterns of these names (``MCS-*``).
+        methods, runs: replace the methods and the number of runs in the files; None: as in the files.
 
     Raises:
         UsageError: an invalid study file, an unknown method, or two conditions of one name.
@@ -225,7 +225,7 @@ def read_study(files: Sequence[str | Path], methods: Sequence[str] | None = None
 
 
 def _check_cutoffs(conditions: Sequence[Condition]) -> None:
-    """Raise UsageError for cut-off frequencies at or above half the sampling rate of the log."""
+    """Raise UsageError for a condition whose cut-off frequency is at or above half the log's sampling rate."""
     from calib.toolkit.simulations import known_truth  # slow to load
 
     for condition in conditions:
@@ -239,7 +239,7 @@ def _check_cutoffs(conditions: Sequence[Condition]) -> None:
 
 
 def _paths(files: Sequence[str | Path]) -> list[Path]:
-    """Return the paths of study files, from paths, names of shipped studies, and patterns of these; each once."""
+    """Return the paths of study files, each once, from paths, names of shipped studies, and patterns of names."""
     library = shipped()
     paths: list[Path] = []
     for text in map(str, files):
@@ -255,10 +255,10 @@ def _paths(files: Sequence[str | Path]) -> list[Path]:
 
 
 def _parse(path: Path) -> StudyFile:
-    """Return the study of a file.
+    """Return the content of the study file at `path`.
 
     Raises:
-        UsageError: see `calib.config.parse`; an unknown method.
+        UsageError: a file that `calib.config.parse` refuses, or an unknown method.
     """
     study = parse(StudyFile, read_toml(path), str(path))
     for name in study.methods:
@@ -275,7 +275,7 @@ def _check_method(path: Path, key: str, name: str) -> None:
 
 
 def _expanded(study: StudyFile) -> list[Condition]:
-    """Return the conditions of a study: all combinations of its values, each with a name."""
+    """Return the conditions of a study file: all combinations of its values, each with a name."""
     axes = (study.robot, study.motion, study.rate, study.noise, study.decimation, study.cutoff, study.mismatch)
     conditions = []
     for robot, motion, rate, noise, decimation, cutoff, mismatch in product(*axes):
@@ -314,7 +314,12 @@ def _cutoff_name(cutoff: float) -> str:
 
 
 def _counts(study: StudyFile, methods: Sequence[str] | None, runs: int | None) -> dict[str, int]:
-    """Return the number of runs of each method; `methods` and `runs` replace those of the file, None keeps them."""
+    """Return the number of runs of each method, by name.
+
+    Args:
+        study: the study file.
+        methods, runs: replace the methods and the number of runs in the file; None: as in the file.
+    """
     if "all" in study.methods:
         names = list(METHODS)
     else:
@@ -327,7 +332,12 @@ def _counts(study: StudyFile, methods: Sequence[str] | None, runs: int | None) -
 
 
 def _runs_of(study: StudyFile, name: str) -> int:
-    """Return the number of runs that a file states for a method, or for its kind."""
+    """Return the number of runs that a study file sets for a method, or for methods of its kind.
+
+    Args:
+        study: the study file.
+        name: name of the method.
+    """
     method = METHODS[name]
     runs = None
     if method.needs_controller:

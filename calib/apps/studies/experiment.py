@@ -1,11 +1,12 @@
 """Simulated data sets: a robot with known parameters in its control loop, and the input of the methods.
 
-The robot follows a motion in its controller's loop at 5 kHz, logged at 1 kHz (TX40), 140 Hz (RV-2SQ) or a stated rate;
-the encoders' noise enters the loop, the torque's is that of the log. Positions are low-passed and differentiated, rows
-decimated, as `calib identify` does it. What is believed of the robot may differ from what it is (`Condition.mismatch`).
-All data sets of a condition share the motion: the best by condition number of `MOTION_TRIES` random Fourier series, or
-one that `calib excite` designed (``library/ROBOT``, by ``examples/survey/limits.toml``), of the same family within the
-same limits of the joints (self-collisions of random ones are not looked at).
+The robot follows a motion in its controller's loop at 5 kHz. It is logged at 1 kHz (TX40), at 140 Hz (RV-2SQ), or at
+the condition's rate. The encoders' noise acts within the loop; the torque's noise is added to the log. Positions are
+low-pass filtered and differentiated, and rows decimated, as by `calib identify`. The model that the methods assume may
+differ from the simulated robot (`Condition.mismatch`). All data sets of a condition share one motion. It is the best,
+by condition number, of `MOTION_TRIES` random Fourier series, or one that `calib excite` designed (``library/ROBOT``, by
+``examples/survey/limits.toml``) of the same family within the same joint limits. Random motions are not checked for
+self-collisions.
 """
 
 from dataclasses import dataclass, replace
@@ -82,14 +83,14 @@ DRAWS, MAX_DRAWS = 100, 1000
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """Data shared by all data sets of a condition.
+    """Data common to all data sets of a condition.
 
     Attributes:
         chain: the arm that the methods assume.
-        plant: the robot as its maker describes it.
+        plant: the robot with the parameters published by its manufacturer.
         reference: the training motion, at the control rate.
         validation: the motion on which estimates are judged.
-        every: control periods per sample; need not be whole.
+        every: number of control periods per sample of the log; need not be whole.
     """
 
     chain: Chain
@@ -105,9 +106,9 @@ class Experiment:
 
     Attributes:
         problem: input of a method.
-        model: its identification model.
+        model: identification model of the problem.
         truth: (b,) true values of the model's base parameters.
-        matrix: (K, n, b) base regressor of the assumed robot along the validation motion.
+        matrix: (K, n, b) base regressor of the assumed robot at K samples of the validation motion.
         torque: (K, n) noise-free torques of the true robot along the validation motion, without its unknown payload [N
             m].
     """
@@ -120,7 +121,7 @@ class Experiment:
 
 
 def set_up(condition: Condition) -> Setup:
-    """Return the data shared by all data sets of a condition."""
+    """Return the data common to all data sets of a condition."""
     setup = _set_up(condition.robot, condition.duration, condition.motion)
     if not condition.rate:
         return setup
@@ -129,7 +130,13 @@ def set_up(condition: Condition) -> Setup:
 
 @lru_cache(maxsize=4)
 def _set_up(robot: str, duration: float, motion: str) -> Setup:
-    """Return the shared data of a robot and a motion, logged at the robot's own rate."""
+    """Return the data common to all data sets of a robot and a motion, logged at the robot's own rate.
+
+    Args:
+        robot: name of the robot, one of `ROBOTS`.
+        duration: duration of the motion [s].
+        motion: one of `MOTIONS`, or the folder of a motion by `calib excite`.
+    """
     chain = load(robot)
     plant = known_plant(robot)
     control = known_truth(robot)["control"]
@@ -150,7 +157,14 @@ def _set_up(robot: str, duration: float, motion: str) -> Setup:
 
 
 def _best_random_motion(robot: str, chain: Chain, duration: float, rate: float) -> Reference:
-    """Return the best of `MOTION_TRIES` random motions by the condition number of the base regressor."""
+    """Return the one of `MOTION_TRIES` random motions whose base regressor has the smallest condition number.
+
+    Args:
+        robot: name of the robot.
+        chain: its nominal geometry.
+        duration: duration of the motion [s].
+        rate: sampling rate of the motion [Hz].
+    """
     model = plant_model(known_plant(robot))
     base_columns = _nominal_base(robot).kept
     part = slice(None, None, 2 * THIN)
@@ -165,7 +179,14 @@ def _best_random_motion(robot: str, chain: Chain, duration: float, rate: float) 
 
 
 def _drawn(chain: Chain, duration: float, rate: float, number: int) -> Reference:
-    """Return the random Fourier series number `number` within the limits; reproducible."""
+    """Return a random Fourier series within the joint limits; reproducible.
+
+    Args:
+        chain: the arm with its limits.
+        duration: duration of the motion [s].
+        rate: sampling rate of the motion [Hz].
+        number: seed of the series.
+    """
     lower, upper = chain.sampling_limits()
     middle, half = 0.5 * (lower + upper), 0.5 * REACH * (upper - lower)
     speed = SPEED * np.array([joint.velocity for joint in chain.joints])
@@ -188,10 +209,10 @@ def _nominal_base(robot: str) -> Base:
 
 @lru_cache(maxsize=2)
 def make_experiment(condition: Condition, seed: int) -> Experiment:
-    """Return the simulated data set of a condition and a trial's seed, with its start values; reproducible.
+    """Return the simulated data set of a condition and a trial's seed, with start values for methods; reproducible.
 
     Raises:
-        CalibError: the true robot cannot be simulated in its loop.
+        CalibError: the true robot cannot be simulated in its control loop.
     """
     number, guess = divmod(seed, condition.guesses)
     data = data_set(condition, number)
@@ -245,12 +266,12 @@ def data_set(condition: Condition, seed: int) -> Experiment:
 
 @dataclass(frozen=True, eq=False)
 class _Robots:
-    """The robots of a data set.
+    """The true and the assumed robot of a data set.
 
     Attributes:
-        true: the robot that is recorded.
+        true: the simulated robot.
         model, base: the assumed model with its base parameters.
-        truth: a robot with the true values of the model's parameters.
+        truth: a robot with the true values of the assumed model's parameters.
     """
 
     true: Plant
@@ -260,7 +281,13 @@ class _Robots:
 
 
 def _robots(condition: Condition, setup: Setup, seed: int) -> _Robots:
-    """Return the robots of a data set, with the mismatch of the condition."""
+    """Return the true and the assumed robot of a data set, which differ by the condition's mismatch.
+
+    Args:
+        condition: the condition.
+        setup: the data common to all data sets of the condition.
+        seed: seed of the data set.
+    """
     plant = setup.plant
     chain = setup.chain
     robots = _Robots(plant, plant_model(plant), _nominal_base(condition.robot), plant)
@@ -290,7 +317,15 @@ def _robots(condition: Condition, setup: Setup, seed: int) -> _Robots:
 
 
 def _recorded(condition: Condition, setup: Setup, true: Plant, controller: LoopController, seed: int) -> Case:
-    """Return the recording of one noisy run of the true robot, as a case."""
+    """Return the recording of one noisy run of the true robot in its control loop.
+
+    Args:
+        condition: the condition, which gives the noise.
+        setup: the data common to all data sets of the condition.
+        true: the simulated robot.
+        controller: its controller.
+        seed: seed of the noise.
+    """
     sensing = Sensing(condition.sigma_q, 0.0, condition.sigma_tau, every=setup.every)
 
     def run(every: float) -> SimulatedRun:
@@ -314,7 +349,12 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: LoopC
 
 
 def _loop(condition: Condition, controller: LoopController) -> LoopSettings:
-    """Return the loop settings for the methods, with the errors of the condition."""
+    """Return the control loop that the methods assume, with wrong gains if this is the condition's mismatch.
+
+    Args:
+        condition: the condition.
+        controller: the controller of the simulated robot.
+    """
     kp = kd = 1.0
     if condition.mismatch == "controller":
         kp, kd = BELIEVED
@@ -328,10 +368,15 @@ def _loop(condition: Condition, controller: LoopController) -> LoopSettings:
 
 
 def _guess(plant: Plant, spread: float, seed: int) -> np.ndarray:
-    """Return the robot's parameters with normal relative errors; the inertias stay physically consistent.
+    """Return start values: the robot's parameters with normally distributed relative errors.
 
-    Errors of a body are drawn until it is physically consistent (as in the survey, but body by body); where that takes
-    too many draws, the spread is halved.
+    The inertial parameters of each link stay physically consistent: a link's errors are drawn until they are (as in the
+    survey, but link by link). If that takes too many draws, `spread` is halved for the link.
+
+    Args:
+        plant: the robot.
+        spread: standard deviation of the relative errors.
+        seed: seed of the errors.
     """
     rng = np.random.default_rng([seed, 15])
     size = plant.inertial

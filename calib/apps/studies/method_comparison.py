@@ -1,14 +1,16 @@
-"""``calib compare``: all methods on the same recordings, ranked by their error on unseen motion.
+"""`calib compare`: all methods on the same recordings, ranked by their error on a held-out motion.
 
-All estimate the same columns (base parameters and standard friction, unless another is asked for), each as
-`calib identify --method` does it: wls regularises what the motion does not identify towards a prior. Errors are
-relative, in the identification band, over all unseen recordings together; their standard errors, and those of
-differences between methods, come from a jackknife over blocks of time (Künsch 1989), since residuals are not white.
-Methods within `MAX_SIGMAS` standard errors of the best, or within `MAX_SHARE` of its error, are as good; of these one
-is taken that is fast: at most `FAST_SECONDS` seconds, or `MAX_TIMES` times the time of the fastest, the first in rank.
-Below the table stands what `calib identify` says of it: the same verdict, from the same findings. None is taken where
-that verdict is fail, where the best predicts no better than no model does (100 %), or where all recordings repeat the
-training motion; one that does is left out.
+All methods estimate the same parameters (base parameters and standard friction, unless another is requested), each as
+`calib identify --method` does. The method wls regularises what the motion does not identify towards a prior. Errors are
+relative to the torque, in the identification band, over all held-out recordings together. Their standard errors, and
+those of differences between methods, are jackknife estimates over blocks of time (Künsch 1989), since residuals are not
+white.
+
+Methods within `MAX_SIGMAS` standard errors of the best, or within `MAX_SHARE` of its error, count as equally good. The
+first of these in rank that is fast is recommended: its time is at most `FAST_SECONDS`, or `MAX_TIMES` times that of the
+fastest. The verdict on it, printed below the table, is that of `calib identify`, from the same findings. No method is
+recommended where this verdict is fail, where the best method predicts no better than no model (100 %), or where all
+held-out recordings repeat the training motion. A single held-out recording that repeats it is ignored.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -55,17 +57,16 @@ class ComparedMethod:
         rank: rank by the error on the held-out motion, from 1; 0 without an estimate.
         unseen, sigma: error on the held-out motion in the identification band, and its standard error [%].
         raw: error on the held-out motion against the torque as recorded [%].
-        training: error on the training data in the band [%].
+        training: error on the training recordings in the identification band [%].
         worst: joint with the largest error on the held-out motion, counted from 1, and that error [%].
-        behind, behind_sigma: difference of `unseen` from the best method, and its standard error [%].
+        behind, behind_sigma: `unseen` minus that of the best method, and the standard error of this difference [%].
         good: whether the method is as good as the best.
-        chosen: whether it is the recommended method.
-        parameters: number of its parameters.
-        seconds: time of the method alone [s].
+        chosen: whether the method is the recommended one.
+        parameters: number of estimated parameters.
+        seconds: computing time of the method alone [s].
         iterations, simulations: number of iterations and simulations of the method.
-        verdict, warnings: verdict and warnings of `calib identify` on its model, for the method that the rule selects
-        only;
-            else None and empty.
+        verdict, warnings: verdict and warnings of `calib identify` on the method's model; None and empty for all
+            methods but the selected one.
     """
 
     name: str
@@ -90,7 +91,12 @@ class ComparedMethod:
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """Sums per block of time (k, rows): squared errors and squared torques, in the band and as recorded."""
+    """Sums over blocks of time, each (k, rows), of squared errors and squared torques.
+
+    Attributes:
+        error, size: errors and torques in the identification band.
+        raw_error, raw_size: errors and torques as recorded.
+    """
 
     error: np.ndarray
     size: np.ndarray
@@ -109,23 +115,25 @@ def compare_methods(
     say: Callable[[str], None] = _ignore,
     done: Callable[[ComparedMethod], None] = _ignore,
 ) -> list[ComparedMethod]:
-    """Return the results of all methods on the recordings, best first; methods without an estimate come last.
+    """Return the results of all methods on the recordings, best first; methods without an estimate are last.
 
     Args:
-        inputs: training recordings, and unseen ones.
-        methods: their names; None: all.
-        friction: as of `IdentificationSettings`; methods that simulate know ``standard`` alone.
-        say: called with messages on progress.
-        done: called with every method when it is done, not yet ranked.
+        inputs: training recordings, and held-out ones.
+        methods: names of methods; None: all.
+        friction: friction model: ``standard``, ``auto``, or a step of the ladder; methods that simulate support only
+            ``standard``.
+        say: called with each message on progress.
+        done: called with each method's result as soon as it is available, not yet ranked.
 
     Raises:
-        UsageError: where no recording is unseen, or one overlaps the training recordings; where a name is none of
-            a method.
+        UsageError: no recording is held out, a held-out one overlaps the training recordings, or a method is unknown.
     """
     require(inputs.unseen, "methods are ranked on unseen motion: give a recording with --validate", UsageError)
     shared = overlaps(inputs.cases, inputs.unseen)
     if shared:
-        raise UsageError(f"{lines_of(shared)[0]}: cut them apart, log.npz@0:20 and log.npz@20:30")
+        raise UsageError(
+            f"{lines_of(shared)[0]}: state parts that do not overlap, such as log.npz@0:20 and log.npz@20:30"
+        )
     # Recordings that repeat the training motion do not rank methods, unless there are no others.
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     validation = tuple(case for case in inputs.unseen if case.name not in repeated)
@@ -167,7 +175,12 @@ def compare_methods(
 
 
 def caveats(inputs: IdentificationInputs, compared: Sequence[ComparedMethod]) -> list[Note]:
-    """Return notes on a ranking, and the reason if no method is recommended."""
+    """Return notes on a ranking, and the reason if no method is recommended.
+
+    Args:
+        inputs: the recordings.
+        compared: results of the methods, best first.
+    """
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     notes = [Note(note) for note in inputs.currents.notes]
     notes += notes_of(motion_findings({}, repeated))
@@ -187,7 +200,9 @@ def caveats(inputs: IdentificationInputs, compared: Sequence[ComparedMethod]) ->
     else:
         for method in compared:
             if method.verdict is not None and method.verdict.level == "fail":
-                message = f"no method recommended: the model of {method.name} fails in calib identify, reason below"
+                message = (
+                    f"no method recommended: the model of {method.name} fails in calib identify for the reason below"
+                )
                 notes.append(Note(message))
                 break
     return list(dict.fromkeys(notes))
@@ -202,7 +217,13 @@ def _one_line(error: CalibError) -> str:
 
 
 def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> IdentificationSettings:
-    """Return the identification settings for a method, without settings that it does not use."""
+    """Return the identification settings for a method, without those settings that the method does not use.
+
+    Args:
+        inputs: the recordings with the user's settings.
+        method: the method.
+        friction: friction model: ``standard``, ``auto``, or a step of the ladder.
+    """
     settings = replace(inputs.options.settings, method=method.name, essential="none", friction=friction)
     if not method.takes_constraints:
         settings = replace(settings, constraints=None)
@@ -220,10 +241,14 @@ def _judged(
     proven: bool,
     say: Callable[[str], None],
 ) -> ComparedMethod:
-    """Return the selected method with the verdict on its model; with verdict fail it is not recommended.
+    """Return the selected method with the verdict on its model; if the verdict is fail, the method is not recommended.
 
     Args:
-        proven: whether the recordings are motion that it has not seen.
+        method: the selected method.
+        inputs: the recordings.
+        model: the method's model.
+        proven: whether a held-out recording differs from the training motion.
+        say: called with messages on progress.
     """
     warnings: tuple[Note, ...] = ()
     try:
@@ -237,7 +262,13 @@ def _judged(
 
 
 def _errors(model: Identification, inputs: IdentificationInputs, same_unit: np.ndarray) -> tuple[ComparedMethod, _Sums]:
-    """Return the errors of a method's model, and their sums by block of time."""
+    """Return a method's result with the errors of its model, and the sums of these errors by block of time.
+
+    Args:
+        model: the method's model.
+        inputs: the recordings.
+        same_unit: (rows,) whether a torque row has the unit in which errors are summed.
+    """
     unseen = _sums(model, inputs.unseen)
     training = _sums(model, inputs.cases)
     joint_sizes = np.maximum(unseen.size.sum(axis=0), 1e-300)
@@ -260,7 +291,12 @@ def _errors(model: Identification, inputs: IdentificationInputs, same_unit: np.n
 
 
 def _sums(model: Identification, cases: Sequence[Case]) -> _Sums:
-    """Return the sums of a model's errors over each block of time of the recordings."""
+    """Return the sums of a model's errors over each block of time of the recordings.
+
+    Args:
+        model: the model.
+        cases: the recordings.
+    """
     errors = []
     sizes = []
     raw_errors = []
@@ -287,14 +323,23 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 
 
 def _leaving_out(sums: _Sums, same_unit: np.ndarray) -> np.ndarray:
-    """Return the error (k,) [%] with each of k blocks of time left out."""
+    """Return the relative error (k,) [%] with each of the k blocks of time left out in turn.
+
+    Args:
+        sums: sums of squared errors and torques over k blocks of time.
+        same_unit: (rows,) whether a torque row has the unit in which errors are summed.
+    """
     error = sums.error[:, same_unit].sum(axis=1)
     size = sums.size[:, same_unit].sum(axis=1)
     return 100.0 * np.sqrt((error.sum() - error) / np.maximum(size.sum() - size, 1e-300))
 
 
 def _jackknife(values: np.ndarray) -> float:
-    """Return the jackknife's standard error of a figure from its values (k,) with each of k blocks left out."""
+    """Return the jackknife's standard error of a quantity.
+
+    Args:
+        values: (k,) the quantity with each of k blocks left out in turn.
+    """
     count = len(values)
     return float(np.sqrt((count - 1) / count * np.sum((values - values.mean()) ** 2)))
 
@@ -304,7 +349,12 @@ def _unseen_error(result: tuple[ComparedMethod, _Sums]) -> float:
 
 
 def _ranked(results: Sequence[tuple[ComparedMethod, _Sums]], same_unit: np.ndarray) -> list[ComparedMethod]:
-    """Return the methods by rank; the first fast one of the good methods is marked as chosen."""
+    """Return the methods by rank; the first fast one among the equally good methods is marked as recommended.
+
+    Args:
+        results: each method's result, and its sums of squared errors and torques over blocks of time.
+        same_unit: (rows,) whether a torque row has the unit in which errors are summed.
+    """
     if not results:
         return []
     order = sorted(results, key=_unseen_error)
@@ -346,7 +396,7 @@ HEADER = [
 
 
 def write_table(compared: Sequence[ComparedMethod], path: Path) -> Path:
-    """Write the comparison as CSV."""
+    """Write the results of the methods as CSV and return its path."""
     lines = []
     for method in compared:
         worst_joint, worst_error = method.worst
@@ -417,7 +467,12 @@ def line(method: ComparedMethod) -> str:
 
 
 def section(compared: Sequence[ComparedMethod], notes: Sequence[Note]) -> Section:
-    """Return a report section: table of methods, notes, and the verdict on the selected method's model."""
+    """Return the report section: table of methods, notes, and the verdict on the selected method's model.
+
+    Args:
+        compared: results of the methods, best first.
+        notes: notes on the ranking.
+    """
     blocks = [*_blocks(compared), Text("", notes, "note")]
     for method in compared:
         if method.verdict is not None:
@@ -426,7 +481,11 @@ def section(compared: Sequence[ComparedMethod], notes: Sequence[Note]) -> Sectio
 
 
 def _blocks(compared: Sequence[ComparedMethod]) -> Iterator[Block]:
-    """Yield the ranked table, and the reasons for excluded methods."""
+    """Yield the report blocks with the ranked table, and with the reasons for methods without an estimate.
+
+    Args:
+        compared: results of the methods, best first.
+    """
     ranked = [method for method in compared if not method.failure]
     note = (
         "100 ‖τ - τ̂‖ / ‖τ‖ on unseen motion, in the identification band, ± its standard error over blocks of time; "

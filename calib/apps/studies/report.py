@@ -1,10 +1,10 @@
-"""The report of a study: tables, box plots, and the decision rule, as one HTML file; the same tables for a console.
+"""The report of a study as one HTML file: tables, box plots, and the decision rule; the tables also for the console.
 
-``calib study``: what is missing is run, what is there is summed up, and a report says what to take.
+`calib study` runs the missing trials, summarises all rows, and reports which method to use. Its folder contains
 
-rows.sqlite              every trial (`store`): more may be added by anyone, at any time
-summary.csv              one line per condition and method: of every figure its median and, as lower and upper, its
-                         quartiles, the nearest of the runs' own values
+rows.sqlite              every trial (`store`); any later command may add more summary.csv              one line per
+condition and method: for every figure of merit the median and, as lower and
+                         upper, the quartiles, each the nearest of the runs' own values
 report.html              tables, box plots, the decision rule; one file
 """
 
@@ -65,7 +65,12 @@ OURS = (ROWS, LOCK, SUMMARY, REPORT)
 
 
 def boxes(condition: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
-    """Return the box plot of a condition."""
+    """Return the box plot of a condition: torque errors of each method over its runs.
+
+    Args:
+        condition: summary of the condition.
+        rows: rows of the condition's trials.
+    """
     layers: list[Layer] = []
     all_errors: list[float] = []
     for height, method in enumerate(condition.methods):
@@ -165,7 +170,7 @@ ON_CONSOLE = ("method", "trials", "failed", "torque [%]", "quartiles", "covered 
 
 
 def overview(conditions: Sequence[ConditionSummary]) -> ReportTable:
-    """Return a table of the recommended method of each condition."""
+    """Return a table with the recommended method of each condition."""
     lines = []
     for summary in conditions:
         name, description = summary.condition.name, _described(summary.condition)
@@ -192,7 +197,7 @@ def overview(conditions: Sequence[ConditionSummary]) -> ReportTable:
 
 
 def torque_table(conditions: Sequence[ConditionSummary]) -> ReportTable:
-    """Return a table of the median torque error of every method on every condition."""
+    """Return a table with the median torque error of each method on each condition."""
     names: list[str] = []
     for summary in conditions:
         for method in summary.methods:
@@ -223,7 +228,7 @@ def _median_cell(method: MethodSummary | None) -> str:
 
 
 def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
-    """Return sentences that say why conditions have no recommended method."""
+    """Return sentences that explain why conditions have no recommended method."""
     by_reason: dict[str, list[str]] = {}
     for summary in conditions:
         if summary.why_none:
@@ -259,14 +264,23 @@ def _described(condition: Condition) -> str:
 
 
 def condition_table(summary: ConditionSummary, names: Sequence[str] = ON_CONSOLE) -> ReportTable:
-    """Return a table of all methods on a condition, best first; by default with the columns for a terminal."""
+    """Return a table of all methods on a condition, best first.
+
+    Args:
+        summary: summary of the condition.
+        names: names of the columns; by default those for a terminal.
+    """
     columns = [column for column in COLUMNS if column.name in names]
     title = f"Methods on {summary.condition.name}"
     return table(title, columns, summary.methods, _described(summary.condition), _is_chosen)
 
 
 def failures(summary: ConditionSummary) -> list[Text]:
-    """Return the failures of each method on a condition: kind, number, and first message; empty without any."""
+    """Return the failures of each method on a condition: kind, number, and first message; an empty list without any.
+
+    Args:
+        summary: summary of the condition.
+    """
     lines = []
     for method in sorted(summary.methods, key=attrgetter("method")):
         for status, count in method.failures.items():
@@ -303,15 +317,18 @@ def make_page(
     """Return the report of a study as HTML.
 
     Args:
-        rows: of these conditions.
-        plots: with box plots.
+        study: the study.
+        conditions: summaries of its conditions.
+        rows: the rows of these conditions.
+        notes: notes for the reader.
+        plots: whether box plots are included.
     """
     from calib.toolkit.report_pages import filled, issued
 
     blocks: list[Block] = [overview(conditions)]
     if len(conditions) > 1:
         blocks.append(torque_table(conditions))
-    blocks += [Text("How that was decided", RULE), Text("Figures", MEANING)]
+    blocks += [Text("How methods are recommended", RULE), Text("Figures", MEANING)]
     sections = [Section("", blocks)]
     all_columns = [column.name for column in COLUMNS]
     for summary in conditions:
@@ -340,10 +357,10 @@ class StudyOutcome:
 
     Attributes:
         conditions: summary of each condition.
-        progress: progress of this command.
+        progress: progress of the command that ran the study.
         notes: notes for the user.
         folder: folder of rows, summary and report.
-        rows: sentence on the number of rows in the file; empty where nothing was run.
+        rows: sentence on the number of rows in the store; empty where no trial was run.
     """
 
     conditions: tuple[ConditionSummary, ...]
@@ -353,7 +370,7 @@ class StudyOutcome:
     rows: str = ""
 
     def described(self) -> list[str]:
-        """Return the closing message of a command."""
+        """Return the closing console lines of a command."""
         lines = [f"note: {note}" for note in self.notes]
         if self.progress.total:
             lines.append(f"{self.progress} in {span(self.progress.seconds)}")
@@ -378,14 +395,14 @@ def run_study(
     plots: bool = True,
     say: Callable[[str], None] = _silent,
 ) -> StudyOutcome:
-    """Run the missing trials of a study, and write its report.
+    """Run the missing trials of a study, write its report, and return its result.
 
     Args:
-        studies: study files, names of shipped ones, patterns of these.
-        out: the folder of its rows; trials whose rows it has are not run again.
-        methods, runs: replace those of the files; None: as in the files.
-        where: where the tasks run, see `calib.workers.workers`.
-        report_only: run nothing and leave the rows as they are, also while another command adds rows.
+        studies: study files, names of shipped ones, or patterns of these names.
+        out: the study's folder; trials whose rows it already contains are not run again.
+        methods, runs: replace the methods and the number of runs in the files; None: as in the files.
+        where: number of local processes, or the address of a Dask scheduler; None: the tasks run in this process.
+        report_only: run nothing and leave the rows unchanged; possible while another command adds rows.
         plots: whether the report has figures.
         say: called with messages on progress.
 
@@ -402,12 +419,12 @@ def run_study(
         rows = read_rows(out)
     else:
         with opened(out) as store:
-            say(f"{len(store.rows)} rows are there")
+            say(f"{len(store.rows)} rows exist")
             with workers(where) as crew:
                 progress = run(study, store, crew, lambda progress: say(str(progress)))
             say("writing")
             rows = list(store.rows.values())
-            stored = f"{ROWS} holds {len(rows)} rows"
+            stored = f"{ROWS} contains {len(rows)} rows"
     counted, notes = _counted(study, rows)
     if not progress.lost and not counted:
         contents = "no rows"
@@ -417,7 +434,7 @@ def run_study(
         advice = "ask for 1 run or more (--runs)"
         if report_only:
             advice = "run the study first, or name its folder (--out)"
-        raise UsageError(f"nothing to report: {out} holds {contents}; {advice}")
+        raise UsageError(f"nothing to report: {out} contains {contents}; {advice}")
     versions = sorted({row.toolkit for row in counted})
     if len(versions) > 1:
         notes.append(f"rows were made by several versions: {', '.join(versions)}")
@@ -431,7 +448,7 @@ def run_study(
 
 
 def _counted(study: Study, rows: Sequence[TrialRow]) -> tuple[list[TrialRow], list[str]]:
-    """Return the rows that count for a study, and notes on those that do not."""
+    """Return the stored rows that are used for a study, and notes on the rows that are not used."""
     digests = {condition.digest for condition in study.conditions}
     study_rows = [row for row in rows if row.digest in digests]
     notes = []
@@ -446,7 +463,11 @@ def _counted(study: Study, rows: Sequence[TrialRow]) -> tuple[list[TrialRow], li
 
 
 def _check_folder(out: Path, studies: Sequence[str | Path]) -> None:
-    """Raise UsageError if the output folder is a file, or contains files of these names that no study has written."""
+    """Raise UsageError if a study cannot be written into the folder `out`.
+
+    The folder must not be a file or contain one of the study files `studies`, rows of an old format, or a summary or
+    report that no study wrote.
+    """
     require(not out.is_file(), f"{out} is a file; give a folder for the study's rows (--out)", UsageError)
     files.check_not_input([out, *(out / name for name in OURS)], studies)
     check_format(out)
@@ -456,5 +477,5 @@ def _check_folder(out: Path, studies: Sequence[str | Path]) -> None:
 
 
 def study_lines() -> list[str]:
-    """Return one line on each shipped study."""
+    """Return one line on each shipped study: name and description."""
     return [f"{name:16} {read_study([path]).about}" for name, path in shipped().items()]

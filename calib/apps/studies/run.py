@@ -1,4 +1,4 @@
-"""Running the missing trials of a study: tasks go to workers, rows to the store as they arrive."""
+"""Runs the missing trials of a study: tasks are sent to workers, and rows are stored as they arrive."""
 
 import math
 import time
@@ -25,10 +25,10 @@ class Progress:
     Attributes:
         total: number of trials that this command has to run.
         done: number of trials that have ended.
-        failed: number of these without an estimate.
-        lost: number of trials that no worker returned.
-        spent: durations [s] of the trials that have ended, by method.
-        remaining_trials: number of trials that have not ended, by method.
+        failed: number of ended trials without an estimate.
+        lost: number of trials whose worker was lost.
+        spent: name of a method to the durations [s] of its ended trials.
+        remaining_trials: name of a method to the number of its trials that have not ended.
         pace: throughput of each worker.
         began: time at which the command began, by `time.monotonic` [s].
     """
@@ -48,7 +48,7 @@ class Progress:
 
     @property
     def remaining(self) -> float:
-        """Estimated remaining time [s], from each method's mean time so far and the number of trials in parallel."""
+        """Estimated remaining time [s], from each method's mean duration and the number of parallel trials; or NaN."""
         if not self.spent or self.seconds <= 0:
             return float("nan")
         mean_seconds = {name: sum(seconds) / len(seconds) for name, seconds in self.spent.items()}
@@ -73,7 +73,7 @@ class Progress:
 
 
 def span(seconds: float) -> str:
-    """Return a duration as text: 40 s, 12 min, 3.1 h."""
+    """Return a duration `seconds` [s] as text, such as 40 s, 12 min, 3.1 h."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     if seconds < 5400:
@@ -82,9 +82,13 @@ def span(seconds: float) -> str:
 
 
 def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
-    """Yield the tasks that have no rows in the store, data set by data set over all conditions.
+    """Yield the tasks whose rows are missing in the store, data set by data set over all conditions.
 
-    Methods that take no start values run once per data set, the others from each guess.
+    Methods without start values run once per data set, the others once for each start value.
+
+    Args:
+        study: the study.
+        store: the store of the study's rows.
     """
     data_sets = 0
     for runs in study.runs:
@@ -108,7 +112,7 @@ def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress
 
     Args:
         study: the study.
-        store: the store of its rows.
+        store: the store of the study's rows.
         workers: workers that run the tasks.
         say: called with the progress at intervals.
 

@@ -1,10 +1,10 @@
-"""The store of a study: rows of trials in one SQLite file of its folder, each key once.
+"""The store of a study: rows of trials in a SQLite file of the study's folder, at most one row per key.
 
-rows.sqlite    every row that a command has appended, whatever ends the command; readable while one writes
-study.lock     held while a command works on the folder
+rows.sqlite    all rows that commands have appended, even if a command was killed; readable while a command writes
+study.lock     locked while a command works on the folder
 
-A row's key is (digest of the condition, method, seed): rows of conditions that a study file no longer states stay, and
-are not counted; so do those of a method that has changed since (`Method.version`), until it is run again.
+A row's key is (digest of the condition, method, seed). Rows of conditions that are no longer in the study file are
+kept, but not used. So are rows of a method that has changed since (`Method.version`), until the trial is run again.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ _SELECT = f"SELECT {_COLUMN_LIST} FROM rows ORDER BY condition, digest, method, 
 
 
 class RowStore:
-    """Rows of a study's folder, locked for one process; made by `opened`.
+    """The rows in a study's folder, locked for one process; created by `opened`.
 
     Attributes:
         folder: folder of the study.
-        rows: key to row.
+        rows: key (digest of the condition, method, seed) to row.
     """
 
     def __init__(self, folder: Path, database: sqlite3.Connection) -> None:
@@ -57,14 +57,18 @@ class RowStore:
         self.rows = {row.key: row for row in _read(database, folder / ROWS)}
 
     def holds(self, key: tuple[str, str, int]) -> bool:
-        """Return whether the store contains a trial of the method's current version."""
+        """Return whether the store contains a trial that was made with the method's current version.
+
+        Args:
+            key: digest of the condition, method, and seed of the trial.
+        """
         return key in self.rows and self.rows[key].current
 
     def append(self, rows: Sequence[TrialRow]) -> None:
-        """Append rows and write them to the disk before returning.
+        """Append rows and write them to the disk before returning; rows whose trial is already stored are skipped.
 
         Raises:
-            CalibError: the disk is full; earlier rows are kept, none of these is.
+            CalibError: the disk is full; earlier rows are kept, and none of these rows is.
         """
         fresh = [row for row in rows if not self.holds(row.key)]
         advice = f"{len(self.rows)} rows are kept: free disk space, then run the same command again"
@@ -77,10 +81,10 @@ class RowStore:
 
 @contextmanager
 def opened(folder: Path) -> Iterator[RowStore]:
-    """Yield the store of a folder, locked for one command until the process ends.
+    """Yield the row store of a folder, locked for this process.
 
     Raises:
-        UsageError: another command works on it, or the store is of another version or damaged.
+        UsageError: another command works on the folder, or the store is of another version or damaged.
         CalibError: the folder cannot be written.
     """
     check_format(folder)
@@ -92,7 +96,7 @@ def opened(folder: Path) -> Iterator[RowStore]:
 
 
 def read_rows(folder: Path) -> list[TrialRow]:
-    """Return all rows of a folder, even while another command writes to it; empty without a store.
+    """Return all rows in a folder, even while another command writes to it; an empty list without a store.
 
     Raises:
         UsageError: a store of another version, or a damaged one.
@@ -108,10 +112,10 @@ def read_rows(folder: Path) -> list[TrialRow]:
 
 
 def check_format(folder: Path) -> None:
-    """Check that a folder does not contain rows of format 1 only, which this version does not read.
+    """Check that a folder does not contain only rows of format 1, which this version cannot read.
 
     Raises:
-        UsageError: it does; the message advises what to do.
+        UsageError: the folder does; the message explains what to do.
     """
     if (folder / ROWS).exists():
         return
@@ -130,7 +134,11 @@ def _other_format(path: Path, version: int) -> UsageError:
 
 
 def _connected(path: Path) -> sqlite3.Connection:
-    """Return a connection to a SQLite file that is new or of this version's format."""
+    """Return a connection to the SQLite file at `path`, which is new or of this version's format.
+
+    Raises:
+        UsageError: a file of another format, or a damaged one.
+    """
     with refused_as(UsageError, sqlite3.DatabaseError, f"{path} is damaged: {{}}; run the study in another folder"):
         database = sqlite3.connect(path)
         version = _format(database)
@@ -155,7 +163,7 @@ def _read(database: sqlite3.Connection, path: Path) -> list[TrialRow]:
 
 
 def _cells(row: TrialRow) -> list[Cell | None]:
-    """Return a row as SQLite stores it: NaN as NULL."""
+    """Return the values of a row for SQLite, with None (NULL) in place of NaN."""
     cells = list(astuple(row))
     for index, cell in enumerate(cells):
         if isinstance(cell, float) and math.isnan(cell):

@@ -1,18 +1,14 @@
 """Summaries of trials: figures of merit of each method on each condition, and which methods differ significantly.
 
 Failures count: a trial without an estimate has an infinite error, in medians and in comparisons. Methods are compared
-in pairs, on equal data sets, by the sign test (Conover 1999, section 3.4), since the errors of two methods on one data
-set are correlated and their distributions have long tails; of several guesses the first one is compared.
+in pairs on equal data sets by the sign test (Conover 1999, section 3.4), since the errors of two methods on one data
+set are correlated and have long-tailed distributions. Of several start values, the first is used.
 
-The rule: among the methods that give an estimate in at least `RELIABLE` of the trials, a method is as good as the best
-if
-its torque error on held-out motion cannot be distinguished from that of the best (`LEVEL`), or is larger by no more
-than
-`SLACK` in the median data set; a method of fewer than `MIN_DATA_SETS` runs is listed but not compared. Of the methods
-as
-good as the best, those that need no more than `ALIKE` times the processor time of the cheapest count as cheap; the
-first
-of these in rank is recommended.
+The rule of recommendation considers methods that give an estimate in at least `RELIABLE` of the trials. A method is as
+good as the best if its torque error on the held-out motion is not significantly different from the best one's
+(`LEVEL`), or is larger by no more than `SLACK` in the median data set. A method with fewer than `MIN_DATA_SETS` runs is
+listed, but not compared. Of the methods that are as good as the best, those that need at most `ALIKE` times the
+processor time of the cheapest count as cheap. The first cheap one in rank is recommended.
 """
 
 import math
@@ -55,7 +51,7 @@ ERROR_FIGURES = ("torque_error", "torque_worst", "beta_error", "beta_distance")
 
 
 class Quartiles(NamedTuple):
-    """Median and quartiles of a figure over runs; a failed run counts as an infinite error."""
+    """Median and quartiles of a figure of merit over runs; a failed run counts as an infinite error."""
 
     median: float
     lower: float
@@ -68,14 +64,14 @@ class MethodSummary:
 
     Attributes:
         method: name of the method.
-        trials: number of its rows.
-        failures: status to number of trials that ended with it and gave no estimate.
+        trials: number of the method's rows.
+        failures: status to the number of trials that ended with it and without an estimate.
         examples: status to data set and message of the first such trial.
-        figures: name of a figure (`FIGURES`) to its median and quartiles.
+        figures: name of a figure of merit (`FIGURES`) to its median and quartiles.
         rank: rank by the median torque error, from 1.
-        as_good: reliable, and not distinguishable from the best or within `SLACK` of it.
+        as_good: whether the method is reliable, and not significantly worse than the best or within `SLACK` of it.
         chosen: whether the method is the recommended one.
-        p: p value of the sign test against the best; NaN for the best itself.
+        p: p value of the sign test against the best method; NaN for the best method itself.
     """
 
     method: str
@@ -90,7 +86,7 @@ class MethodSummary:
 
     @property
     def enough(self) -> bool:
-        """Whether the runs suffice to distinguish the method from others."""
+        """Whether there are enough runs to compare the method with others."""
         return self.trials >= MIN_DATA_SETS
 
     @property
@@ -105,14 +101,14 @@ class MethodSummary:
 
 @dataclass(frozen=True)
 class ConditionSummary:
-    """Summaries of all methods on one condition, best first."""
+    """Summaries of all methods on one condition, in order of rank (best first)."""
 
     condition: Condition
     methods: tuple[MethodSummary, ...]
 
     @property
     def chosen(self) -> MethodSummary | None:
-        """The recommended method; None if none is reliable."""
+        """The recommended method; None if there is none."""
         for method in self.methods:
             if method.chosen:
                 return method
@@ -120,7 +116,7 @@ class ConditionSummary:
 
     @property
     def best(self) -> MethodSummary | None:
-        """The best method with enough runs and an estimate; None without any."""
+        """The first method in rank with enough runs and a finite median error; None if there is none."""
         for method in self.methods:
             if method.enough and method.estimates:
                 return method
@@ -128,7 +124,7 @@ class ConditionSummary:
 
     @property
     def why_none(self) -> str:
-        """Reason why no method is recommended; empty if one is, or without rows."""
+        """Reason why no method is recommended; empty if one is, or if there are no rows."""
         if self.chosen or not self.methods:
             return ""
         if not any(method.enough for method in self.methods):
@@ -139,8 +135,8 @@ class ConditionSummary:
 def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
     """Return the summary of each condition of a study, over all methods that have rows.
 
-    Rows of other conditions do not count, nor rows of an earlier version of a method. Methods that the study no longer
-    asks for stay in the summary while their rows are stored.
+    Rows of other conditions, and rows of an earlier version of a method, are ignored. Rows of methods that the study no
+    longer contains are included.
     """
     by_digest: dict[str, dict[str, list[TrialRow]]] = {}
     for row in rows:
@@ -157,7 +153,12 @@ def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
 
 
 def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> ConditionSummary:
-    """Return the summary of a condition from the rows of each method."""
+    """Return the summary of a condition, with ranked methods.
+
+    Args:
+        condition: the condition.
+        rows: name of a method to its rows on this condition.
+    """
     if not rows:
         return ConditionSummary(condition, ())
     summaries = []
@@ -201,12 +202,22 @@ def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> Con
 
 
 def _pairs(errors: Mapping[int, float], reference: Mapping[int, float]) -> list[tuple[float, float]]:
-    """Return the errors of two methods on the data sets that both have."""
+    """Return pairs of errors of two methods on the data sets that both have.
+
+    Args:
+        errors, reference: seed of the data set to error, for the two methods.
+    """
     return [(errors[seed], reference[seed]) for seed in errors.keys() & reference.keys()]
 
 
 def _median_ratio(errors: Mapping[int, float], reference: Mapping[int, float]) -> float:
-    """Return the median ratio of two methods' errors on the same data sets; infinite without common data sets."""
+    """Return the median ratio (`errors` / `reference`) of two methods' errors on common data sets.
+
+    Infinite without common data sets.
+
+    Args:
+        errors, reference: seed of the data set to error, for the two methods.
+    """
     ratios = []
     for error, reference_error in _pairs(errors, reference):
         if np.isfinite(reference_error):
@@ -237,7 +248,7 @@ def _summary(name: str, rows: Sequence[TrialRow]) -> MethodSummary:
 
 
 def spread(values: Sequence[float]) -> Quartiles:
-    """Return median and quartiles of the values without NaN; NaN if none remain."""
+    """Return median and quartiles of values, ignoring NaN; all three are NaN if no value is left."""
     numbers = np.sort([value for value in values if not math.isnan(value)])
     if len(numbers) == 0:
         return Quartiles(float("nan"), float("nan"), float("nan"))
@@ -250,7 +261,7 @@ def sign_test(errors: Mapping[int, float], reference: Mapping[int, float]) -> fl
     """Return the two-sided p value of the sign test between the errors of two methods.
 
     Args:
-        errors, reference: seed to error; only seeds in both are compared, ties are left out.
+        errors, reference: seed of the data set to error; only seeds in both are compared, and ties are ignored.
 
     Returns:
         The p value; 1 where fewer than `MIN_DATA_SETS` data sets distinguish the methods.

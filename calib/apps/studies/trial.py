@@ -1,4 +1,7 @@
-"""One trial: a method on one data set of a condition, as a row of figures of merit. Its errors never end a study."""
+"""One trial: a method applied to one data set of a condition, as a row of figures of merit.
+
+An error of the method becomes part of the row and never ends a study.
+"""
 
 import time
 from collections.abc import Sequence
@@ -30,26 +33,32 @@ MAX_MESSAGE = 300
 
 @dataclass(frozen=True)
 class TrialRow:
-    """Figures of merit of one trial; NaN if not available.
+    """Figures of merit of one trial; NaN where a figure is not available.
+
+    β are the p base parameters, W is the observation matrix, τ the torques; a hat marks estimates. "The survey" is
+    Leboutet et al. (2021).
 
     Attributes:
-        condition: name of the condition; digest: what it is.
-        method, seed: of the trial.
-        status: how it ended: ``found``, another of `EstimateStatus`, ``not recorded``, ``failed``.
-        message: why, in a line.
-        robot, sigma_q, sigma_tau, decimation, cutoff, mismatch, duration, guess: of the condition; what else there is
-            of it, digest and name tell.
+        condition, digest: name of the condition, and the digest of its content.
+        method, seed: method and seed of the trial.
+        status: how the trial ended: ``found``, another value of `EstimateStatus`, ``not recorded``, ``failed``.
+        message: the reason, in one line.
+        robot, sigma_q, sigma_tau, decimation, cutoff, mismatch, duration, guess: values of the condition. Its other
+            values are determined by digest and name.
         beta_error: 100 ‖β̂ - β‖ / ‖β‖ [%].
         beta_distance: the survey's d_β = 100 (2/p) Σ |β̂_j - β_j| / (|β̂_j| + |β_j|) [%].
-        beta_sigma: rms of (β̂_j - β_j) / σ_j: 1 where the stated σ match the error.
-        coverage: share of the parameters within 1.96 σ [%].
+        beta_sigma: rms of (β̂_j - β_j) / σ_j: 1 where the estimated σ match the errors.
+        coverage: share of the parameters whose true value is within 1.96 σ of the estimate [%].
         torque_error: 100 ‖τ̂ - τ‖ / ‖τ‖ along the validation motion, τ noise-free [%].
-        torque_worst: the same of the worst joint.
-        survey_tau: the survey's d_τ = 100 mean_k ‖τ_m - W β̂‖ / ‖τ_m‖ on its own data set, noise included [%].
-        survey_q: the survey's d_q = 100 mean_k ‖q - q_s‖ / ‖q‖, q_s simulated with β̂ [%]; of the first data sets.
-        iterations, simulations: of the method.
-        seconds, cpu: wall and processor time of the method [s].
-        version: of the toolkit; behind it that of the method, where it has changed: ``0.1.0``, ``0.1.0 method 2``.
+        torque_worst: torque error of the worst joint [%].
+        survey_tau: the survey's d_τ = 100 mean_k ‖τ_m - W β̂‖ / ‖τ_m‖ on the method's own data set, with measured
+            torques τ_m, noise included [%].
+        survey_q: the survey's d_q = 100 mean_k ‖q - q_s‖ / ‖q‖, with positions q_s simulated with β̂ [%]; only for the
+            first data sets.
+        iterations, simulations: number of iterations and simulations of the method.
+        seconds, cpu: wall-clock and processor time of the method [s].
+        version: version of the toolkit, followed by that of the method if it has changed: ``0.1.0``, ``0.1.0 method
+            2``.
     """
 
     condition: str
@@ -82,7 +91,7 @@ class TrialRow:
 
     @property
     def key(self) -> tuple[str, str, int]:
-        """Unique key of the trial."""
+        """Key of the trial in the store: digest of the condition, method and seed."""
         return self.digest, self.method, self.seed
 
     @property
@@ -92,7 +101,7 @@ class TrialRow:
 
     @property
     def current(self) -> bool:
-        """Whether the method is unchanged since the trial; otherwise the row does not count and is run again."""
+        """Whether the method is unchanged since the trial; otherwise the row is not used and the trial is repeated."""
         return (self.version.partition(_CHANGED)[2] or "1") == str(VERSIONS.get(self.method, 1))
 
     @property
@@ -105,7 +114,13 @@ COLUMNS = tuple(field.name for field in fields(TrialRow))
 
 @dataclass(frozen=True)
 class Trials:
-    """Trials of several methods on one data set: one task for a worker."""
+    """Trials of several methods on one data set, which are one task for a worker.
+
+    Attributes:
+        condition: the condition.
+        methods: names of the methods.
+        seed: seed of the trials.
+    """
 
     condition: Condition
     methods: tuple[str, ...]
@@ -113,12 +128,12 @@ class Trials:
 
 
 def run_trials(trials: Trials) -> list[TrialRow]:
-    """Return the row of each method."""
+    """Return one row for each method of a task."""
     return [run_trial(trials.condition, method, trials.seed) for method in trials.methods]
 
 
 def run_trial(condition: Condition, method: str, seed: int) -> TrialRow:
-    """Return the row of a condition, a method and a seed; reproducible except for the times."""
+    """Return the row of a trial, given by condition, method and seed; reproducible except for the times."""
     head: FieldValues = {
         "condition": condition.name,
         "digest": condition.digest,
@@ -155,7 +170,13 @@ def run_trial(condition: Condition, method: str, seed: int) -> TrialRow:
 
 
 def _merit(data: Experiment, outcome: MethodEstimate, values: np.ndarray) -> FieldValues:
-    """Return the figures of merit of an estimate with base parameters (b,), all but ``survey_q``."""
+    """Return all figures of merit but ``survey_q`` of an estimate, by name.
+
+    Args:
+        data: the data set.
+        outcome: the method's estimate.
+        values: (b,) estimated base parameters.
+    """
     error = values - data.truth
     torque_error = data.matrix @ values - data.torque
     joint_errors = [_percent(joint, torque) for joint, torque in zip(torque_error.T, data.torque.T)]
@@ -184,7 +205,12 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 
 
 def _survey_tau(data: Experiment, values: np.ndarray) -> float:
-    """Return the survey's torque error d_τ [%] of base parameters (b,) on the first data set."""
+    """Return the torque error d_τ of Leboutet et al. (2021) [%] of an estimate on the data set's first recording.
+
+    Args:
+        data: the data set.
+        values: (b,) estimated base parameters.
+    """
     problem = data.problem
     case = problem.cases[0]
     predicted = predict(Dynamics(problem.model, problem.base.to_standard(values)), case)
@@ -194,7 +220,16 @@ def _survey_tau(data: Experiment, values: np.ndarray) -> float:
 
 
 def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, seed: int) -> float:
-    """Return the survey's position error d_q [%] of an estimate, simulated again without noise; NaN if unavailable."""
+    """Return the position error d_q of Leboutet et al. (2021) [%] of an estimate; NaN if unavailable.
+
+    The motion is simulated again without noise, with the estimated parameters.
+
+    Args:
+        condition: the condition.
+        data: the data set.
+        values: (b,) estimated base parameters.
+        seed: seed of the trial; the error is computed for the first data sets only.
+    """
     if seed // condition.guesses >= condition.resimulated:
         return NAN
     setup = set_up(condition)
@@ -214,7 +249,7 @@ def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, see
 
 
 def _message(error: BaseException | None) -> str:
-    """Return the message of an error as one line, with its class if it is an unexpected one."""
+    """Return the message of an error in one line, preceded by the class of an unexpected error; empty for None."""
     if error is None:
         return ""
     if isinstance(error, CalibError):
@@ -225,7 +260,7 @@ def _message(error: BaseException | None) -> str:
 
 
 def _version(method: str) -> str:
-    """Return the version of the toolkit and, where it has changed, of a method."""
+    """Return the version of the toolkit, followed by that of the method if it has changed."""
     try:
         toolkit = version("armature-calib")
     except PackageNotFoundError:
@@ -236,7 +271,13 @@ def _version(method: str) -> str:
 
 
 def grouped(condition: Condition, methods: Sequence[str], seed: int) -> list[Trials]:
-    """Return the trials of one data set as tasks: one per simulating method, one for all other methods."""
+    """Return the trials of one data set as tasks: one per simulating method, one for all other methods.
+
+    Args:
+        condition: the condition.
+        methods: names of the methods.
+        seed: seed of the trials.
+    """
     fast = [name for name in methods if not method_named(name).needs_simulation]
     tasks = []
     if fast:

@@ -32,7 +32,7 @@ def view(
     from calib.apps.viewer import viewer
     from calib.files import results
 
-    require(folder.exists(), f"{folder}: no such folder or CSV", UsageError)
+    require(folder.exists(), f"{folder}: no such folder or CSV: check the path", UsageError)
     if save is None and spawn is False:
         raise UsageError("nothing to do: give --save FILE.rrd, or omit --no-spawn")
     scene = None

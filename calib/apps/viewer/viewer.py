@@ -1,10 +1,8 @@
 """Display of a scene in Rerun; the only module that loads rerun-sdk, and only when a scene is shown.
 
-Everything is on one timeline, ``time`` [s], in the order of the work: pose plans as they grow, measured poses one by
-one, motions, torques. A pose lasts `EACH`, a motion its own duration. Poses also have timelines of their own.
-
-Everything plays on one clock, the timeline ``time``, in the order of the work: pose plans as they grow, measured poses
-one by one, motions, torques; poses last `EACH`, motions as long as they are. Poses have timelines of their own beside.
+Everything is on one timeline, ``time`` [s], in the order of a calibration: pose plans as they grow, measured poses one
+by one, motions, torques. A pose lasts `EACH` seconds, a motion its own duration. Poses also have timelines of their
+own, which count poses.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ from calib import files
 from calib.errors import CalibError, UsageError, command_line, refused_as
 from calib.toolkit.chains import Chain, Joint, joint_frames
 from calib.toolkit.result_folders import DrawnRobot as Drawn
-from calib.toolkit.result_folders import ErrorSizes, Measured, Played, Scene, Torques, drawn, strips, thinned
+from calib.toolkit.result_folders import ErrorSizes, Measured, Played, Scene, Torques, TradeOffs, drawn, strips, thinned
 from calib.transforms import to_quaternion
 
 if TYPE_CHECKING:
@@ -34,6 +32,9 @@ BEFORE = [213, 94, 0]
 AFTER = [0, 130, 90]
 SEEN = [40, 90, 180]
 LIMIT = [200, 60, 60]
+BAND = [150, 200, 180]
+CAD = [140, 90, 170]
+DOMINATED = [170, 170, 170]
 # between one part and the next [s]
 GAP = 1.0
 # that a pose stands still [s]
@@ -42,7 +43,7 @@ FILE = "session.rrd"
 
 
 class _Rerun:
-    """The package rerun, loaded at first use."""
+    """The package rerun, loaded when one of its names is first used."""
 
     def __getattr__(self, name: str) -> Any:
         message = "Rerun is not installed here (no version for Macs with Intel processors): pip install rerun-sdk"
@@ -55,7 +56,12 @@ rr = _Rerun()
 
 
 def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Scene:
-    """Write a folder's scene as a Rerun recording, complete or not at all, and return the scene.
+    """Write a folder's scene as a Rerun recording, and return the scene; an incomplete recording is never left.
+
+    Args:
+        folder: folder of a result or a session, or a CSV.
+        path: file of the recording.
+        robot: the robot to draw; None: as the folder has it.
 
     Raises:
         UsageError: rerun is not installed, or the folder has nothing to show.
@@ -74,9 +80,12 @@ def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Sce
 
 
 def write_beside(folder: str | Path) -> str:
-    """Write ``session.rrd`` into a folder if possible, and return its name or why it failed, in one line; never raises.
+    """Write ``session.rrd`` into a folder, and return its name, or in one line why it failed; never raises.
 
     A recording is a convenience: neither a missing package nor a full disk stops the step that writes it.
+
+    Args:
+        folder: folder of a session.
     """
     try:
         write(folder, Path(folder) / FILE)
@@ -87,6 +96,10 @@ def write_beside(folder: str | Path) -> str:
 
 def spawn(folder: str | Path, robot: str | None = None) -> Scene:
     """Open Rerun's window with a folder's scene, and return the scene.
+
+    Args:
+        folder: folder of a result or a session, or a CSV.
+        robot: the robot to draw; None: as the folder has it.
 
     Raises:
         UsageError: there is no display, as over SSH.
@@ -121,11 +134,13 @@ def _send(recording: RecordingStream, scene: Scene) -> None:
         start = _played(recording, scene, played, start)
     for torques in scene.torques:
         start = _torques(recording, scene, torques, start)
+    for front in scene.fronts:
+        _front(recording, front)
     _meshes(recording, scene)
 
 
 def about(scene: Scene) -> str:
-    """Return the text shown next to the plots."""
+    """Return the text on a scene that is shown next to the plots."""
     lines = [f"# {scene.title}"]
     for measured in scene.measured:
         nominal_mm = 1e3 * np.linalg.norm(measured.seen - measured.nominal, axis=1)
@@ -147,9 +162,21 @@ def about(scene: Scene) -> str:
     for motion in scene.played:
         lines.append(f"motion *{motion.name}*: {motion.t[-1]:.1f} s")
     for torques in scene.torques:
-        lines.append(f"torques *{torques.name}*: measured orange, predicted green, and residuals [N·m, N]")
+        lines.append(_torque_line(torques))
+    for front in scene.fronts:
+        lines.append(f"front of *{front.name}*: motion {front.designed + 1} of {len(front.values)} was designed")
     lines += [f"note: {note}" for note in scene.notes]
     return "\n\n".join(lines)
+
+
+def _torque_line(torques: Torques) -> str:
+    """Return the line on a recording's torques, with the colours of its curves."""
+    curves = ["measured orange", "predicted green"]
+    if torques.sigma is not None:
+        curves.append("expected interval of 95 % light green")
+    if torques.nominal is not None:
+        curves.append("identified on the CAD geometry violet")
+    return f"torques *{torques.name}*: {', '.join(curves)}, and residuals [N·m, N]"
 
 
 def _rms(values: np.ndarray) -> float:
@@ -157,7 +184,11 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _size_lines(sizes: ErrorSizes) -> Iterator[str]:
-    """Yield lines, for the text beside the plots, on rows without a measured position in the arm's base."""
+    """Yield lines on the errors of measurements that do not give a position in the arm's base.
+
+    Args:
+        sizes: magnitudes of these errors.
+    """
     for label, rows in (("fitted", ~sizes.unseen), ("unseen", sizes.unseen)):
         if not rows.any():
             continue
@@ -168,7 +199,7 @@ def _size_lines(sizes: ErrorSizes) -> Iterator[str]:
 
 
 def _rms_mm(sizes: np.ndarray) -> str:
-    """Return the rms of error sizes (m,) [m] as text in mm; NaN are left out, 'not stated' if all are."""
+    """Return the rms of error sizes (m,) [m] as text in mm, ignoring NaN; 'not stated' if all are NaN."""
     errors_mm = 1e3 * sizes[np.isfinite(sizes)]
     if not len(errors_mm):
         return "not stated"
@@ -176,7 +207,14 @@ def _rms_mm(sizes: np.ndarray) -> str:
 
 
 def _poses(name: str, count: int, start: float, selection: np.ndarray | None = None) -> list[TimeColumn]:
-    """Return the time columns of `count` poses, or those selected: the common clock from `start` [s], and a counter."""
+    """Return the time columns of poses: on the common timeline from `start` [s] on, and on a counter called `name`.
+
+    Args:
+        name: name of the counter.
+        count: number of poses.
+        start: time at which the poses begin [s].
+        selection: indices of the poses to include; None for all.
+    """
     steps = np.arange(1, count + 1)
     if selection is not None:
         steps = selection + 1
@@ -184,7 +222,14 @@ def _poses(name: str, count: int, start: float, selection: np.ndarray | None = N
 
 
 def _measured(recording: RecordingStream, scene: Scene, measured: Measured, start: float) -> float:
-    """Log points and error arrows, together and pose by pose; return the start time of the next part [s]."""
+    """Log measured points and error arrows, all together and pose by pose; return the start time of the next part [s].
+
+    Args:
+        recording: the recording.
+        scene: the scene, which contains the robot.
+        measured: the measured poses.
+        start: time at which this part begins [s].
+    """
     if not len(measured.q) or scene.chain is None:
         return start
     count = len(measured.q)
@@ -198,6 +243,7 @@ def _measured(recording: RecordingStream, scene: Scene, measured: Measured, star
         recording.log(f"world/tool/{name}", rr.Points3D(points, radii=0.006, colors=colour), static=True)
         size_mm = 1e3 * np.linalg.norm(errors, axis=1)
         _series(recording, f"errors/{name}", index, size_mm, f"{name} [mm]", colour)
+    _interval(recording, "errors", "pose", start, measured.interval)
     residual_mm = 1e3 * (measured.seen - measured.calibrated)
     for k, axis in enumerate("xyz"):
         _series(recording, f"axes/position/{axis}", index, residual_mm[:, k], f"{axis} in the arm's base [mm]")
@@ -224,7 +270,14 @@ def _measured(recording: RecordingStream, scene: Scene, measured: Measured, star
 
 
 def _sizes(recording: RecordingStream, scene: Scene, sizes: ErrorSizes, start: float) -> float:
-    """Log the sizes of errors row by row, with the arm at each; return the start time of the next part [s]."""
+    """Log the sizes of errors row by row, with the arm at each row's pose; return the start time of the next part [s].
+
+    Args:
+        recording: the recording.
+        scene: the scene, which contains the robot.
+        sizes: magnitudes of the errors.
+        start: time at which this part begins [s].
+    """
     count = len(sizes.q)
     entity = f"errors/{sizes.kind}"
     if sizes.kind == "position":
@@ -234,6 +287,7 @@ def _sizes(recording: RecordingStream, scene: Scene, sizes: ErrorSizes, start: f
         if len(rows):
             index = _poses("row", count, start, rows)
             _series(recording, f"{entity}/{name}", index, 1e3 * size[rows], f"{name} [mm]", colour)
+    _interval(recording, entity, "row", start, sizes.interval)
     index = _poses("row", count, start)
     if sizes.unseen.any():
         is_unseen = np.where(sizes.unseen, 1.0, 0.0)
@@ -242,10 +296,32 @@ def _sizes(recording: RecordingStream, scene: Scene, sizes: ErrorSizes, start: f
     return start + EACH * count + GAP
 
 
+def _interval(recording: RecordingStream, entity: str, counter: str, start: float, interval: np.ndarray | None) -> None:
+    """Log the radii (m,) [m] within which 95 % of the calibrated arm's errors are expected, at rows that have one."""
+    if interval is None:
+        return
+    rows = np.flatnonzero(np.isfinite(interval))
+    if len(rows):
+        index = _poses(counter, len(interval), start, rows)
+        _series(recording, f"{entity}/interval95", index, 1e3 * interval[rows], "95 % expected below [mm]", BAND)
+
+
 def _chosen(
     recording: RecordingStream, scene: Scene, chain: Chain | Drawn, name: str, q: np.ndarray, start: float
 ) -> float:
-    """Log a pose plan as it grows: one more tool position each step, and the arm at the newest pose."""
+    """Log a pose plan as it grows: one more tool position per step, and the arm at the newest pose.
+
+    Args:
+        recording: the recording.
+        scene: the scene.
+        chain: the robot.
+        name: name of the plan.
+        q: (m, n) joint values of the plan's poses [rad or m].
+        start: time at which this part begins [s].
+
+    Returns:
+        The start time of the next part [s].
+    """
     tips = strips(chain, q)[0][:, -1]
     counts = np.arange(1, len(q) + 1)
     positions = np.concatenate([tips[:k] for k in counts])
@@ -259,7 +335,14 @@ def _chosen(
 
 
 def _played(recording: RecordingStream, scene: Scene, played: Played, start: float) -> float:
-    """Log a motion with its limits from `start` on [s], and return the start time of the next part."""
+    """Log a motion and its limits; return the start time of the next part [s].
+
+    Args:
+        recording: the recording.
+        scene: the scene, which contains the robot.
+        played: the motion.
+        start: time at which this part begins [s].
+    """
     t = start + played.t - played.t[0]
     samples = thinned(played.t)
     index = [rr.TimeColumn("time", duration=t[samples])]
@@ -277,7 +360,15 @@ def _played(recording: RecordingStream, scene: Scene, played: Played, start: flo
 
 
 def _limits(recording: RecordingStream, joint: Joint, name: str, ends: np.ndarray, velocities: bool) -> None:
-    """Log a joint's limits, where it has any, as lines over a motion's first and last time (2,) [s]."""
+    """Log a joint's limits, if it has any, as lines over the duration of a motion.
+
+    Args:
+        recording: the recording.
+        joint: the joint.
+        name: its name in the viewer.
+        ends: (2,) first and last time of the motion [s].
+        velocities: whether the limits of velocity are logged, too.
+    """
     index = [rr.TimeColumn("time", duration=ends)]
     limits = [("position", "lower", joint.lower), ("position", "upper", joint.upper)]
     if velocities:
@@ -289,7 +380,17 @@ def _limits(recording: RecordingStream, joint: Joint, name: str, ends: np.ndarra
 
 
 def _torques(recording: RecordingStream, scene: Scene, torques: Torques, start: float) -> float:
-    """Log measured torques, predicted torques and residuals, with the arm on the same time axis."""
+    """Log measured torques, predicted torques and residuals, with the arm on the same time axis.
+
+    Args:
+        recording: the recording.
+        scene: the scene, which contains the robot.
+        torques: torques of one recording of the robot.
+        start: time at which this part begins [s].
+
+    Returns:
+        The start time of the next part [s].
+    """
     t = start + torques.t - torques.t[0]
     index = [rr.TimeColumn("time", duration=t)]
     for j, (name, unit) in enumerate(zip(torques.rows, torques.units)):
@@ -299,15 +400,34 @@ def _torques(recording: RecordingStream, scene: Scene, torques: Torques, start: 
         _series(recording, f"torques/{part}/measured", index, measured, f"measured [{unit}]", BEFORE)
         _series(recording, f"torques/{part}/predicted", index, predicted, f"predicted [{unit}]", AFTER)
         _series(recording, f"residuals/{part}", index, measured - predicted, f"{name} [{unit}]")
+        if torques.band is not None:
+            for side, bound in zip(("lower", "upper"), torques.band):
+                _series(recording, f"torques/{part}/{side}", index, bound[:, j], f"95 %, {side} [{unit}]", BAND)
+        if torques.nominal is not None:
+            nominal = torques.nominal[:, j]
+            _series(recording, f"torques/{part}/nominal", index, nominal, f"on the CAD geometry [{unit}]", CAD)
     if torques.q is not None:
         samples = thinned(torques.t)
         _arm(recording, scene, [rr.TimeColumn("time", duration=t[samples])], torques.q[samples])
     return float(t[-1]) + GAP
 
 
+def _front(recording: RecordingStream, front: TradeOffs) -> None:
+    """Log a front of trade-offs as labelled points, each objective scaled to 0 to 1; the designed motion is marked."""
+    colours = np.where(front.best[:, None], AFTER, DOMINATED)
+    colours[front.designed] = BEFORE
+    points = front.drawn * [1.0, -1.0]  # the viewer's y axis points down
+    entity = f"front/{_part(front.name)}"
+    motions = rr.Points2D(points, radii=0.02, colors=colours, labels=front.labels)
+    recording.log(f"{entity}/motions", motions, static=True)
+    order = np.flatnonzero(front.best)
+    order = order[np.argsort(points[order, 0])]
+    recording.log(f"{entity}/best", rr.LineStrips2D([points[order]], colors=[AFTER]), static=True)
+
+
 def _part(name: str) -> str:
-    """Return a name, escaped as one part of a Rerun entity path."""
-    return rr.escape_entity_path_part(name)
+    """Return a name as one part of a Rerun entity path, with an underscore for each blank."""
+    return rr.escape_entity_path_part(name.replace(" ", "_"))
 
 
 def _series(
@@ -318,7 +438,16 @@ def _series(
     name: str,
     colour: Sequence[int] | None = None,
 ) -> None:
-    """Log one line of a plot with its legend."""
+    """Log one curve of a plot with its legend.
+
+    Args:
+        recording: the recording.
+        path: entity path of the curve.
+        index: time columns of the values.
+        values: the values.
+        name: name in the legend.
+        colour: colour of the curve; None: chosen by Rerun.
+    """
     style = {}
     if colour is not None:
         style["colors"] = colour
@@ -328,7 +457,14 @@ def _series(
 
 
 def _arm(recording: RecordingStream, scene: Scene, index: list[TimeColumn], q: np.ndarray) -> None:
-    """Log the arm's links as lines, and its links' frames where it has meshes."""
+    """Log the arm's links as lines, and the frames of the links if the robot has meshes, at joint values q (m, n).
+
+    Args:
+        recording: the recording.
+        scene: the scene, which contains robot and meshes.
+        index: time columns of the m poses.
+        q: joint values [rad or m].
+    """
     if scene.chain is None or q.shape[1] != scene.chain.n:
         return
     lines = strips(scene.chain, q)
@@ -360,7 +496,7 @@ def _arm(recording: RecordingStream, scene: Scene, index: list[TimeColumn], q: n
 
 
 def _meshes(recording: RecordingStream, scene: Scene) -> None:
-    """Log the meshes, each once, under the frame of its link."""
+    """Log each mesh of a scene's robot once, attached to the frame of its link."""
     for number, mesh in enumerate(scene.meshes):
         entity = f"world/robot/links/{_part(mesh.link)}/mesh_{number}"
         position = mesh.placement[:3, 3]
@@ -370,7 +506,7 @@ def _meshes(recording: RecordingStream, scene: Scene) -> None:
 
 
 def _blueprint(scene: Scene) -> Any:
-    """Return the initial layout of the recording: the arm at the left, plots and text at the right."""
+    """Return the initial layout of the recording of a scene: the arm on the left, plots and text on the right."""
     import rerun.blueprint as rrb
 
     tabs: list[Any] = []
@@ -410,6 +546,10 @@ def _blueprint(scene: Scene) -> Any:
         grid = rrb.Grid(*plots, grid_columns=2)
         residuals = rrb.TimeSeriesView(origin="residuals", name="measured minus predicted")
         tabs.append(rrb.Vertical(grid, residuals, row_shares=[3, 1], name="torques"))
+    for front in scene.fronts:
+        axes = " over ".join(reversed(front.objectives))
+        origin = f"front/{_part(front.name)}"
+        tabs.append(rrb.Spatial2DView(origin=origin, name=f"front of {front.name}: {axes}, both scaled"))
     picture = rrb.Spatial3DView(origin="world", name="robot, nominal orange, calibrated green")
     right = rrb.Tabs(*tabs, active_tab=int(bool(scene.measured and scene.chosen)))
     text = rrb.TextDocumentView(origin="about", name="what is shown")

@@ -35,8 +35,11 @@ DICTIONARIES = {f"{bits}x{bits}_{count}": count for bits in (4, 5, 6, 7) for cou
     "apriltag_36h11": 587,
 }
 """Number of markers in each dictionary."""
-# corners that make an image useful
+# Smallest number of corners with which an image is used.
 MIN_CORNERS = 8
+# Smallest and largest marker (of an AprilTag grid: gap between tags), as shares of the side of a square.
+MARKER_SHARES = {"charuco": (0.3, 0.9), "apriltag": (0.05, 2.0)}
+KIND_NAMES = {"charuco": "ChArUco", "chessboard": "chessboard", "apriltag": "AprilTag grid"}
 
 
 @strict
@@ -54,16 +57,18 @@ class Board:
     def __post_init__(self) -> None:
         if max(self.columns, self.rows) > 100:
             raise ValueError(f"{self.columns} x {self.rows} squares: the limit is 100 per row")
-        min_share, max_share = {"charuco": (0.3, 0.9), "apriltag": (0.05, 2.0)}.get(self.kind, (0.0, np.inf))
+        min_share, max_share = MARKER_SHARES.get(self.kind, (0.0, np.inf))
         if not min_share * self.square <= self.marker <= max_share * self.square:
-            quantity = "side of a marker" if self.kind == "charuco" else "gap between two tags"
+            quantity = "gap between two tags"
+            if self.kind == "charuco":
+                quantity = "side of a marker"
             raise ValueError(
                 f"marker = {self.marker:g}: the {quantity} must be between {min_share:g} and {max_share:g} of "
                 f"square = {self.square:g}"
             )
         if self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0:
             squares = f"{self.columns} x {self.rows} squares"
-            raise ValueError(f"{squares} look the same upside down: take an even and an odd number")
+            raise ValueError(f"{squares} look the same upside down: take an even and an odd number of squares")
         if self.kind == "chessboard" and min(self.columns, self.rows) < 4:
             raise ValueError("a chessboard needs at least 4 squares in each direction")
         count = DICTIONARIES.get(self.dictionary, self.tags)
@@ -74,50 +79,61 @@ class Board:
     def tags(self) -> int:
         """Number of markers on the board."""
         count = self.columns * self.rows
-        return {"charuco": count // 2, "apriltag": count, "chessboard": 0}[self.kind]
+        tags_by_kind = {"charuco": count // 2, "apriltag": count, "chessboard": 0}
+        return tags_by_kind[self.kind]
 
     @property
     def extent(self) -> tuple[float, float]:
         """Width and height of the pattern [m]."""
         if self.kind == "apriltag":
             pitch = self.square + self.marker
-            return self.columns * pitch - self.marker, self.rows * pitch - self.marker
+            width = self.columns * pitch - self.marker
+            height = self.rows * pitch - self.marker
+            return width, height
         return self.columns * self.square, self.rows * self.square
 
     @property
     def words(self) -> str:
         """Short description of the board."""
-        kind_name = {"charuco": "ChArUco", "chessboard": "chessboard", "apriltag": "AprilTag grid"}[self.kind]
-        return f"{kind_name} {self.columns} x {self.rows}, {1e3 * self.square:g} mm"
+        return f"{KIND_NAMES[self.kind]} {self.columns} x {self.rows}, {1e3 * self.square:g} mm"
 
 
 def corners(board: Board) -> np.ndarray:
     """Return the positions (K, 3) [m] of a board's corners in the board's frame."""
     if board.kind == "apriltag":
-        pitch, side = board.square + board.marker, board.square
+        pitch = board.square + board.marker
+        side = board.square
         positions = []
         for row, column in product(range(board.rows), range(board.columns)):
-            x, y = column * pitch, row * pitch
+            x = column * pitch
+            y = row * pitch
             for shift_x, shift_y in ((0.0, 0.0), (side, 0.0), (side, side), (0.0, side)):
                 positions.append((x + shift_x, y + shift_y, 0.0))
         return np.array(positions)
-    across, down = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
-    return board.square * np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
+    columns = np.arange(1, board.columns)
+    rows = np.arange(1, board.rows)
+    across, down = np.meshgrid(columns, rows)
+    heights = np.zeros(across.size)
+    counts = np.column_stack([across.ravel(), down.ravel(), heights])
+    return board.square * counts
 
 
 def read_board(path: str | Path) -> Board:
-    """Return the board described by a ``board.toml`` file, or by the one in a folder.
+    """Return the board that a file describes; of a folder, the file ``board.toml`` is read.
 
     Raises:
-        UsageError: for a key or a value that cannot be.
+        UsageError: for an unknown key or an impossible value.
     """
-    path = Path(path) / BOARD if Path(path).is_dir() else Path(path)
+    path = Path(path)
+    if path.is_dir():
+        path = path / BOARD
     return parse(Board, read_toml(path), str(path))
 
 
 def write_board(board: Board, path: str | Path) -> Path:
-    """Write a board as ``board.toml``."""
-    comment = {"apriltag": "the gap between two tags [m]", "charuco": "side of a marker [m]"}.get(board.kind, "unused")
+    """Write a board as ``board.toml``; return the path."""
+    marker_comments = {"apriltag": "the gap between two tags [m]", "charuco": "side of a marker [m]"}
+    comment = marker_comments.get(board.kind, "unused")
     lines = [
         f'kind = "{board.kind}"',
         f"columns = {board.columns}".ljust(32) + "# squares (tags) across",

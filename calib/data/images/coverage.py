@@ -5,13 +5,16 @@ import numpy as np
 from calib.data.images.pixels import Pixels
 from calib.data.poses import IN_HAND
 
-# cells of the image that coverage counts (our choice)
+# Numbers of columns and rows of cells into which the image is divided to measure its coverage (our choice).
 GRID = (12, 9)
+# Share of covered cells below which a sentence advises on further images.
+MIN_COVERAGE = 0.6
 
 
 def image_words(block: Pixels) -> str:
     """Return a summary sentence of newly read images: corners, mounting, lens, coverage."""
-    corner_counts = f"{block.seen.sum(axis=1).mean():.1f} of {block.seen.shape[1]} corners each"
+    mean_count = block.seen.sum(axis=1).mean()
+    corner_counts = f"{mean_count:.1f} of {block.seen.shape[1]} corners each"
     carried = "the arm carries the board"
     if block.mounting == IN_HAND:
         carried = "the arm carries the camera"
@@ -19,11 +22,18 @@ def image_words(block: Pixels) -> str:
     if block.lens is not None:
         origin = "given" if block.known else "found"
         focal = f", focal length {block.lens.values[0]:.0f} px {origin}"
-    return f"{corner_counts}; {carried}{focal}; {coverage_words(block.pixel[block.seen], block.size)}"
+    covered = coverage_words(block.pixel[block.seen], block.size)
+    return f"{corner_counts}; {carried}{focal}; {covered}"
 
 
 def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | None = None) -> np.ndarray:
-    """Return the number (or total weight) of corners in each cell of the image grid (`GRID`), as (rows, columns)."""
+    """Return the number of corners in each cell of the image grid `GRID`, as (rows, columns).
+
+    Args:
+        pixels: (N, 2) corners [px].
+        size: width and height of the image [px].
+        weights: (N,) weights whose sums are returned instead of numbers; None: numbers.
+    """
     bins = [np.linspace(0, length, count + 1) for length, count in zip(size, GRID)]
     counts, _, _ = np.histogram2d(pixels[:, 0], pixels[:, 1], bins, weights=weights)
     return counts.T
@@ -31,8 +41,9 @@ def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | No
 
 def coverage_words(pixels: np.ndarray, size: tuple[int, int]) -> str:
     """Return a sentence on the share of the image covered by corners, with advice if it is small."""
-    share = float(np.mean(coverage(pixels, size) > 0))
+    covered = coverage(pixels, size) > 0
+    share = float(np.mean(covered))
     sentence = f"corners lie in {share:.0%} of the image"
-    if share < 0.6:
+    if share < MIN_COVERAGE:
         sentence += "; the lens is not identifiable in the rest: bring the board closer and into the image's corners"
     return sentence

@@ -19,7 +19,7 @@ from calib import files
 from calib.data.images.board import Board, read_board, write_board
 from calib.data.images.detection import detected
 from calib.data.images.image_folders import detection_summary
-from calib.data.images.pixels import Found, write_corners
+from calib.data.images.pixels import Detections, write_corners
 from calib.data.poses import BOARD, CORNERS, JOINTS
 from calib.data.recordings.bags import JOINT_STATE, connections_of, header_stamp, joint_states, opened
 from calib.errors import MeasurementError, require
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
-# type and number of the values of a pixel, by the message's encoding
+# Type and number of the values of a pixel, by encoding of the message.
 ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
     "mono8": (np.uint8, 1),
     "8UC1": (np.uint8, 1),
@@ -41,14 +41,16 @@ ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
     "bgra8": (np.uint8, 4),
     "rgba8": (np.uint8, 4),
 }
-# an image further from the nearest joint state has none [s]
+# Largest time [s] between an image and the nearest joint state; other images have no joint values.
 MAX_DELAY = 0.1
-# of a joint about an image [rad/s or m/s]; our choice
+# Largest speed of a joint [rad/s or m/s] at which the arm counts as at rest (our choice).
 MAX_JOINT_SPEED = 2e-3
-# joints of one stop differ by less [rad or m]
+# Largest difference of joint values [rad or m] between images of one stop.
 MAX_STOP_DISTANCE = 1e-3
-# images of one stop that are kept
+# Largest number of images of one stop that are kept.
 MAX_PER_STOP = 3
+# Nanoseconds, in which a bag states times, per second.
+NANOSECONDS = 1e9
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,7 @@ class ImageBag:
     names: tuple[str, ...]
     joint_names: tuple[str, ...]
     q: np.ndarray
-    corners: Found
+    corners: Detections
     notes: tuple[str, ...]
 
 
@@ -82,8 +84,8 @@ def read_image_bag(
     Args:
         path: path of the bag (a file, or the folder of a ROS 2 bag).
         board: the board to look for.
-        image_topic, joint_topic: topics to read; needed only where the bag has several of a kind.
-        say: called with the number and the name of each image.
+        image_topic, joint_topic: topics to read; "": the only topic of the kind in the bag.
+        say: called with the number and the name of each image; None: not called.
 
     Raises:
         MeasurementError: if the bag cannot be read, a topic is missing, or no image was taken at rest.
@@ -91,19 +93,26 @@ def read_image_bag(
     with opened(path) as reader:
         states = connections_of(reader, JOINT_STATE, joint_topic, path, "joint states", "--joint-topic")
         names, parts, _ = joint_states(reader, states, None, path)
-        few = f"{len(parts['q'])} joint states are too few to interpolate joint values"
+        few = f"{len(parts['q'])} joint states are too few to interpolate joint values: is the topic the right one?"
         require(len(parts["q"]) >= 2, few, MeasurementError, path)
         order = np.argsort(parts["stamp"], kind="stable")
         connections = connections_of(reader, IMAGE, image_topic, path, "images", "--image-topic")
-        chosen, q, notes = _at_rest(_image_stamps(reader, connections), parts["stamp"][order], parts["q"][order])
+        image_stamps = _image_stamps(reader, connections)
+        chosen, q, notes = _at_rest(image_stamps, parts["stamp"][order], parts["q"][order])
         require(len(chosen), f"no image was taken with the arm at rest: {'; '.join(notes)}", MeasurementError, path)
         labels = [f"image {k + 1}" for k in chosen]
-        images = zip(labels, _images(reader, connections, set(chosen.tolist())))
-        detections = detected(images, board, len(labels), None if say is None else lambda k, _, name: say(k, name))
+        images = _images(reader, connections, set(chosen.tolist()))
+
+        def show_progress(done: int, total: int, name: str) -> None:
+            if say is not None:
+                say(done, name)
+
+        detections = detected(zip(labels, images), board, len(labels), show_progress)
     return ImageBag(tuple(labels), names, q, detections, tuple(notes))
 
 
 def _image_stamps(reader: AnyReader, connections: list[Connection]) -> np.ndarray:
+    """Return the time of each image (N,) [ns]: that of its header, else that at which it was logged."""
     stamps = []
     for connection, logged, raw in reader.messages(connections=connections):
         message = reader.deserialize(raw, connection.msgtype)
@@ -115,19 +124,22 @@ def _images(reader: AnyReader, connections: list[Connection], numbers: set[int])
     """Yield the images with the given numbers as 8-bit grey levels, in the bag's order."""
     for number, (connection, _, raw) in enumerate(reader.messages(connections=connections)):
         if number in numbers:
-            yield _grey(reader.deserialize(raw, connection.msgtype))
+            message = reader.deserialize(raw, connection.msgtype)
+            yield _grey(message)
 
 
 def _grey(message: Any) -> np.ndarray:
+    """Return the 8-bit grey levels (height, width) of a message; raise ValueError for an unknown encoding."""
     from calib.data.images.images import decode, to_grey
 
     if hasattr(message, "format"):
         return decode(bytes(message.data))
     if message.encoding not in ENCODINGS:
-        raise ValueError(f"images of encoding '{message.encoding}'; known are {', '.join(ENCODINGS)}")
+        raise ValueError(f"images of encoding '{message.encoding}'; supported are {', '.join(ENCODINGS)}")
     kind, depth = ENCODINGS[message.encoding]
     order = ">" if message.is_bigendian else "<"
-    height, width = message.height, message.width
+    height = message.height
+    width = message.width
     rows = np.frombuffer(bytes(message.data), np.uint8).reshape(height, message.step)
     # rows may be padded
     flat = np.ascontiguousarray(rows[:, : width * depth * np.dtype(kind).itemsize])
@@ -141,16 +153,29 @@ def _grey(message: Any) -> np.ndarray:
 
 
 def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Return the numbers of images taken at rest, their joint values, and notes on the other images."""
+    """Return the images taken at rest, their joint values, and notes on the other images.
+
+    Args:
+        images: (N,) times of the images [ns].
+        stamps: (M,) times of the joint states, in ascending order [ns].
+        q: (M, n) joint values of the joint states [rad or m].
+
+    Returns:
+        Indices (k,) of the images, joint values (k, n) interpolated at their times, and sentences.
+    """
     notes = []
-    after = np.clip(np.searchsorted(stamps, images), 1, len(stamps) - 1)
+    next_state = np.searchsorted(stamps, images)
+    after = np.clip(next_state, 1, len(stamps) - 1)
     before = after - 1
+    since = images - stamps[before]
+    until = images - stamps[after]
     gap = np.maximum(stamps[after] - stamps[before], 1)
-    share = np.clip((images - stamps[before]) / gap, 0.0, 1.0)[:, None]
+    share = np.clip(since / gap, 0.0, 1.0)[:, None]
     q_images = q[before] * (1.0 - share) + q[after] * share
-    delay = np.minimum(np.abs(images - stamps[before]), np.abs(images - stamps[after]))
-    has_state = delay < MAX_DELAY * 1e9
-    speed = np.abs(q[after] - q[before]).max(axis=1) / (gap * 1e-9)
+    delay = np.minimum(np.abs(since), np.abs(until))
+    has_state = delay < MAX_DELAY * NANOSECONDS
+    travel = np.abs(q[after] - q[before]).max(axis=1)
+    speed = travel / (gap * 1e-9)
     still = speed < MAX_JOINT_SPEED
     at_rest = np.flatnonzero(has_state & still)
     if not has_state.all():
@@ -164,8 +189,14 @@ def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.
     selected = []
     images_of_stop = 0
     for k in at_rest:
-        same_stop = bool(selected) and np.abs(q_images[k] - q_images[selected[-1]]).max() < MAX_STOP_DISTANCE
-        images_of_stop = images_of_stop + 1 if same_stop else 1
+        same_stop = False
+        if selected:
+            distance = np.abs(q_images[k] - q_images[selected[-1]]).max()
+            same_stop = bool(distance < MAX_STOP_DISTANCE)
+        if same_stop:
+            images_of_stop += 1
+        else:
+            images_of_stop = 1
         if images_of_stop <= MAX_PER_STOP:
             selected.append(int(k))
     surplus = len(at_rest) - len(selected)
@@ -189,9 +220,11 @@ def from_bag(
 ) -> list[str]:
     """Write a bag's corners and joint values into a folder; return a summary as sentences."""
     printed_board = read_board(board)
-    contents = read_image_bag(
-        bag, printed_board, image_topic or "", joint_topic or "", lambda k, name: show(f"image {k}: {name}")
-    )
+
+    def show_progress(number: int, name: str) -> None:
+        show(f"image {number}: {name}")
+
+    contents = read_image_bag(bag, printed_board, image_topic or "", joint_topic or "", show_progress)
     write_image_folder(contents, printed_board, out)
     lines = detection_summary(contents.corners, printed_board, contents.names)
     return [*lines, *contents.notes, f"written to {out}; calib fit ROBOT {out} --out FOLDER fits it"]

@@ -26,14 +26,14 @@ from calib.data.csv_table import Table, read_table
 from calib.data.images.board import Board, corners, read_board
 from calib.data.images.coverage import coverage_words
 from calib.data.images.lens import LENS, Lens, read_lens
-from calib.data.images.pixels import Found, Pixels, read_corners, write_corners
+from calib.data.images.pixels import Detections, Pixels, read_corners, write_corners
 from calib.data.poses import BOARD, CORNERS, JOINTS, plausible
 from calib.data.poses.columns import Sheet
 from calib.data.poses.fit_options import FileOptions
 from calib.data.schema import Joints
 from calib.errors import CalibError, MeasurementError, UsageError, counted, listing, require
 
-# A number that is no part of a name.
+# A number that is not part of a name.
 MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")
 # Usable images below which a folder is refused.
 MIN_IMAGES = 3
@@ -70,19 +70,27 @@ def read_images(
     detection = find_corners(path, board, names, progress)
     rows, detection_notes = _usable(names, detection, path)
     notes += detection_notes
-    lens, lens_stated = _own_lens(path, detection.size, options)
-    usable = [detection.images[names[row]] for row in rows]
+    lens, lens_stated = _lens_of_folder(path, detection.size, options)
+    pixels = []
+    sigmas = []
+    for row in rows:
+        image = detection.images[names[row]]
+        pixels.append(image.pixel)
+        sigmas.append(image.sigma)
     size = detection.size
-    if not size[0]:
-        size = lens.size if lens else (0, 0)
+    if not size[0] and lens is not None:
+        size = lens.size
+    mounting = options.camera.mounting
+    if mounting == "auto":
+        mounting = ""
     return Pixels(
         q[rows],
         columns,
-        np.array([image.pixel for image in usable]),
+        np.array(pixels),
         board,
         lens,
-        mounting=options.camera.mounting.replace("auto", ""),
-        sigma=np.array([image.sigma for image in usable]),
+        mounting=mounting,
+        sigma=np.array(sigmas),
         names=tuple(names),
         size=size,
         known=lens_stated,
@@ -115,11 +123,11 @@ def joint_table(path: Path) -> Table:
     table = read_table(file)
     for name, count in Counter(table.texts("image")).items():
         if count > 1:
-            raise MeasurementError(f"'{name}' occurs {count} times", file, column="image")
+            raise MeasurementError(f"'{name}' occurs {count} times: one row per image is needed", file, column="image")
     return table
 
 
-def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progress | None = None) -> Found:
+def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progress | None = None) -> Detections:
     """Return the corners of a folder's images: from ``corners.csv`` if newer than the images, else by detection.
 
     Args:
@@ -131,31 +139,44 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
     stored = path / CORNERS
     images = [path / name for name in names if (path / name).is_file()]
     if stored.is_file():
-        newest = max(file.stat().st_mtime for file in (*images, path / BOARD))
+        times = [file.stat().st_mtime for file in (*images, path / BOARD)]
+        newest = max(times)
         detection = read_corners(stored, board)
-        all_stored = {image.name for image in images} <= set(detection.images)
+        all_stored = all(image.name in detection.images for image in images)
         if all_stored and stored.stat().st_mtime >= newest:
             return detection
     if not images:
         missing = "images"
-        if names:
-            missing = f"'{names[0]}' and the others" if len(names) > 1 else f"'{names[0]}'"
+        if len(names) == 1:
+            missing = f"'{names[0]}'"
+        elif names:
+            missing = f"'{names[0]}' and the others"
         raise MeasurementError(f"none of the images named in {JOINTS} exists ({missing})", path)
-    # Loads OpenCV: only where images are looked at.
+    # Loads OpenCV, which is slow: only where images are read.
     from calib.data.images.detection import detected
 
-    detection = detected(((image.name, image) for image in images), board, len(images), progress)
-    # A folder that cannot be written into is read all the same.
+    named_images = [(image.name, image) for image in images]
+    detection = detected(named_images, board, len(images), progress)
+    # The detection is valid even if the folder cannot be written into.
     with suppress(CalibError):
         write_corners(stored, detection)
     return detection
 
 
-def _usable(names: Sequence[str], detection: Found, path: Path) -> tuple[np.ndarray, list[str]]:
+def _usable(names: Sequence[str], detection: Detections, path: Path) -> tuple[np.ndarray, list[str]]:
     """Return the rows of ``joints.csv`` whose images are usable, and sentences on the unusable images."""
-    missing = [name for name in names if name not in detection.images]
-    problems = {name: detection.images[name].problem for name in names if name in detection.images}
-    rows = np.array([k for k, name in enumerate(names) if problems.get(name) == ""], dtype=int)
+    missing = []
+    problems = {}
+    usable = []
+    for row, name in enumerate(names):
+        image = detection.images.get(name)
+        if image is None:
+            missing.append(name)
+            continue
+        problems[name] = image.problem
+        if not image.problem:
+            usable.append(row)
+    rows = np.array(usable, dtype=int)
     notes = []
     if missing:
         notes.append(f"{len(missing)} of {len(names)} rows have no image: {listing(missing, 5)}")
@@ -174,26 +195,44 @@ def _usable(names: Sequence[str], detection: Found, path: Path) -> tuple[np.ndar
 
 
 def problem_words(problems: Mapping[str, str]) -> list[str]:
-    """Return a sentence per reason why images are unusable, with the names of the images concerned."""
+    """Return a sentence per reason why images are unusable, with the names of the images concerned.
+
+    Args:
+        problems: reason by image name; "" for a usable image. Reasons that differ in their numbers only are reported as
+            one, with the range of the numbers.
+    """
     reasons: dict[str, list[str]] = {}
     for name, problem in problems.items():
         if problem:
-            reasons.setdefault(MEASURED.sub("#", problem), []).append(name)
+            reason = MEASURED.sub("#", problem)
+            reasons.setdefault(reason, []).append(name)
     result = []
     for reason, names in reasons.items():
         numbers = [MEASURED.findall(problems[name]) for name in names]
         for numerals in zip(*numbers):
-            low, high = min(numerals, key=float), max(numerals, key=float)
-            number_range = low if low == high else f"{low} to {high}"
+            low = min(numerals, key=float)
+            high = max(numerals, key=float)
+            number_range = f"{low} to {high}"
+            if low == high:
+                number_range = low
             reason = reason.replace("#", number_range, 1)
-        images = "images are" if len(names) > 1 else "image is"
+        images = "image is"
+        if len(names) > 1:
+            images = "images are"
         result.append(f"{len(names)} {images} not usable ({reason}): {listing(names, 5)}")
     return result
 
 
-def _own_lens(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[Lens | None, bool]:
-    """Return the folder's lens and whether it was given by the user; None if the lens must be estimated from the
-    images.
+def _lens_of_folder(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[Lens | None, bool]:
+    """Return the lens of a folder's ``camera.yaml``, and whether there is this file.
+
+    Args:
+        path: the folder.
+        size: width and height of the images [px]; 0, 0: unknown.
+        options: options for reading.
+
+    Returns:
+        Lens and True; None and False without a file: then the lens has to be estimated from the images.
     """
     file = path / LENS
     if not file.is_file():
@@ -203,7 +242,8 @@ def _own_lens(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[
     lens = read_lens(file)
     if size[0] and lens.size != size:
         raise MeasurementError(
-            f"is for images of {lens.size[0]} x {lens.size[1]} pixels, the images here have {size[0]} x {size[1]}", file
+            f"is for images of {lens.size[0]} x {lens.size[1]} pixels, but the images here have {size[0]} x {size[1]}",
+            file,
         )
     return lens, True
 
@@ -229,11 +269,16 @@ def look(folder: Path, show: Callable[[str], None]) -> list[str]:
         names = joint_table(folder).texts("image")
     else:
         names = _images(folder)
-    detection = find_corners(folder, board, names, lambda done, total, name: show(f"{done} of {total}: {name}"))
+
+    def show_progress(done: int, total: int, name: str) -> None:
+        show(f"{done} of {total}: {name}")
+
+    detection = find_corners(folder, board, names, show_progress)
     return detection_summary(detection, board, names)
 
 
 def _images(folder: Path) -> list[str]:
+    """Return the names of a folder's images, sorted; raise UsageError if there are none."""
     from calib.data.images.images import SUFFIXES
 
     names = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
@@ -241,27 +286,39 @@ def _images(folder: Path) -> list[str]:
     return names
 
 
-def detection_summary(detection: Found, board: Board, names: Iterable[str]) -> list[str]:
+def detection_summary(detection: Detections, board: Board, names: Iterable[str]) -> list[str]:
     """Return sentences on detected corners: number of usable images, reasons for unusable ones, coverage of the image.
 
     Raises:
         MeasurementError: if no image is usable, with the reasons.
     """
-    usable = [image for image in detection.images.values() if not image.problem]
+    corner_counts = []
+    sigmas = []
+    edges = []
+    pixels = []
+    reasons = {}
+    for name, image in detection.images.items():
+        reasons[name] = image.problem
+        if image.problem:
+            continue
+        corner_counts.append(image.seen.sum())
+        sigmas.append(image.sigma[image.seen])
+        pixels.append(image.pixel[image.seen])
+        edges.append(image.edge)
     total = len(corners(board))
     count = len(list(names))
-    problems = problem_words({name: image.problem for name, image in detection.images.items()})
-    if not usable:
+    problems = problem_words(reasons)
+    if not edges:
         raise MeasurementError("; ".join([f"none of {count} images is usable ({board.words})", *problems]))
-    corner_counts = np.array([image.seen.sum() for image in usable])
-    sigma = float(np.nanmedian(np.concatenate([image.sigma[image.seen] for image in usable])))
-    edge = float(np.nanmedian([image.edge for image in usable]))
+    all_sigmas = np.concatenate(sigmas)
+    sigma = float(np.nanmedian(all_sigmas))
+    edge = float(np.nanmedian(edges))
     quality = f"each to about {sigma:.2f} px; edges {edge:.1f} px wide"
     lines = [
-        f"{len(usable)} of {count} images are usable ({board.words})",
-        f"{corner_counts.mean():.1f} of {total} corners per image, {quality}",
+        f"{len(edges)} of {count} images are usable ({board.words})",
+        f"{np.mean(corner_counts):.1f} of {total} corners per image, {quality}",
     ]
     if detection.size[0]:
-        pixels = np.concatenate([image.pixel[image.seen] for image in usable])
-        lines.append(coverage_words(pixels, detection.size))
+        all_pixels = np.concatenate(pixels)
+        lines.append(coverage_words(all_pixels, detection.size))
     return [*lines, *problems]

@@ -44,28 +44,33 @@ def decode(content: bytes) -> np.ndarray:
         ValueError: if the content is no image.
     """
     require(content, "the file is empty", ValueError)
-    if content.startswith(PNG) and b"IEND" not in content[-64:]:  # libpng would complain on its own
-        raise ValueError("no image format that is known, or cut short")
+    # libpng would write a complaint to the terminal
+    if content.startswith(PNG) and b"IEND" not in content[-64:]:
+        raise ValueError("the image format is unknown, or the file is incomplete")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+    stored = np.frombuffer(content, np.uint8)
     try:
         with quiet():
-            pixels = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+            pixels = cv2.imdecode(stored, flags)
     except cv2.error as error:
         raise ValueError(str(error)) from error
     if pixels is None:
-        raise ValueError("no image format that is known, or cut short")
+        raise ValueError("the image format is unknown, or the file is incomplete")
     return to_grey(pixels)
 
 
 def to_grey(image: np.ndarray) -> np.ndarray:
     """Return any image as 8-bit grey levels (height, width); more than 8 bits are scaled to the image's range."""
     if image.ndim == 3:
-        image = cv2.cvtColor(np.ascontiguousarray(image[:, :, :3]), cv2.COLOR_BGR2GRAY)
+        colours = np.ascontiguousarray(image[:, :, :3])
+        image = cv2.cvtColor(colours, cv2.COLOR_BGR2GRAY)
     if image.dtype == np.uint8:
         return image
     values = image.astype(np.float32)
     low, high = np.percentile(values[::7, ::7], [0.1, 99.9])
-    return np.clip((values - low) * (255.0 / max(float(high - low), 1e-9)), 0, 255).astype(np.uint8)
+    value_range = max(float(high - low), 1e-9)
+    scaled = (values - low) * (255.0 / value_range)
+    return np.clip(scaled, 0, 255).astype(np.uint8)
 
 
 def write_image(path: Path, image: np.ndarray) -> Path:

@@ -26,19 +26,22 @@ from calib.config_types import shown
 from calib.errors import CalibError, MeasurementError, refused_as, suggestion
 from calib.records import frozen
 
-# of a lens's values
+# Names of a lens's values, by model.
 NAMES = {
     "pinhole": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
-# number of values that a lens of a model may have
+# Numbers of values that a lens of a model may have.
 COUNTS = {"pinhole": (9, 12), "fisheye": (8,)}
-# of the inverse; Newton's, so that a handful does
+# Largest number of Newton steps from a pixel to its ray; few are needed.
 ITERATIONS = 20
+# Largest depth below which a point counts as behind the camera [m].
+MIN_DEPTH = 1e-6
+# Name of a lens's file in a folder of images.
 LENS = "camera.yaml"
-# distortion models of camera_info, and the models here
+# Distortion models of camera_info, and the models of this module.
 MODELS = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
-# number of coefficients that a distortion model may have, the usual one last; 4 for the others
+# Numbers of coefficients that a distortion model may have, the usual number last; other models have 4.
 COEFFICIENTS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,)}
 
 
@@ -61,7 +64,9 @@ class Lens:
         if self.model not in NAMES or len(values) not in COUNTS[self.model]:
             raise CalibError(f"no camera model '{self.model}' with {len(values)} values; known: pinhole, fisheye")
         if not np.isfinite(values).all() or min(values[:2]) <= 0.0:
-            raise CalibError(f"camera: focal lengths {values[0]:g}, {values[1]:g} px are impossible")
+            raise CalibError(
+                f"camera: focal lengths {values[0]:g}, {values[1]:g} px are impossible: they must be above 0"
+            )
         object.__setattr__(self, "values", values)
 
     @property
@@ -76,17 +81,18 @@ class Lens:
     def in_sight(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Return whether points (N, 3) [m] project into the image, at least `margin` [px] from its edge: (N,) bool.
 
-        A point beyond the angle at which the distortion polynomial ceases to increase is out of sight, wherever it
-        projects.
+        A point beyond the angle at which the distortion polynomial ceases to increase is never in sight, even if its
+        pixel lies in the image.
         """
-        ahead = points[:, 2] > 1e-6
+        ahead = points[:, 2] > MIN_DEPTH
         safe = np.where(ahead[:, None], points, [0.0, 0.0, 1.0])
         pixel = self.project(safe)
         largest = np.array(self.size) - 1 - margin
         in_image = np.all((pixel >= margin) & (pixel <= largest), axis=1)
-        # the ray of its pixel has to be its own
+        # The ray of the pixel must pass through the point.
         centre = self.values[2:4]
-        ray = rays(self, np.where(in_image[:, None], pixel, centre))
+        image_pixel = np.where(in_image[:, None], pixel, centre)
+        ray = rays(self, image_pixel)
         plane = safe[:, :2] / safe[:, 2:]
         error = np.abs(ray - plane).max(axis=1)
         size = np.abs(plane).max(axis=1)
@@ -99,36 +105,55 @@ class Lens:
     def project_with_slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return pixels (N, 2), ∂pixel/∂point (N, 2, 3) [px/m] and ∂pixel/∂values (N, 2, k) for points (N, 3) [m]."""
         depth = points[:, 2]
-        focal, centre = self.values[:2], self.values[2:4]
+        focal = self.values[:2]
+        centre = self.values[2:4]
         plane = points[:, :2] / depth[:, None]
         bent, across, by_value = BEND[self.model](plane, self.values[4:])
-        by_point = np.empty((len(points), 2, 3))
+        count = len(points)
+        by_depth = -np.einsum("nij,nj->ni", across, plane)
+        by_point = np.empty((count, 2, 3))
         by_point[:, :, :2] = across / depth[:, None, None]
-        by_point[:, :, 2] = -np.einsum("nij,nj->ni", across, plane) / depth[:, None]
-        by_lens = np.zeros((len(points), 2, len(self.values)))
+        by_point[:, :, 2] = by_depth / depth[:, None]
+        by_lens = np.zeros((count, 2, len(self.values)))
         by_lens[:, 0, 0] = bent[:, 0]
         by_lens[:, 1, 1] = bent[:, 1]
-        by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
+        by_lens[:, 0, 2] = 1.0
+        by_lens[:, 1, 3] = 1.0
         by_lens[:, :, 4:] = by_value * focal[:, None]
-        return bent * focal + centre, by_point * focal[:, None], by_lens
+        pixel = bent * focal + centre
+        return pixel, by_point * focal[:, None], by_lens
 
 
 def _brown_conrady(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return distorted coordinates (N, 2) and their Jacobians with respect to `plane` (N, 2, 2) and k (N, 2, K)."""
-    a, b = plane[:, 0], plane[:, 1]
+    """Return the coordinates distorted by a pinhole lens, and their Jacobians.
+
+    Args:
+        plane: (N, 2) coordinates a, b of the module's formulas.
+        k: (K,) distortion coefficients.
+
+    Returns:
+        Distorted coordinates x, y (N, 2), their Jacobians with respect to `plane` (N, 2, 2) and to k (N, 2, K).
+    """
+    a = plane[:, 0]
+    b = plane[:, 1]
     square = a * a + b * b
     k1, k2, p1, p2, k3 = k[:5]
-    k4, k5, k6 = k[5:] if len(k) > 5 else (0.0, 0.0, 0.0)
+    k4 = k5 = k6 = 0.0
+    if len(k) > 5:
+        k4, k5, k6 = k[5:]
     above = 1.0 + square * (k1 + square * (k2 + square * k3))
     below = 1.0 + square * (k4 + square * (k5 + square * k6))
     scale = above / below
     tangent_x = 2 * p1 * a * b + p2 * (square + 2 * a * a)
     tangent_y = p1 * (square + 2 * b * b) + 2 * p2 * a * b
-    bent = plane * scale[:, None] + np.stack([tangent_x, tangent_y], axis=1)
+    tangential = np.stack([tangent_x, tangent_y], axis=1)
+    bent = plane * scale[:, None] + tangential
 
     # derivative of the scale by the square of the radius
-    steep = (k1 + square * (2 * k2 + 3 * k3 * square)) / below
-    steep -= scale * (k4 + square * (2 * k5 + 3 * k6 * square)) / below
+    above_slope = k1 + square * (2 * k2 + 3 * k3 * square)
+    below_slope = k4 + square * (2 * k5 + 3 * k6 * square)
+    steep = above_slope / below
+    steep -= scale * below_slope / below
     across = np.empty((len(plane), 2, 2))
     across[:, 0, 0] = scale + 2 * a * a * steep + 2 * p1 * b + 6 * p2 * a
     across[:, 1, 1] = scale + 2 * b * b * steep + 6 * p1 * b + 2 * p2 * a
@@ -138,28 +163,37 @@ def _brown_conrady(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.nda
 
     by_value = np.empty((len(plane), 2, len(k)))
     for index, power in ((0, 1), (1, 2), (4, 3)):
-        by_value[:, :, index] = plane * (square**power / below)[:, None]
+        by_coefficient = square**power / below
+        by_value[:, :, index] = plane * by_coefficient[:, None]
     for index, power in zip(range(5, len(k)), (1, 2, 3)):
-        by_value[:, :, index] = plane * (-scale * square**power / below)[:, None]
-    by_value[:, :, 2] = np.stack([2 * a * b, square + 2 * b * b], axis=1)
-    by_value[:, :, 3] = np.stack([square + 2 * a * a, 2 * a * b], axis=1)
+        by_coefficient = -scale * square**power / below
+        by_value[:, :, index] = plane * by_coefficient[:, None]
+    by_value[:, 0, 2] = 2 * a * b
+    by_value[:, 1, 2] = square + 2 * b * b
+    by_value[:, 0, 3] = square + 2 * a * a
+    by_value[:, 1, 3] = 2 * a * b
     return bent, across, by_value
 
 
 def _fisheye(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return distorted coordinates and Jacobians of a fisheye lens, in the form of `_brown_conrady`."""
-    r = np.maximum(np.linalg.norm(plane, axis=1), 1e-12)
+    radius = np.linalg.norm(plane, axis=1)
+    r = np.maximum(radius, 1e-12)
     angle = np.arctan(r)
     powers = angle[:, None] ** np.array([2, 4, 6, 8])
     length = angle * (1.0 + powers @ k)
     scale = length / r
     bent = plane * scale[:, None]
     # derivative of the length by r
-    steep = (1.0 + (powers * np.array([3, 5, 7, 9])) @ k) / (1.0 + r * r)
+    power_slopes = powers * np.array([3, 5, 7, 9])
+    by_angle = 1.0 + power_slopes @ k
+    steep = by_angle / (1.0 + r * r)
     unit = plane / r[:, None]
-    along = (steep - scale)[:, None, None] * unit[:, :, None] * unit[:, None, :]
+    excess = (steep - scale)[:, None, None]
+    along = excess * unit[:, :, None] * unit[:, None, :]
     across = scale[:, None, None] * np.eye(2) + along
-    by_value = unit[:, :, None] * (angle[:, None] * powers)[:, None, :]
+    length_by_value = angle[:, None] * powers
+    by_value = unit[:, :, None] * length_by_value[:, None, :]
     return bent, across, by_value
 
 
@@ -172,18 +206,21 @@ def rays(lens: Lens, pixels: np.ndarray) -> np.ndarray:
     plane = distorted.copy()
     if lens.model == "fisheye":
         length = np.linalg.norm(distorted, axis=1)
-        start = np.tan(np.clip(length, 0.0, 1.5)) / np.maximum(length, 1e-12)
+        angle = np.clip(length, 0.0, 1.5)
+        start = np.tan(angle) / np.maximum(length, 1e-12)
         plane = distorted * start[:, None]
     for _ in range(ITERATIONS):
         bent, across, _ = BEND[lens.model](plane, lens.values[4:])
-        error_x, error_y = (bent - distorted).T
+        error = bent - distorted
+        error_x, error_y = error.T
         (xx, xy), (yx, yy) = np.moveaxis(across, 0, -1)
         determinant = xx * yy - xy * yx
         determinant = np.where(np.abs(determinant) < 1e-9, np.nan, determinant)
         step_x = yy * error_x - xy * error_y
         step_y = xx * error_y - yx * error_x
-        plane = plane - np.stack([step_x, step_y], axis=1) / determinant[:, None]
-        if np.nanmax(np.abs(bent - distorted), initial=0.0) < 1e-12:
+        step = np.stack([step_x, step_y], axis=1)
+        plane = plane - step / determinant[:, None]
+        if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
             break
     return plane
 
@@ -198,7 +235,8 @@ def read_lens(path: str | Path) -> Lens:
     from ruamel.yaml.error import YAMLError
 
     try:
-        table = YAML(typ="safe", pure=True).load(Path(path).read_text(encoding="utf-8"))
+        text = Path(path).read_text(encoding="utf-8")
+        table = YAML(typ="safe", pure=True).load(text)
     except (OSError, UnicodeDecodeError, YAMLError) as error:
         raise MeasurementError(f"cannot be read as YAML ({str(error).splitlines()[0]})", path) from error
     if not isinstance(table, dict):
@@ -218,14 +256,16 @@ def read_lens(path: str | Path) -> Lens:
         message = f"distortion_model {name} has {allowed[-1]} coefficients, found {len(coefficients)}"
         raise MeasurementError(message, path)
     if name == "plumb_bob":
-        coefficients = np.concatenate([coefficients, np.zeros(5 - len(coefficients))])
+        missing = np.zeros(5 - len(coefficients))
+        coefficients = np.concatenate([coefficients, missing])
     intrinsics = matrix[[0, 4, 2, 5]]
+    values = np.concatenate([intrinsics, coefficients])
     with refused_as(MeasurementError, CalibError, "{}", path):
-        return Lens(MODELS[name], np.concatenate([intrinsics, coefficients]), (width, height))
+        return Lens(MODELS[name], values, (width, height))
 
 
 def _entry(table: dict[str, object], keys: tuple[str, ...]) -> object:
-    """Return the value of the first of some keys that a table has; None if it has none of them."""
+    """Return the value of the first key that a table contains; None if it contains none of the keys."""
     for key in keys:
         if key in table:
             return table[key]
@@ -233,6 +273,7 @@ def _entry(table: dict[str, object], keys: tuple[str, ...]) -> object:
 
 
 def _pixel_count(table: dict[str, object], keys: tuple[str, ...], path: str | Path) -> int:
+    """Return the number of pixels that a table states under one of the keys; raise MeasurementError for others."""
     value = _entry(table, keys)
     if not isinstance(value, int) or not 0 < value < 100_000:
         raise MeasurementError(f"{keys[0]}: expected a number of pixels, found {shown(value)}", path)
@@ -240,6 +281,7 @@ def _pixel_count(table: dict[str, object], keys: tuple[str, ...], path: str | Pa
 
 
 def _numbers(table: dict[str, object], keys: tuple[str, ...], path: str | Path) -> np.ndarray:
+    """Return the numbers (N,) that a table states under one of the keys; raise MeasurementError for others."""
     value = _entry(table, keys)
     if isinstance(value, dict):
         value = value.get("data")
@@ -261,19 +303,23 @@ def write_lens(lens: Lens, path: str | Path, name: str = "camera") -> Path:
         model = "equidistant"
     elif len(lens.values) == 9:
         model = "plumb_bob"
+    camera = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    projection = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+    identity = np.eye(3).ravel().tolist()
     lines = [
         f"image_width: {lens.size[0]}",
         f"image_height: {lens.size[1]}",
         f"camera_name: {name}",
-        _matrix("camera_matrix", 3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
+        _matrix("camera_matrix", 3, 3, camera),
         f"distortion_model: {model}",
         _matrix("distortion_coefficients", 1, len(coefficients), coefficients),
-        _matrix("rectification_matrix", 3, 3, np.eye(3).ravel().tolist()),
-        _matrix("projection_matrix", 3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
+        _matrix("rectification_matrix", 3, 3, identity),
+        _matrix("projection_matrix", 3, 4, projection),
     ]
     return files.write(path, "\n".join(lines) + "\n")
 
 
 def _matrix(name: str, rows: int, columns: int, data: list[float]) -> str:
+    """Return a matrix as an entry of ``camera_info`` YAML; `data`: its values row by row."""
     numbers = ", ".join(repr(value) for value in data)
     return f"{name}:\n  rows: {rows}\n  cols: {columns}\n  data: [{numbers}]"

@@ -106,7 +106,8 @@ class Optics:
         """Return the optics with other parameter values; each focal length is limited to a change by half of its
         present value.
         """
-        lenses, start = [], 0
+        lenses = []
+        start = 0
         for lens in self.lenses:
             lens_values = np.array(values[start : start + len(lens.values)])
             lens_values[:2] = np.clip(lens_values[:2], 0.5 * lens.values[:2], 1.5 * lens.values[:2])
@@ -177,14 +178,17 @@ def read_optics(cameras: Sequence[Mapping[str, object]], boards: Sequence[Mappin
     Raises:
         ValueError, CalibError: for an invalid table.
     """
-    lenses = read_record(tuple[_Camera, ...], cameras)
-    shapes = read_record(tuple[_Board, ...], boards)
-    return Optics(
-        lenses=tuple(Lens(lens.model, np.array(lens.values), lens.size) for lens in lenses),
-        lens_names=tuple(lens.name for lens in lenses),
-        boards=tuple(BoardShape(*shape.values) for shape in shapes),
-        board_names=tuple(shape.name for shape in shapes),
-    )
+    lenses: list[Lens] = []
+    lens_names: list[str] = []
+    for camera in read_record(tuple[_Camera, ...], cameras):
+        lenses.append(Lens(camera.model, np.array(camera.values), camera.size))
+        lens_names.append(camera.name)
+    shapes: list[BoardShape] = []
+    board_names: list[str] = []
+    for board in read_record(tuple[_Board, ...], boards):
+        shapes.append(BoardShape(*board.values))
+        board_names.append(board.name)
+    return Optics(tuple(lenses), tuple(lens_names), tuple(shapes), tuple(board_names))
 
 
 @dataclass(frozen=True, eq=False)

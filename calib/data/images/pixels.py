@@ -68,25 +68,33 @@ class Pixels(PoseMeasurements):
 
     @property
     def camera(self) -> str:
-        """Name of the camera among an installation's lenses: that of the tool or station where it is mounted."""
-        return self.tool_names[0] if self.mounting == IN_HAND else self.station
+        """Name of the camera among an installation's lenses: that of the tool or station at which it is mounted."""
+        if self.mounting == IN_HAND:
+            return self.tool_names[0]
+        return self.station
 
     @property
     def carried(self) -> tuple[str, object]:
-        return ("camera", self.size) if self.mounting == IN_HAND else ("board", self.board)
+        if self.mounting == IN_HAND:
+            return "camera", self.size
+        return "board", self.board
 
     @property
     def target(self) -> str:
         """Name of the board among an installation's boards."""
-        return self.station if self.mounting == IN_HAND else self.tool_names[0]
+        if self.mounting == IN_HAND:
+            return self.station
+        return self.tool_names[0]
 
     def name(self, row: int) -> str:
-        """Return the image's name by its row number in the file."""
-        return self.names[row - 1] if 0 < row <= len(self.names) else f"image {row}"
+        """Return the name of an image by its row number in the file, counted from 1; ``image 3`` if it has no name."""
+        if 0 < row <= len(self.names):
+            return self.names[row - 1]
+        return f"image {row}"
 
 
 HEADER = ("image", "corner", "u [px]", "v [px]", "sigma [px]", "edge [px]", "problem")
-# sigma where a file states none [px]; our choice
+# Sigma assumed for corners of a file that states none [px] (our choice).
 USUAL = 0.1
 
 
@@ -113,14 +121,14 @@ class Detection:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """Detected corners by image name, and the images' width and height (0, 0 if unknown)."""
+class Detections:
+    """Detected corners by image name, and the images' width and height [px] (0, 0 if unknown)."""
 
     images: dict[str, Detection]
     size: tuple[int, int] = (0, 0)
 
 
-def write_corners(path: Path, detections: Found) -> Path:
+def write_corners(path: Path, detections: Detections) -> Path:
     """Write detections as ``corners.csv``."""
     rows: list[list[object]] = [["", "", *detections.size, None, None, "size of the images"]]
     for name, detection in detections.images.items():
@@ -132,7 +140,7 @@ def write_corners(path: Path, detections: Found) -> Path:
     return files.write_table(path, HEADER, rows)
 
 
-def read_corners(path: Path, board: Board) -> Found:
+def read_corners(path: Path, board: Board) -> Detections:
     """Return the detections of a ``corners.csv`` for a board.
 
     Raises:
@@ -149,12 +157,13 @@ def read_corners(path: Path, board: Board) -> Found:
         rows = list(csv.DictReader(file, restkey="further cells", restval=""))
     for number, row in enumerate(rows, 1):
         if "further cells" in row:
-            refuse_data(path, "has more cells than the header names columns", row=number)
+            refuse_data(path, "has more cells than the header has columns: check its commas", row=number)
         cells = {}
         for heading, cell in row.items():
             key = (heading or "").split("[")[0].strip()
             cells[key] = (cell or "").strip()
-        name, problem = cells.get("image", ""), cells.get("problem", "")
+        name = cells.get("image", "")
+        problem = cells.get("problem", "")
         with refused_as(
             MeasurementError, (KeyError, ValueError, OverflowError), "expected image, corner, u, v ({})", path, number
         ):
@@ -162,7 +171,8 @@ def read_corners(path: Path, board: Board) -> Found:
                 size = int(float(cells["u"])), int(float(cells["v"]))
                 continue
             if name not in images:
-                no_pixels, no_sigmas = np.full((count, 2), np.nan), np.full(count, np.nan)
+                no_pixels = np.full((count, 2), np.nan)
+                no_sigmas = np.full(count, np.nan)
                 edge = float(cells.get("edge") or "nan")
                 images[name] = Detection(no_pixels, no_sigmas, problem, edge)
             if problem or not cells.get("corner"):
@@ -170,7 +180,7 @@ def read_corners(path: Path, board: Board) -> Found:
             k = int(cells["corner"])
             corner_pixel = float(cells["u"]), float(cells["v"])
         if not 0 <= k < count:
-            refuse_data(path, f"corner {k}: the board ({board.words}) has {count}", "corner", number)
+            refuse_data(path, f"corner {k}: the board ({board.words}) has corners 0 to {count - 1}", "corner", number)
         images[name].pixel[k] = corner_pixel
         images[name].sigma[k] = float(cells.get("sigma") or USUAL)
-    return Found(images, size)
+    return Detections(images, size)

@@ -1,4 +1,4 @@
-"""Columns of a measurement file: the quantity in each column, recognised by the column's name and the options."""
+"""Columns of a measurement file: which quantity each column contains, by the column's name and the options."""
 
 import re
 from collections.abc import Sequence
@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.controllers.table import as_described
 from calib.data.csv_table import Table
+from calib.data.poses import IGNORED, MEASURED
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import KINDS
 from calib.data.schema import BOUNDS, Column
@@ -31,13 +32,19 @@ SIGMA_ROTATION = Column(
 )
 DISTANCE = Column(("distance",), "length", "distance", BOUNDS.max_length, "mm", positive="a distance must be above 0")
 SIGMA_DISTANCE = Column(("sigma_distance",), "length", "sigma", positive=SIGMA.positive)
-BASE = Column(("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw"))
 LATE = Column(("late_x", "late_y", "late_z"), "speed", "late")
 TIME = Column(("time",), "time", "time")
 LABELS = ("distance", "pair", "bar", "socket", "plane", "tool")
 UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation")
-_FAMILIES = (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION, SIGMA_DISTANCE, BASE, LATE)
-OURS = (*(name for column in _FAMILIES for name in column.names), *LABELS)
+BASE_TIME = "base_time"
+_OF_FRAME = (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION)
+_FAMILIES = (*_OF_FRAME, SIGMA_DISTANCE, LATE)
+OURS = (
+    *(name for column in _FAMILIES for name in column.names),
+    *(f"base_{name}" for column in _OF_FRAME for name in column.names),
+    BASE_TIME,
+    *LABELS,
+)
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
 _NUMBERED_JOINT = re.compile(r"q\d+")
@@ -45,12 +52,12 @@ _NUMBERED_JOINT = re.compile(r"q\d+")
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table of a file, and the options for reading it.
+    """A table and the options for reading it.
 
     Attributes:
         table: the table as read from the file.
-        options: names and units that the header does not state.
-        suffixes: allowed suffixes of the toolkit's names in a family of columns.
+        options: names and units that the header does not contain.
+        suffixes: suffixes that a family of columns (``x y z``) may have, such as ``_meas``.
     """
 
     table: Table
@@ -58,16 +65,26 @@ class Sheet:
     suffixes: tuple[str, ...] = SUFFIXES
 
     def fail(self, message: str, column: str | None = None) -> NoReturn:
-        """Raise MeasurementError about the file, or about one of its columns."""
+        """Raise MeasurementError about the file; with `column`, about that column.
+
+        Args:
+            message: text of the error; the file's name is prepended.
+            column: the file's name of the column; None: the whole file.
+        """
         self.table.fail(message, column)
 
     def find(self, name: str) -> str:
-        """Return the file's name of the toolkit's column `name`; "" if the file has no such column."""
+        """Return the file's column that contains the toolkit's column `name`; "" if the file has no such column."""
         heading = self.options.columns.get(name, name)
         return heading if heading in self.table else ""
 
     def unit(self, column: str, family: str) -> str:
-        """Return the unit of a column as stated in the header or the options; "" if neither states it."""
+        """Return the unit of a column from the header or the options; "" if neither contains one.
+
+        Args:
+            column: the file's name of the column.
+            family: family of columns under which the options may have the unit.
+        """
         return self.table.units[self.table.index(column)] or self._unit_of_options(column, family)
 
     def _unit_of_options(self, column: str, family: str) -> str:
@@ -79,8 +96,12 @@ class Sheet:
         return ""
 
     def numbers(self, names: Sequence[str], column: Column, gaps: bool = False) -> np.ndarray:
-        """Return columns (m, k) in SI, checked against the bounds of `column`; with `gaps`, an empty cell becomes NaN,
-        otherwise it is refused.
+        """Return columns (m, k) in SI, checked against the bounds of `column`.
+
+        Args:
+            names: the file's names of the columns.
+            column: dimension, unit and bounds of the columns.
+            gaps: whether an empty cell becomes NaN; otherwise it is refused.
         """
         values = []
         for name in names:
@@ -89,7 +110,11 @@ class Sheet:
         return column.check(np.stack(values, axis=1), self.table, names)
 
     def joints(self, joints: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-        """Return joint values (m, n) [rad or m] and the file's names of their columns."""
+        """Return joint values (m, n) [rad or m], and the file's names of the joint columns.
+
+        Args:
+            joints: names of the robot's n joints, in the robot's order.
+        """
         names = self.find_joints(joints)
         q = self.numbers(names, Column(tuple(joints), "joint", "joints"))
         if self.options.controller:
@@ -97,7 +122,11 @@ class Sheet:
         return q, names
 
     def check_names(self, joints: Sequence[str]) -> None:
-        """Refuse options that name a column unknown to both the toolkit and the file."""
+        """Raise MeasurementError if the options map a column name that the toolkit does not know.
+
+        Args:
+            joints: names of the robot's joints, which the options may map, too.
+        """
         names = (*OURS, *joints, *(f"q{i + 1}" for i in range(len(joints))))
         for name, heading in self.options.columns.items():
             if name not in names and not _TARGET.fullmatch(name):
@@ -109,14 +138,17 @@ class Sheet:
             self.table.index(name)
         for name, unit in self.options.units.items():
             if name not in (*names, *UNIT_GROUPS, *self.table.header) and not _TARGET.fullmatch(name):
-                message = f"the options state unit {unit} for '{name}', which is not a column"
+                message = f"the options state unit {unit} for '{name}', which is not a column: correct [units]"
                 self.fail(message + suggestion(name, (*names, *UNIT_GROUPS)), name)
 
     def find_joints(self, joints: Sequence[str]) -> tuple[str, ...]:
-        """Return the file's names of the joint columns in the robot's order.
+        """Return the file's names of the joint columns, in the robot's order.
 
         Accepted are the robot's joint names, ``q_<joint name>``, or ``q1`` to ``qn``; the first of these forms that
-        occurs is used.
+        occurs in the file is used.
+
+        Args:
+            joints: names of the robot's joints.
         """
         n, table, mapping = len(joints), self.table, self.options.columns
         numbered = tuple(f"q{i + 1}" for i in range(n))
@@ -140,7 +172,12 @@ class Sheet:
         self.fail(f"{message}. Map them in the options' [columns]")
 
     def _refuse_more_joints(self, columns: Sequence[str], n: int) -> None:
-        """Refuse a table that has more numbered joint columns than the robot has joints."""
+        """Raise MeasurementError for a table with more numbered joint columns than the robot has joints.
+
+        Args:
+            columns: the file's names of the joint columns that were found.
+            n: number of the robot's joints.
+        """
         if not all(_NUMBERED_JOINT.fullmatch(name) for name in columns):
             return
         for name in self.table.header:
@@ -148,13 +185,16 @@ class Sheet:
                 self.fail(f"the robot has only {n} joints: is this the right robot (chain)?", name)
 
     def family(self, names: Sequence[str], mark: str = "") -> tuple[str, ...]:
-        """Return the file's names of a family of columns (plain, or with a suffix); () if all are absent.
+        """Return the file's names of a family of columns, such as ``x y z``, all with one suffix; () if all are absent.
 
-        Where the options map only some columns of the family, the others are looked up under the plain or a suffixed
-        name.
+        If the options map only some columns of the family, the others are looked up by their plain or suffixed name.
+
+        Args:
+            names: the toolkit's names of the columns.
+            mark: number appended to the names, for one of several reflectors; "" for none.
 
         Raises:
-            MeasurementError: if a column of the family is missing, or the file has the family under several suffixes.
+            MeasurementError: some columns of the family are missing, or the file has the family with several suffixes.
         """
         marked = [name + mark for name in names]
         if any(name in self.options.columns for name in marked):
@@ -177,7 +217,15 @@ class Sheet:
         return ()
 
     def only_family(self, families: Sequence[tuple[str, ...]], names: Sequence[str]) -> tuple[str, ...]:
-        """Return the only family of columns found in the file, () if none was found; refuse two."""
+        """Return the only family of columns that was found in the file, () if none was.
+
+        Args:
+            families: the file's names of the columns of each family that was found.
+            names: the toolkit's names of a family's columns, for messages.
+
+        Raises:
+            MeasurementError: several families were found.
+        """
         if len(families) > 1:
             first, second = (", ".join(family) for family in families[:2])
             mapping = ", ".join(f'{name} = "{heading}"' for name, heading in zip(names, families[-1]))
@@ -186,14 +234,19 @@ class Sheet:
         return families[0] if families else ()
 
     def _mapped(self, name: str, together: Sequence[str]) -> str:
-        """Return the file's name of column `name` of the family `together`, of which the options map only a part."""
+        """Return the file's name of the column `name` in a family that the options map only in part.
+
+        Args:
+            name: the toolkit's name of the column.
+            together: the toolkit's names of all columns of the family.
+        """
         if name in self.options.columns:
             return self.options.columns[name]
         candidates = [name + suffix for suffix in self.suffixes if name + suffix in self.table]
         if len(candidates) == 1:
             return candidates[0]
         if candidates:
-            fault = " and ".join(candidates) + " could be it"
+            fault = " and ".join(candidates) + " could be meant"
         else:
             fault = f"missing{suggestion(name, self.table.header)}"
         self.fail(f"{fault}: {', '.join(together)} belong together; map this one in [columns], too", name)
@@ -201,20 +254,21 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Layout:
-    """Names of the file's columns that are read, by the quantity that they contain.
+    """The file's columns that are read, by the quantity that they contain.
 
     Attributes:
-        kind: one of `KINDS`.
+        kind: kind of measurement, one of `KINDS`.
         joints: n names, in the robot's order.
-        positions: x y z of each target (reflector); one triple, or several where the columns are numbered.
-        sigmas: the three sigmas of each target; () where not stated.
-        orientation: four names (quaternion), nine (matrix), three (angles, whose meaning the options state), or none.
-        sigma_rotation: three names or none.
-        distance: name of the distance column and, where present, of its sigma; () without a distance.
-        tool: name of the column of tool labels, or "".
-        group: the columns whose labels together name a row's group.
-        base: position and quaternion of a frame on the robot's base, seven names, or none.
-        late: the target's velocity and the time, four names, or none.
+        positions: names of x y z of each target (reflector); several triples if the columns are numbered.
+        sigmas: names of the three sigmas of each target; () without sigmas.
+        orientation: four names (quaternion), nine (matrix), three (angles as the options define), or none.
+        sigma_rotation: three names, or none.
+        distance: name of the distance column and, if present, of its sigma; () without a distance.
+        tool: name of the column with tool labels; "" without one.
+        group: names of the columns whose labels together identify a row's group.
+        base: three names for the position of a frame on the robot's base, then those of its orientation; or none.
+        base_sigma, base_sigma_rotation: three names each for the sigmas of the base frame, or none.
+        late: four names for the target's velocity and the time, or none.
         notes: remarks for the user on how the columns were chosen.
     """
 
@@ -228,6 +282,8 @@ class Layout:
     tool: str = ""
     group: tuple[str, ...] = ()
     base: tuple[str, ...] = ()
+    base_sigma: tuple[str, ...] = ()
+    base_sigma_rotation: tuple[str, ...] = ()
     late: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -235,15 +291,24 @@ class Layout:
     def used(self) -> frozenset[str]:
         """The file's names of all columns that are read."""
         families = (*self.positions, *self.sigmas, self.orientation, self.sigma_rotation, self.distance, self.group)
-        return frozenset().union(*families, self.joints, self.base, self.late, (self.tool,))
+        return frozenset().union(*families, self.joints, *self.of_base, self.late, (self.tool,))
+
+    @property
+    def of_base(self) -> tuple[tuple[str, ...], ...]:
+        """Names of the columns on the base frame, by family; empty tuples without a base frame."""
+        return self.base, self.base_sigma, self.base_sigma_rotation
 
 
 def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
-    """Return which columns of a table are read, for a robot with these joints.
+    """Return which columns of a table are read, for a robot with joints of the given names.
+
+    Args:
+        sheet: the table with its options.
+        joints: names of the robot's joints.
 
     Raises:
-        MeasurementError: if a column is missing or mapped to an unknown one, or if the header allows several kinds or
-            position triples and the options select none.
+        MeasurementError: a column is missing, or the options map it to one that the file does not have; the header
+            allows several kinds or position triples, and the options select none.
     """
     sheet.check_names(joints)
     layout = _layout(sheet, joints)
@@ -267,6 +332,7 @@ def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
 
 
 def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
+    _refuse_base_alone(sheet)
     columns = sheet.find_joints(joints)
     kind = _find_kind(sheet, columns)
     if kind in LABEL_OF:
@@ -275,18 +341,20 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     if not positions:
         sheet.table.index("x")
     tool = sheet.find("tool")
-    base = sheet.family(BASE.names)
     late = sheet.family(LATE.names)
     if late:
         late = (*late, *TIME.names)
-    layout = Layout(kind, columns, positions, sigmas, tool=tool, base=base, late=late, notes=notes)
+    layout = Layout(kind, columns, positions, sigmas, tool=tool, late=late, notes=notes)
+    layout = _with_base(sheet, layout)
     if kind == "position":
         return layout
     orientation = _find_orientation(sheet, columns)
     if not orientation:
         sheet.fail("kind 'pose' needs qx qy qz qw, r11 to r33, or rx ry rz; the header has none of them")
     if len(positions) > 1:
-        sheet.fail("kind 'pose' allows one target per row, but positions are numbered", positions[1][0])
+        sheet.fail(
+            "kind 'pose' allows one target per row, but positions are numbered: use kind 'position'", positions[1][0]
+        )
     if orientation[0] not in ("qx", "r11"):
         meaning = f" as {sheet.options.euler}" if len(orientation) == 3 else ""
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}{meaning}")
@@ -294,10 +362,73 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     return replace(layout, orientation=orientation, sigma_rotation=rotation, notes=notes)
 
 
-def _check_one_source(sheet: Sheet, position: Sequence[str], orientation: Sequence[str]) -> None:
-    """Refuse a plain position with a measured orientation, or the reverse: the plain columns may be commands.
+def _of_base(column: Column) -> list[str]:
+    return [f"base_{name}" for name in column.names]
 
-    Columns count as measured if their name says so, or if the options map them although the file has plain names, too.
+
+def _refuse_base_alone(sheet: Sheet) -> None:
+    """Raise MeasurementError for a file with base frames and without any target.
+
+    Args:
+        sheet: the table with its options.
+    """
+    base = _of_base(POSITION)
+    is_base = any(sheet.find(name) for name in base)
+    if not is_base or any(sheet.find(label) for label in LABEL_OF.values()):
+        return
+    if not _find_targets(sheet)[0]:
+        sheet.fail(
+            f"contains base frames ({', '.join(base)} …) and no target: a base frame is of use in the row of the "
+            "target that was measured with it; put both into the same rows, or join both by name or time (calib join)"
+        )
+
+
+def _with_base(sheet: Sheet, layout: Layout) -> Layout:
+    """Return a layout with the columns of the base frame, if the file has them and the options do not ignore them.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns that are read so far.
+
+    Raises:
+        MeasurementError: a base frame that is incomplete, or missing although the options require it.
+    """
+    if sheet.options.base_frame == IGNORED:
+        return layout
+    position = sheet.family(_of_base(POSITION))
+    orientation = sheet.family(_of_base(QUATERNION)) or sheet.family(_of_base(MATRIX))
+    if not orientation:
+        orientation = sheet.family(_of_base(TURNS))
+        if orientation and not sheet.options.euler:
+            sheet.fail("state in the options what these angles mean: euler = 'xyz fixed', 'vector' …", orientation[0])
+    if not position and not orientation:
+        if sheet.options.base_frame == MEASURED:
+            sheet.fail(
+                "has no base frame: columns base_x, base_y, base_z, base_qx, base_qy, base_qz, base_qw are needed in "
+                "the target's rows, not in a file apart; where it was not measured: reference = false in session.toml, "
+                "or base_frame = 'ignored' in the options"
+            )
+        return layout
+    if not position or not orientation:
+        needed = "base_x, base_y, base_z, and base_qx to base_qw, base_r11 to base_r33, or base_rx, base_ry, base_rz"
+        sheet.fail(f"the base frame is incomplete: it needs {needed}", (position or orientation)[0])
+    return replace(
+        layout,
+        base=(*position, *orientation),
+        base_sigma=sheet.family(_of_base(SIGMA)),
+        base_sigma_rotation=sheet.family(_of_base(SIGMA_ROTATION)),
+    )
+
+
+def _check_one_source(sheet: Sheet, position: Sequence[str], orientation: Sequence[str]) -> None:
+    """Raise MeasurementError if position and orientation have columns of different origin: one measured, one plain.
+
+    The plain columns may be commanded values. Columns count as measured if their name has such a suffix, or if the
+    options map them although the file has plain names too.
+
+    Args:
+        sheet: the table with its options.
+        position, orientation: the file's names of the position's and the orientation's columns.
     """
     rotation_names = {4: QUATERNION.names, 9: MATRIX.names}.get(len(orientation))
     if rotation_names is None:
@@ -336,8 +467,12 @@ def _grouped_layout(sheet: Sheet, kind: str, joints: tuple[str, ...]) -> Layout:
 def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the orientation's columns: four (quaternion), nine (matrix), three (angles), or ().
 
+    Args:
+        sheet: the table with its options.
+        joints: names of the joint columns, which are not angles of an orientation.
+
     Raises:
-        MeasurementError: for three angles whose meaning the options do not state.
+        MeasurementError: three angles whose convention the options do not define.
     """
     columns = sheet.family(QUATERNION.names) or sheet.family(MATRIX.names) or _angles(sheet, joints)
     if len(columns) == 3 and not sheet.options.euler:
@@ -351,9 +486,13 @@ def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
-    """Return the names of three angle columns (in any case) that are not joints; () if absent.
+    """Return the names of three angle columns, in upper or lower case, that are not joints; () without such columns.
 
-    Columns named by one small letter (a, b, c) count as angles only if the options state the meaning of the angles.
+    Names of one small letter (a, b, c) count as angles only if the options define the convention of the angles.
+
+    Args:
+        sheet: the table with its options.
+        joints: names of the joint columns, which are not angles of an orientation.
     """
     standard_names = ANGLES[0]
     if any(name in sheet.options.columns for name in standard_names):
@@ -391,7 +530,13 @@ def _find_kind(sheet: Sheet, joints: Sequence[str]) -> str:
 
 
 def _find_targets(sheet: Sheet) -> tuple[tuple, tuple, tuple[str, ...]]:
-    """Return positions, sigmas and notes: the unnumbered triple, else x1 y1 z1, x2 y2 z2, ..."""
+    """Return names of positions and sigmas of each target, and notes.
+
+    The targets are the one without a number (x y z) if there is one, otherwise x1 y1 z1, x2 y2 z2, ….
+
+    Args:
+        sheet: the table with its options.
+    """
     all_names = (*sheet.table.header, *sheet.options.columns)
     marks = sorted({int(name[1:]) for name in all_names if re.fullmatch(r"[xyz]\d+", name)})
     plain = sheet.family(POSITION.names)

@@ -55,14 +55,22 @@ _TURN = re.compile(r"[rq][xyzw]")
 
 
 class InstrumentExport(io.StringIO):
-    """A file as the toolkit's own table of text, with notes on how it was read."""
+    """An instrument's file, rewritten as the text of a CSV table, with notes on how it was read."""
 
     notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Location of the numbers in a text: separator, decimal mark, index and cells of the first line, rows above."""
+    """Position of the numbers in a text.
+
+    Attributes:
+        separator: separator of cells.
+        mark: decimal mark.
+        first: index of the first line of numbers.
+        cells: cells of this line.
+        above: cells of the lines above it.
+    """
 
     separator: str
     mark: str
@@ -72,18 +80,24 @@ class Grid:
 
     @property
     def numeric(self) -> list[bool]:
-        """Whether each cell of the first line of numbers is a number."""
+        """For each cell of the first line of numbers, whether it is a number."""
         return _numeric(self.cells, self.mark)
 
 
 @cache
 def presets() -> dict[str, dict[str, str]]:
-    """Return the known exports by name."""
+    """Return the known exports by name, as the tables of ``presets.toml``."""
     return tomllib.loads(Path(__file__).with_name("presets.toml").read_text(encoding="utf-8"))
 
 
 def translated(path: str | Path) -> InstrumentExport | None:
-    """Return the file at `path` as a table of the toolkit; None if it is one already, or has no positions."""
+    """Return an instrument's file as the text of a CSV table.
+
+    None if the file is a CSV table already, or has no positions.
+
+    Args:
+        path: the file.
+    """
     with open(path, "rb") as file:
         beginning = file.read(HEAD)
         is_utf16 = beginning[:2] in (b"\xff\xfe", b"\xfe\xff")
@@ -127,7 +141,7 @@ def translated(path: str | Path) -> InstrumentExport | None:
 
 
 def _preset(lines: Sequence[str]) -> dict[str, str]:
-    """Return the known export whose files begin with these lines; {} if there is none."""
+    """Return the preset of the known export whose files begin with these lines; {} for another file."""
     first_line = ""
     for line in lines:
         if line.strip():
@@ -140,7 +154,7 @@ def _preset(lines: Sequence[str]) -> dict[str, str]:
 
 
 def _first_content(lines: Sequence[str]) -> int:
-    """Return the index of the first line that is neither empty nor a comment of ours; 0 without any."""
+    """Return the index of the first line that is neither empty nor begins with ``#``; 0 if there is none."""
     for index, line in enumerate(lines):
         if line.strip() and not line.startswith("#"):
             return index
@@ -148,7 +162,13 @@ def _first_content(lines: Sequence[str]) -> int:
 
 
 def _length_unit(preset: dict[str, str], head: str, preamble: Sequence[str]) -> str:
-    """Return the unit of lengths that a file states before its numbers; "" if it states none."""
+    """Return the unit of lengths that a file states before its numbers; "" if there is none.
+
+    Args:
+        preset: preset of the file's format; {} for an unknown format.
+        head: first line of the file.
+        preamble: lines before the numbers.
+    """
     if "unit" in preset:
         match = re.search(preset["unit"], head)
         if match:
@@ -161,7 +181,10 @@ def _length_unit(preset: dict[str, str], head: str, preamble: Sequence[str]) -> 
 
 
 def _grid(lines: Sequence[str]) -> Grid | None:
-    """Return the location of a text's numbers, with the separator that makes most cells of a line numbers; or None."""
+    """Return the position of a text's numbers; None if the text has no numbers.
+
+    The separator is the one that makes most cells of a line numbers.
+    """
     content = [(i, line) for i, line in enumerate(lines) if _is_content(line)]
     best, best_count = None, MIN_NUMBERS - 1
     for separator in "\t;|, ":
@@ -182,7 +205,12 @@ def _grid(lines: Sequence[str]) -> Grid | None:
 
 
 def _first_of_numbers(rows: Sequence[Sequence[str]], counts: Sequence[int]) -> int | None:
-    """Return the index of the first of several rows of equal length with enough numbers; None if there is none."""
+    """Return the index of the first row that begins a series of rows of numbers; None if there is none.
+
+    Args:
+        rows: cells of each row; all rows of a series have equal length.
+        counts: number of numeric cells in each row.
+    """
     for k, row in enumerate(rows):
         if counts[k] < MIN_NUMBER_SHARE * len(row):
             continue
@@ -197,7 +225,7 @@ def _is_content(line: str) -> bool:
 
 
 def _numeric(cells: Sequence[str], mark: str) -> list[bool]:
-    """Return whether each cell is a number with this decimal mark."""
+    """Return for each cell whether it is a number with the decimal mark `mark`."""
     return [bool(_NUMBER[mark].fullmatch(cell)) for cell in cells]
 
 
@@ -208,7 +236,12 @@ def _split(line: str, separator: str) -> list[str]:
 
 
 def _rows(lines: Sequence[str], grid: Grid) -> Iterator[list[str]]:
-    """Yield the rows of numbers, with decimal points."""
+    """Yield the cells of the rows of numbers, with points as decimal marks.
+
+    Args:
+        lines: all lines of the text.
+        grid: position of the numbers in the text.
+    """
     for line in lines:
         if not _is_content(line):
             continue
@@ -221,7 +254,13 @@ def _rows(lines: Sequence[str], grid: Grid) -> Iterator[list[str]]:
 
 
 def _columns(grid: Grid) -> tuple[list[str], list[str], bool]:
-    """Return the toolkit's name ("": left out) and the unit of each column, and whether any differs from the file's."""
+    """Return the toolkit's name and the unit of each column, and whether any name or unit differs from the file's.
+
+    The name is "" for a column that is left out.
+
+    Args:
+        grid: position of the numbers in the text, with the cells above them.
+    """
     above, width = list(grid.above), len(grid.cells)
     units = [""] * width
     if above and any(above[-1]) and all(cell.lower() in UNITS for cell in above[-1] if cell):
@@ -245,13 +284,23 @@ def _columns(grid: Grid) -> tuple[list[str], list[str], bool]:
 
 
 def _is_ours(names: Sequence[str]) -> bool:
-    """Return whether positions already have names of the toolkit."""
+    """Return whether the position columns already have names that the toolkit reads.
+
+    Args:
+        names: the file's names of the columns.
+    """
     suffixes = (*SUFFIXES, "1")
     return any({f"x{suffix}", f"y{suffix}", f"z{suffix}"} <= set(names) for suffix in suffixes)
 
 
 def _unnamed(grid: Grid) -> tuple[list[str], list[str]]:
-    """Return names and units for columns without names: texts, then x, y, z; empty if the first cell is no text."""
+    """Return names and units for columns without names: up to three texts, then x, y, z.
+
+    Both lists are empty if the first cell is not a text.
+
+    Args:
+        grid: position of the numbers in the text.
+    """
     numeric = grid.numeric
     texts = numeric.index(True)
     if not 0 < texts <= 3 or not all(numeric[texts : texts + 3]):
@@ -262,7 +311,12 @@ def _unnamed(grid: Grid) -> tuple[list[str], list[str]]:
 
 
 def _ours(names: Sequence[str], above: Sequence[Sequence[str]]) -> list[str]:
-    """Return the toolkit's names of columns, from the row of names and the rows of quantities and objects above it."""
+    """Return the toolkit's names of columns.
+
+    Args:
+        names: the file's row of names.
+        above: rows above it, with quantities and objects (of motion capture).
+    """
     plain_names = [re.sub(r"[^a-z0-9]", "", name.lower()) for name in names]
     is_rotation = [any(row[k].lower() == "rotation" for row in above) for k in range(len(names))]
     axes = []

@@ -14,6 +14,8 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
     tool = "ball"                    # the tool's (reflector's) name
     check_limits = true              # refuse joint values outside the robot's limits
     planned = "poses.csv"            # of a file without joints: the poses driven, in this order or found by geometry
+    base_frame = "auto"              # a frame on the base in columns base_x …: used where it is there; "measured": it
+                                     # must be there; "ignored": the target is seen from the instrument
     socket_distance = 0.05           # between two sockets of the same fixture position
     socket_pairs = [["0", "1"]]      # which sockets that joins, where there are more than two
     model = "auto"                   # or the largest model of the ladder to fit; all names: below
@@ -54,7 +56,7 @@ from typing import Annotated
 
 from calib.config import inherited, own_table, parse, read_toml, strict
 from calib.config_types import Expect, Flag, Hidden, Label, Name, Names, OneOf, Positive, Real, Spread
-from calib.data.poses import IN_HAND, MIN_SIGMA, TO_HAND, Loss, Model
+from calib.data.poses import IGNORED, IN_HAND, MEASURED, MIN_SIGMA, TO_HAND, Loss, Model
 from calib.data.poses.measurements import KINDS
 from calib.errors import refuse_option, suggestion
 from calib.units import ANGLES, LENGTHS
@@ -116,6 +118,7 @@ class FileOptions:
         units: the toolkit's name of a column, or a family of columns → its unit.
         where: column → texts; only rows with one of these texts are used.
         planned: CSV of the poses that were to be measured, for a file without joints.
+        base_frame: whether the target is seen from the base frame that the file's columns ``base_`` contain.
     """
 
     kind: Annotated[str, OneOf(tuple(KINDS))] = ""
@@ -135,6 +138,7 @@ class FileOptions:
     socket_pairs: Annotated[tuple[tuple[Label, Label], ...], Expect('pairs of socket labels, [["0", "1"]]')] = ()
     check_limits: Flag = True
     planned: Name = ""
+    base_frame: Annotated[str, OneOf(("auto", MEASURED, IGNORED))] = "auto"
     camera: CameraOptions = field(default_factory=CameraOptions)
 
 
@@ -160,21 +164,21 @@ class FitOptions(FileOptions):
     source: Annotated[str, Hidden()] = ""
 
     def for_file(self, path: str | Path) -> FileOptions:
-        """Return the options for the file at `path`: its [files] table if present, else the common options."""
+        """Return the options for the file at `path`: its table under [files] if there is one, else the common ones."""
         return own_table(self.files, path) or self
 
 
 def read_options(path: str | Path | None = None) -> FitOptions:
-    """Return the options of the file at `path`; without a file the defaults.
+    """Return the options in the file at `path`; the defaults for None.
 
     Raises:
-        UsageError: for a file that is missing or no TOML, an unknown key, or a value that a key cannot have.
+        UsageError: a file that is missing or not TOML, an unknown key, or an invalid value.
     """
     return FitOptions() if path is None else parse_options(read_toml(path), str(path))
 
 
 def parse_options(table: Mapping[str, object], source: str = "options") -> FitOptions:
-    """Return the options in a parsed TOML table; `source` names the file in messages."""
+    """Return the options in a parsed TOML table; `source` is the file's name in messages."""
     options = parse(FitOptions, inherited(table, FileOptions), source)
     if "free" in table and not options.free:
         refuse_option(source, "free: the list is empty; remove the key to free all parameters")
@@ -185,7 +189,12 @@ def parse_options(table: Mapping[str, object], source: str = "options") -> FitOp
 
 
 def check_files(options: FitOptions, paths: Sequence[str | Path]) -> None:
-    """Refuse a [files] table for a file that is not among `paths`."""
+    """Raise UsageError for a [files] table of a file that is not among `paths`.
+
+    Args:
+        options: options of the fit, with a table [files].
+        paths: the measurement files of the fit.
+    """
     names = [Path(path).name for path in paths]
     for name in options.files:
         if not any(own_table({name: name}, path) for path in paths):

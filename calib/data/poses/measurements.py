@@ -1,7 +1,7 @@
-"""Measurements at poses: one frozen type per kind of measurement, independent of the robot.
+"""Measurements at poses: one frozen dataclass per kind of measurement, independent of the robot.
 
-Each kind is a measurement of the tool point p (and frame R) that the robot carries. Its residual function is registered
-for the type in `calib.geometry.residuals`.
+Each kind measures the tool point p (or also the tool frame R) that the robot moves. `calib.geometry.residuals` has one
+residual function for each kind.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from calib.records import frozen
 
 @dataclass(frozen=True, eq=False)
 class PoseMeasurements:
-    """Measurements of one kind from one file, m rows: the fields that all kinds share.
+    """Measurements of one kind from one file, m rows: the fields that all kinds have in common.
 
     Attributes:
         q: (m, n) joint values [rad or m], columns as in ``joint_names``.
-        joint_names: as in the file's header.
-        tool: (m,) index into ``tool_names``: which reflector or target of the tool was seen.
-        station: name of the instrument placement that these rows share (unused by kinds without an instrument).
+        joint_names: joint names as in the file's header.
+        tool: (m,) index into ``tool_names``: which reflector or target of the tool was measured.
+        station: name of the instrument placement, common to all rows (unused by kinds without an instrument).
         file, rows: path of the file, and number (m,) of each row in it, data rows counted from 1.
         torque: (m, n) gravity torques of the arm at these rows [N m], for compliance terms; None if not known.
         ignored: names of columns that were not read, for messages.
@@ -34,7 +34,7 @@ class PoseMeasurements:
     Class attributes of each kind:
         kind: name of the kind in files.
         has_instrument: whether rows are measured from a station whose placement has to be fitted.
-        placing: rank of the kind in how well it determines the placements of instrument and target, 0 being the best.
+        placing: rank of the kind by how well it determines the placements of instrument and target; 0 is the best.
     """
 
     q: np.ndarray
@@ -55,9 +55,10 @@ class PoseMeasurements:
 
     @property
     def measures_length(self) -> bool:
-        """Whether the rows contain measured lengths, which determine the scale of the arm.
+        """Whether the rows contain measured lengths, which determine the arm's scale.
 
-        False for sockets: known distances between them are short compared with the arm, and noise would bias its scale.
+        False for sockets: the known distances between them are short compared with the arm, and noise would bias its
+        scale.
         """
         return self.has_instrument
 
@@ -71,7 +72,12 @@ class PoseMeasurements:
             value = getattr(self, name)
             if value is None:
                 continue
-            require(len(value) == m, f"{name} has {len(value)} rows, q has {m}", MeasurementError, self.file)
+            require(
+                len(value) == m,
+                f"{name} has {len(value)} rows, but q has {m}: one row per pose is needed",
+                MeasurementError,
+                self.file,
+            )
             object.__setattr__(self, name, frozen(value, int if name in _COUNTS else float))
 
     @staticmethod
@@ -83,17 +89,17 @@ class PoseMeasurements:
         joint_names: Sequence[str] = (),
         **fields: Any,
     ) -> Positions:
-        """Return measurements from arrays: positions, or poses if `quaternion` is given.
+        """Return measurements from arrays: poses if `quaternion` is given, else positions.
 
         Args:
             q: (m, n) joint values [rad or m].
             position: (m, 3) positions of the target in the instrument's frame [m].
             quaternion: (m, 4) orientations x y z w, of unit norm; None for positions only.
             joint_names: n names; q1 to qn by default.
-            fields: other fields of `Positions` and `Poses`: ``sigma``, ``station``, ``tool_names`` ...
+            fields: other fields of `Positions` and `Poses`: ``sigma``, ``station``, ``tool_names``, ….
 
         Raises:
-            MeasurementError: for arrays whose length differs from that of q.
+            MeasurementError: an array has another number of rows than q.
         """
         values = np.atleast_2d(np.asarray(q, dtype=float))
         names = tuple(joint_names) or tuple(f"q{j + 1}" for j in range(values.shape[1]))
@@ -106,27 +112,30 @@ class PoseMeasurements:
 
     @property
     def per_row(self) -> list[str]:
-        """Names of the array fields with one entry per row; those in `_COUNTS` hold integers."""
+        """Names of the array fields with one entry per row; those in `_COUNTS` contain integers."""
         return [field.name for field in fields(self) if "ndarray" in str(field.type)]
 
     @property
     def together(self) -> np.ndarray:
-        """Number (m,) of the robot pose (or pair of poses) of each row; folds keep rows of equal number together."""
+        """Number (m,) of each row's robot pose (or pair of poses).
+
+        Cross-validation keeps rows with equal numbers in one fold.
+        """
         return self.rows
 
     @property
     def measured(self) -> np.ndarray:
-        """Measured numbers (m, k) of each row, by which repeated rows are recognised."""
+        """Measured numbers (m, k), by which rows that were recorded twice are recognised."""
         return np.zeros((len(self), 0))
 
     @property
     def carried(self) -> tuple[str, object]:
-        """Object on the flange, as a pair: ``tool``, the instrument or its target, and a key that distinguishes it."""
+        """What the flange carries (``tool``, the instrument or its target), with a key that distinguishes it."""
         return "tool", None
 
     @property
     def states_sigma(self) -> bool:
-        """Whether the file states sigmas."""
+        """Whether the measurements have sigmas."""
         return getattr(self, "sigma", None) is not None
 
 
@@ -138,16 +147,22 @@ class Positions(PoseMeasurements):
     """Positions of the tool point, measured in the station's frame.
 
     Attributes:
-        position: (m, 3) [m].
-        sigma: (m, 3) standard deviation of the position [m]; None where not stated.
-        late: (m, k, 3) derivatives of the positions by k unknown errors that all rows share, such as a clock's offset
-            [m/s] and drift [m]; None without such errors.
+        position: (m, 3) positions [m].
+        sigma: (m, 3) standard deviations of the position [m]; None if not known.
+        late: (m, k, 3) derivatives of the positions by k unknown errors common to all rows, such as offset [m/s] and
+            drift [m] of a clock; None without such errors.
+        base: (m, 7) position [m] and orientation x y z w of a frame on the robot's base, as the instrument measured it
+            with each row, to which the other fields are relative; None: they are in the instrument's frame.
+        base_sigma: (m, 6) standard deviations of its position [m] and of its orientation about the instrument's axes
+            [rad]; NaN where not known.
     """
 
     position: np.ndarray
     _: KW_ONLY
     sigma: np.ndarray | None = None
     late: np.ndarray | None = None
+    base: np.ndarray | None = None
+    base_sigma: np.ndarray | None = None
 
     kind: ClassVar[str] = "position"
     has_instrument: ClassVar[bool] = True
@@ -163,10 +178,11 @@ class Poses(Positions):
     """Poses of the tool frame, measured in the station's frame.
 
     Attributes:
-        quaternion: (m, 4) x y z w of unit norm.
-        sigma_rotation: (m, 3) standard deviation of the orientation, about the station's axes [rad]; None where not
-            stated.
-        euler: meaning of the three angles that `quaternion` was read from, as in the options; empty for other columns.
+        quaternion: (m, 4) orientations x y z w, of unit norm.
+        sigma_rotation: (m, 3) standard deviations of the orientation, about the station's axes [rad]; None if not
+            known.
+        euler: convention of the three angles from which `quaternion` was computed, as in the options; empty for other
+            columns.
     """
 
     quaternion: np.ndarray
@@ -184,12 +200,12 @@ class Poses(Positions):
 
 @dataclass(frozen=True, eq=False)
 class GroupedMeasurements(PoseMeasurements):
-    """Measurements within groups of rows, for which no instrument has to be placed.
+    """Measurements within groups of rows, which need no instrument placement.
 
     Attributes:
-        group: (m,) index of the socket, plane, pair or bar centre.
+        group: (m,) index of each row's socket, plane, pair or bar centre.
         group_names: names of the groups.
-        sigma: standard deviation [m], with the shape stated at each kind; None where not stated.
+        sigma: standard deviations [m], of a shape that each kind defines; None if not known.
     """
 
     _: KW_ONLY
@@ -207,7 +223,7 @@ class Distances(GroupedMeasurements):
     """Distances |p_a - p_b| between the tool points of the two rows of a group.
 
     Attributes:
-        distance: (m,) [m], the same in both rows of a pair; so is ``sigma`` (m,).
+        distance: (m,) distances [m], equal in both rows of a pair; so are the sigmas (m,).
     """
 
     distance: np.ndarray
@@ -229,10 +245,10 @@ class Distances(GroupedMeasurements):
 
 @dataclass(frozen=True, eq=False)
 class Bars(GroupedMeasurements):
-    """Distances |p - c| from the tool point to one unknown point per group (the other end of a ball bar).
+    """Distances |p - c| between the tool point and one unknown point c per group (the other end of a ball bar).
 
     Attributes:
-        distance: (m,) [m], with ``sigma`` (m,).
+        distance: (m,) distances [m]; the sigmas are (m,).
     """
 
     distance: np.ndarray
@@ -250,7 +266,7 @@ class Bars(GroupedMeasurements):
 
 @dataclass(frozen=True, eq=False)
 class Sockets(GroupedMeasurements):
-    """Rows of a group whose tool points coincide, in a socket of unknown position; ``sigma`` (m, 3).
+    """Rows whose tool points coincide within each group, in a socket of unknown position; the sigmas are (m, 3).
 
     Attributes:
         links: known distances between sockets, each (group, group, distance [m]).
@@ -265,7 +281,7 @@ class Sockets(GroupedMeasurements):
 
 @dataclass(frozen=True, eq=False)
 class Planes(GroupedMeasurements):
-    """Rows of a group whose tool points lie on one unknown plane; ``sigma`` (m,) is along its normal."""
+    """Rows whose tool points lie on one unknown plane per group; the sigmas (m,) are along the plane's normal."""
 
     kind: ClassVar[str] = "plane"
 
@@ -279,7 +295,12 @@ Block = TypeVar("Block", bound=PoseMeasurements)
 
 
 def take(block: Block, index: Sequence[int] | np.ndarray) -> Block:
-    """Return the rows at `index`; groups keep their numbers, so that links stay valid."""
+    """Return the rows at the indices `index`; groups keep their numbers, so that links stay valid.
+
+    Args:
+        block: measurements of one kind.
+        index: row indices, or a mask (m,).
+    """
     index = np.asarray(index)
     rows: dict[str, object] = {}
     for name in block.per_row:

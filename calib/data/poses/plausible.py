@@ -17,13 +17,16 @@ from calib.units import ANGLES, DEG
 
 
 def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joints) -> tuple[str, ...]:
-    """Check joint values (m, n) [rad or m] of a robot's joints, in the file's `columns`.
+    """Check joint values (m, n) [rad or m] for plausibility and return notes on unusual but possible values.
 
-    Returns:
-        Notes on unusual but possible values.
+    Args:
+        q: the joint values.
+        sheet: the file's table with its options.
+        columns: the file's names of the joint columns.
+        robot: types and limits of the joints.
 
     Raises:
-        MeasurementError: for degrees under a rad header, values outside the limits, a robot that never moved.
+        MeasurementError: degrees although the header says rad, values outside the limits, or a robot that never moved.
     """
     joints, kinds, lower, upper, table = robot.names, robot.kinds, robot.lower, robot.upper, sheet.table
     units = [sheet.unit(column, "joints") for column in columns]
@@ -60,7 +63,7 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
         row_of_worst = int(np.argmax(excess[:, j]))
         share = f"{int((excess[:, j] > 0.0).sum())} of {len(q)} rows"
         where = f"most in row {table.rows[row_of_worst]}, by {excess[row_of_worst, j]:.2g} {joint_unit(kinds[j])[0]}"
-        notes.append(f"{joints[j]} is outside its limits in {share}, {where}; kept")
+        notes.append(f"{joints[j]} is outside its limits in {share}, {where}; these rows are used")
     turning = [j for j in range(len(joints)) if not sliding[j]]
     in_degrees = turning and all(units[j] in ("deg", "°", "degrees") for j in turning)
     if in_degrees and np.abs(q[:, turning]).max() < BOUNDS.max_turn * DEG:
@@ -69,12 +72,24 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
 
 
 def outside(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return which joint values (m, n) exceed their limits (n,) by more than encoder errors."""
+    """Return which joint values (m, n) exceed their limits (n,) by more than an encoder's error, (m, n) bool.
+
+    Args:
+        q: (m, n) joint values [rad or m].
+        lower, upper: (n,) limits; infinite for no limit.
+    """
     return (q < lower - BOUNDS.limit_slack) | (q > upper + BOUNDS.limit_slack)
 
 
 def _check_joint_units(sheet: Sheet, columns: Sequence[str], kinds: Sequence[str], units: Sequence[str]) -> None:
-    """Refuse a stated unit that does not suit the joint: mm for a revolute one, deg for a prismatic one."""
+    """Raise MeasurementError for a unit of the wrong kind: mm for a revolute joint, deg for a prismatic one.
+
+    Args:
+        sheet: the file's table with its options.
+        columns: the file's names of the joint columns.
+        kinds: URDF type of each joint.
+        units: unit of each joint column; "" without one.
+    """
     for name, kind, unit in zip(columns, kinds, units):
         if unit and (unit.lower() in ANGLES) == (kind == "prismatic"):
             advice = "is it the right column?"
@@ -84,7 +99,13 @@ def _check_joint_units(sheet: Sheet, columns: Sequence[str], kinds: Sequence[str
 
 
 def check_block(block: PoseMeasurements, options: FileOptions, robot: Joints) -> PoseMeasurements:
-    """Return measurements given in memory, with notes, after the checks that a file undergoes."""
+    """Return measurements from memory with notes, after the checks that are also applied to files.
+
+    Args:
+        block: measurements made from arrays.
+        options: options for reading a file, with stated sigmas.
+        robot: types and limits of the joints.
+    """
     q, joints = np.asarray(block.q), tuple(block.joint_names)
     where = block.file or "measurements in memory"
     message = f"q has shape {q.shape}, expected (rows, joints) with {len(joints)} joints"
@@ -103,7 +124,13 @@ def check_block(block: PoseMeasurements, options: FileOptions, robot: Joints) ->
 
 
 def unit_quaternions(values: np.ndarray, source: Rows, columns: Sequence[str]) -> np.ndarray:
-    """Return normalised quaternions (m, 4); refuse norms that differ from 1 by more than rounding."""
+    """Return normalised quaternions (m, 4); refuse norms that differ from 1 by more than rounding.
+
+    Args:
+        values: (m, 4) quaternions.
+        source: file and row numbers, for messages.
+        columns: names of the columns.
+    """
     norm = np.linalg.norm(values, axis=1)
     advice = "not 1: were columns rounded or swapped, or are they not a quaternion?"
     refuse(
@@ -116,7 +143,12 @@ def unit_quaternions(values: np.ndarray, source: Rows, columns: Sequence[str]) -
 
 
 def orientation(sheet: Sheet, names: Sequence[str]) -> np.ndarray:
-    """Return unit quaternions (m, 4) x y z w from the columns of a quaternion, a matrix or three angles."""
+    """Return unit quaternions (m, 4) x y z w from the columns `names` of a quaternion, a matrix or three angles.
+
+    Args:
+        sheet: the file's table with its options, which define the convention of angles.
+        names: the file's names of four, nine or three columns.
+    """
     column = Column(tuple(names))
     # Angles are bounded below, unless they are a rotation vector.
     if len(names) == 3:
@@ -132,26 +164,46 @@ def orientation(sheet: Sheet, names: Sequence[str]) -> np.ndarray:
 
 
 def from_angles(values: np.ndarray, euler: str) -> Rotation:
-    """Return the rotations of three numbers each (m, 3) [rad], by what the options' ``euler`` says they mean."""
+    """Return the rotations for three numbers each (m, 3) [rad], in the convention that the option ``euler`` names.
+
+    Args:
+        values: the three numbers.
+        euler: convention, such as ``xyz fixed`` or ``zyx moving`` (``calib formats options``).
+    """
     if euler == "vector":
         return Rotation.from_rotvec(values)
     return Rotation.from_euler(_axes(euler), values)
 
 
 def to_angles(turns: Rotation, euler: str) -> np.ndarray:
-    """Return the three numbers (m, 3) [rad] of rotations, the inverse of `from_angles`."""
+    """Return three numbers (m, 3) [rad] for rotations, the inverse of `from_angles`.
+
+    Args:
+        turns: the m rotations.
+        euler: convention, as in `from_angles`.
+    """
     return turns.as_rotvec() if euler == "vector" else turns.as_euler(_axes(euler))
 
 
 def _axes(euler: str) -> str:
-    """Return SciPy's letters of a convention: small ones for turns about fixed axes."""
+    """Return a convention's axes in SciPy's notation: small letters for fixed axes, capital letters for moving axes.
+
+    Args:
+        euler: convention, such as ``xyz fixed`` or ``zyx moving``.
+    """
     convention = {"wpr": "xyz fixed", "xyz": "xyz moving"}.get(euler, euler)
     axes, _, frame = convention.partition(" ")
     return axes if frame == "fixed" else axes.upper()
 
 
 def _from_matrices(matrices: np.ndarray, source: Rows, columns: Sequence[str]) -> Rotation:
-    """Return the rotations of matrices (m, 3, 3); refuse a matrix that is not a rotation."""
+    """Return the rotations for matrices (m, 3, 3); refuse a matrix that is not a rotation.
+
+    Args:
+        matrices: (m, 3, 3) the numbers as read.
+        source: file and row numbers, for messages.
+        columns: the file's names of the nine columns.
+    """
     defect = np.abs(matrices @ np.swapaxes(matrices, 1, 2) - np.eye(3)).max(axis=(1, 2))
     skewed = defect > 2 * BOUNDS.max_norm_error
 

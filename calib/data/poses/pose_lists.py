@@ -68,10 +68,13 @@ REVERSED_COST = 1e-9
 
 
 def write_poses(path: str | Path, q: ArrayLike, joint_names: Sequence[str], kinds: Sequence[str] | None = None) -> Path:
-    """Write joint values (m, n) [rad or m] to a CSV file in deg or mm, under ``joint1 [deg]``.
+    """Write joint values to a CSV file in deg or mm, with headers such as ``joint1 [deg]``, and return its path.
 
     Args:
-        kinds: URDF's type of each joint; all revolute by default.
+        path: the file.
+        q: (m, n) joint values [rad or m].
+        joint_names: names of the joints.
+        kinds: URDF type of each joint; None: all revolute.
     """
     values = shaped(q, (None, len(joint_names)), "q")
     header, factors = joint_columns(joint_names, kinds or ["revolute"] * len(joint_names))
@@ -79,7 +82,12 @@ def write_poses(path: str | Path, q: ArrayLike, joint_names: Sequence[str], kind
 
 
 def joint_columns(names: Sequence[str], kinds: Sequence[str]) -> tuple[list[str], np.ndarray]:
-    """Return headers of joints' columns for people, ``joint1 [deg]`` or ``[mm]``, and the factors (n,) from SI."""
+    """Return the headers of joint columns, ``joint1 [deg]`` or ``[mm]``, and the factors (n,) from SI to the units.
+
+    Args:
+        names: names of the joints.
+        kinds: URDF type of each joint.
+    """
     headers = []
     factors = []
     for name, kind in zip(names, kinds):
@@ -90,7 +98,12 @@ def joint_columns(names: Sequence[str], kinds: Sequence[str]) -> tuple[list[str]
 
 
 def filled_in(path: Path, joints: int) -> bool:
-    """Return whether the user has entered measurements into a list of planned poses."""
+    """Return whether the user has entered measurements into a CSV list of planned poses with `joints` joint columns.
+
+    Args:
+        path: the CSV file.
+        joints: number of joint columns.
+    """
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     for line in lines[1:]:
         cells = re.split("[,;\t]", line)
@@ -106,7 +119,12 @@ def read_poses(
 ) -> np.ndarray:
     """Return joint values (m, n) [rad or m] in the order of `joints`, from a CSV file, measurements or an array.
 
-    Columns and checks of a file are those of measurements.
+    A file's columns and checks are those of a measurement file.
+
+    Args:
+        source: a CSV file, measurements, or joint values (m, n) [rad or m].
+        joints: the robot's n joints, or only their names (then taken as revolute without limits).
+        options: options for reading a file; None: the defaults.
     """
     robot = Joints.of(joints)
     if not isinstance(source, str | Path):
@@ -121,7 +139,14 @@ def read_poses(
 
 
 def check_planned(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joints) -> tuple[str, ...]:
-    """Check planned joint values and return the notes of `check_joints`; a plan may repeat one pose."""
+    """Check planned joint values and return the notes of `check_joints`; a plan may consist of one repeated pose.
+
+    Args:
+        q: (m, n) planned joint values [rad or m].
+        sheet: the file's table with its options.
+        columns: the file's names of the joint columns.
+        robot: types and limits of the joints.
+    """
     moves = np.ptp(q, axis=0).max() > BOUNDS.min_travel
     return plausible.check_joints(q if moves else q[:1], sheet, columns, robot)
 
@@ -129,15 +154,17 @@ def check_planned(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Jo
 def check_against(
     plan: ArrayLike, measured: PoseMeasurements, max_difference: float = MAX_JOINT_DIFFERENCE
 ) -> tuple[str, ...]:
-    """Return notes on differences between measured joint values and planned poses (m, n) [rad or m].
+    """Return notes on measured rows that were not planned.
 
-    A planned and a measured pose are the same if no joint differs by more than `max_difference`.
+    A planned and a measured pose count as equal if no joint differs by more than `max_difference`.
 
-    Returns:
-        Notes on measured rows that were not planned.
+    Args:
+        plan: (k, n) planned joint values [rad or m].
+        measured: the measurements.
+        max_difference: largest difference of a joint [rad or m].
 
     Raises:
-        MeasurementError: if most rows were not planned; the message names the cause if degrees, or swapped or reversed
+        MeasurementError: most rows were not planned; the message names the cause if degrees, or swapped or reversed
             joint columns, explain it.
     """
     plan = shaped(plan, (None, measured.q.shape[1]), "plan")
@@ -154,7 +181,13 @@ def check_against(
 def unmeasured(
     plan: ArrayLike, measured: Sequence[PoseMeasurements], max_difference: float = MAX_JOINT_DIFFERENCE
 ) -> tuple[str, ...]:
-    """Return a note on the planned poses (m, n) [rad or m] that are in none of the blocks; () if all were measured."""
+    """Return a note on the planned poses that are in none of the measured blocks; () if all were measured.
+
+    Args:
+        plan: (k, n) planned joint values [rad or m].
+        measured: blocks of measurements.
+        max_difference: largest difference of a joint between equal poses [rad or m].
+    """
     if not measured:
         return ()
     plan = np.asarray(plan)
@@ -167,13 +200,22 @@ def unmeasured(
 
 
 def _distinct(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
-    """Return joint values and row numbers, each row of the file once (several targets may share a row)."""
+    """Return joint values and row numbers of a block, with each row of the file once.
+
+    Several targets measured at one pose come from one row of the file.
+    """
     rows, first = np.unique(measured.rows if measured.rows is not None else [], return_index=True)
     return measured.q[first], rows
 
 
 def _has_match(candidates: np.ndarray, q: np.ndarray, max_difference: float) -> np.ndarray:
-    """Return the mask of rows of `q` with a row of `candidates` within `max_difference` (largest of the joints)."""
+    """Return for each row of `q` whether a row of `candidates` differs by at most `max_difference` in every joint.
+
+    Args:
+        candidates: (k, n) joint values to compare with [rad or m].
+        q: (m, n) joint values [rad or m].
+        max_difference: largest difference of a joint between equal poses [rad or m].
+    """
     distance, _ = KDTree(candidates).query(q, p=math.inf)
     return distance <= max_difference
 
@@ -205,16 +247,22 @@ def _explain(
     worst = int(np.argmax(distance))
     joint = int(np.argmax(np.abs(q[worst] - plan[index[worst]])))
     count = int((distance <= max_difference).sum())
-    message = f"only {count} of {len(q)} rows are planned poses; the nearest one differs by {distance[worst]:.3g}"
-    advice = "is it the right plan? If other poses were measured on purpose, set plan = false under [poses]"
+    message = (
+        f"only {count} of {len(q)} rows are planned poses; the one nearest to this row differs by {distance[worst]:.3g}"
+    )
+    advice = "is this the right plan? If other poses were measured on purpose, set plan = false under [poses]"
     return MeasurementError(f"{message}: {advice} in session.toml", measured.file, int(rows[worst]), names[joint])
 
 
 def _best_order(plan: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return which measured column fits each planned joint best (n,), and its sign (n,).
+    """Return which measured column fits each planned joint best (n,), and the sign of the match (n,).
 
-    Each pair of columns is compared as two sets of numbers (mean distance to the nearest one, at most 1), so that order
-    and completeness of the rows do not matter; the assignment minimises the sum.
+    Each pair of columns is compared as two sets of numbers (mean distance to the nearest number, at most 1), so that
+    order and completeness of the rows do not matter. The assignment of columns minimises the sum of these distances.
+
+    Args:
+        plan: (k, n) planned joint values [rad or m].
+        q: (m, n) measured joint values [rad or m].
     """
     n = plan.shape[1]
     cost = np.empty((2, n, n))
@@ -234,10 +282,10 @@ class Targets:
     """Targets of a compensation from one file, m rows.
 
     Attributes:
-        q: (m, n) nominal joint values [rad or m]; None where the file has none.
-        position: (m, 3) desired tool positions [m]; None where joint values define the targets.
-        rotation: (m, 3, 3) desired tool orientations; None without orientation.
-        columns: the file's names of the joint columns with their units in brackets; () without joints.
+        q: (m, n) nominal joint values [rad or m]; None if the file has none.
+        position: (m, 3) desired tool positions [m]; None if joint values define the targets.
+        rotation: (m, 3, 3) desired tool orientations; None without orientations.
+        columns: the file's headers of the joint columns, with units in brackets; () without joints.
         factors: (n,) SI value of one unit of each joint column.
         ignored: names of columns that were not read.
         notes: remarks on unusual values that were accepted.
@@ -261,7 +309,7 @@ class Targets:
 
     @staticmethod
     def of(targets: Targets | np.ndarray) -> Targets:
-        """Return targets in memory: poses (m, 4, 4) [m], or joint values (m, n) [rad or m]."""
+        """Return targets from memory: poses (m, 4, 4) [m], or joint values (m, n) [rad or m]."""
         if isinstance(targets, Targets):
             return targets
         if targets.ndim == 3:
@@ -273,14 +321,15 @@ class Targets:
 
 
 def read_targets(path: str | Path, joints: Joints | Sequence[str]) -> Targets:
-    """Return the targets in the file at `path` for a robot with these joints.
+    """Return the targets in the file at `path`.
 
     Args:
-        joints: the robot's n joints, or their names. Single rows may lie outside the limits; a file of which most rows
-            do holds something else.
+        path: the CSV file.
+        joints: the robot's n joints, or only their names. Some rows may be outside the joint limits; a file with most
+            rows outside is refused.
 
     Raises:
-        MeasurementError: for an invalid file or value, with row and column.
+        MeasurementError: an invalid file or value; the message contains row and column.
     """
     sheet = Sheet(read_table(path), suffixes=SUFFIXES)
     robot = Joints.of(joints)

@@ -45,7 +45,7 @@ Read = tuple[Table, FileOptions, tuple[str, ...]]
 def recognises(header: Sequence[str]) -> bool:
     """Return whether a header begins with RoboDK's J1 to J6 (or ``Joint 1`` to ``Joint 6``).
 
-    ``joint1`` in one word is a name that robots have: such a file is read by its names.
+    ``joint1`` in one word does not count, since robots have such joint names: these files are read by column names.
     """
     names = [name.split("(")[0].split("[")[0].strip().lower() for name in header[:6]]
     if names not in (JOINT_NUMBERS, JOINT_NAMES):
@@ -55,7 +55,13 @@ def recognises(header: Sequence[str]) -> bool:
 
 
 def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
-    """Return RoboDK's CSV as a table for the standard reader, with the options to read it and notes."""
+    """Return RoboDK's CSV as a table for the standard reader, the options for reading this table, and notes.
+
+    Args:
+        path: the file.
+        joints: the robot's number of joints.
+        options: options for reading the file.
+    """
     header = read_header(path)[0]
     if not recognises(header):
         refuse_data(path, f"is not a RoboDK file: its header begins with {', '.join(header[:7])}, not J1 to J6")
@@ -94,7 +100,13 @@ def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
 
 
 def read_three_smr(path: str | Path, joints: int, options: FileOptions) -> Read:
-    """Return the headerless CSV of three reflectors as a table, options and notes, as `read_robodk`."""
+    """Return the headerless CSV of three reflectors as a table, the options for reading it, and notes.
+
+    Args:
+        path: the file.
+        joints: the robot's number of joints.
+        options: options for reading the file.
+    """
     targets = ["x1", "y1", "z1", "x2", "y2", "z2", "x3", "y3", "z3"]
     width = row_width(path)
     padding = width - 9 - joints
@@ -116,7 +128,13 @@ def _plain(name: str) -> str:
 
 
 def _with_tools(table: Table, tcp: Sequence[str], options: FileOptions) -> tuple[Table, tuple[str, ...]]:
-    """Return the table, with a column ``tool`` and a note if its rows have different TCPs."""
+    """Return the table and notes; if rows have different TCPs, with a column ``tool`` that distinguishes these.
+
+    Args:
+        table: the table.
+        tcp: names of the columns with the TCP's position; empty if there are none.
+        options: options for reading the file.
+    """
     if not tcp:
         return table, ()
     tcp_values = np.stack([table.numbers(name) for name in tcp], axis=1)

@@ -45,13 +45,26 @@ CHUNK = 1 << 16
 
 
 def read_archive(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
-    """Return the recording in a NumPy archive (.npz) from ends[0] to ends[1] [s]; values are not checked."""
+    """Return the recording in a NumPy archive (.npz) from ends[0] to ends[1] [s]; values are not checked.
+
+    Args:
+        path: the archive.
+        joints: the robot's joints, in whose order columns are put; None: as in the file.
+        options: options for reading the file.
+        ends: begin and end of the part to read; None: no bound.
+    """
     with _opened(path) as archive:
         return _recording(archive, joints, options, ends)
 
 
 def read_archived_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stamps (N,) [s] and reference positions (N, n) of an archive: q_ref, or q without it."""
+    """Return the time stamps (N,) [s] and reference positions (N, n) in an archive: q_ref, or q without q_ref.
+
+    Args:
+        path: the archive.
+        joints: the robot's n joints, in whose order columns are put.
+        options: options for reading the file.
+    """
     with _opened(path) as archive:
         names = find_names(tuple(archive.members), options, path)
         series = "q_ref" if "q_ref" in names else "q"
@@ -80,22 +93,31 @@ def _opened(path: Path) -> Iterator["_Archive"]:
 
 @dataclass(frozen=True)
 class _Archive:
-    """An open NumPy archive and its path."""
+    """An open NumPy archive `file`, and its `path`."""
 
     file: zipfile.ZipFile
     path: Path
 
     @cached_property
     def members(self) -> dict[str, str]:
-        """Map from each member's name to its file name in the archive."""
+        """Name of each array in the archive to its file name there."""
         return {name.removesuffix(".npy"): name for name in self.file.namelist()}
 
     def fail(self, message: str, name: str | None = None) -> NoReturn:
-        """Raise MeasurementError about the archive, or about one of its members."""
+        """Raise MeasurementError about the archive; with `name`, about one of its arrays.
+
+        Args:
+            message: text of the error; the file's name is prepended.
+            name: name of the array; None: the whole archive.
+        """
         refuse_data(self.path, message, name)
 
     def header(self, name: str) -> tuple[IO[bytes], tuple[int, ...], bool, np.dtype]:
-        """Return a member's stream after its header, its shape, whether it is stored in Fortran order, and its type."""
+        """Return the stream of an array's data, the array's shape, whether it is in Fortran order, and its dtype.
+
+        Args:
+            name: name of the array.
+        """
         member = self.members[name]
         stream = self.file.open(member)
         # What numpy's reader of headers raises, and Python's parser in it.
@@ -114,10 +136,13 @@ class _Archive:
         return stream, shape, fortran, dtype
 
     def read(self, name: str, rows: np.ndarray | None = None, exact: bool = False, kinds: str = "fiub") -> np.ndarray:
-        """Return a member as floats (`exact`: in its stored type): all rows, or those numbered in `rows` (rising).
+        """Return an array of the archive as floats: all rows, or only some.
 
         Args:
-            kinds: accepted kinds of numpy types, as letters of ``dtype.kind``.
+            name: name of the array.
+            rows: increasing indices of the rows to return; None for all.
+            exact: return the array with its stored dtype.
+            kinds: accepted kinds of dtype, as letters of ``dtype.kind``.
         """
         stream, shape, fortran, dtype = self.header(name)
         with stream:
@@ -142,7 +167,7 @@ class _Archive:
         return result
 
     def few(self, name: str, count: int) -> np.ndarray | None:
-        """Return a member of `count` finite numbers; None if the archive has no such member."""
+        """Return an array of `count` finite numbers; None if the archive has no array of this name."""
         if name not in self.members:
             return None
         values = self.read(name, kinds="fiu").ravel()
@@ -204,7 +229,16 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
 
 
 def _variance(archive: _Archive, name: str, shape: tuple[int, ...], rows: np.ndarray) -> np.ndarray | None:
-    """Return the mean variance (n,) of the effort averaged over periods (variance of one sample / periods)."""
+    """Return each joint's mean variance (n,) of an effort that was averaged over periods; None if unknown.
+
+    It is the stored variance of a single sample divided by the number of periods.
+
+    Args:
+        archive: the archive.
+        name: name of the array with the variance of a single sample.
+        shape: expected shape of this array.
+        rows: indices of the rows in use.
+    """
     periods = archive.few("periods", 1)
     if name not in archive.members or periods is None:
         return None
@@ -219,7 +253,14 @@ def _variance(archive: _Archive, name: str, shape: tuple[int, ...], rows: np.nda
 
 
 def _stamps(archive: _Archive, names: Mapping[str, str], options: RecordingOptions, count: int) -> np.ndarray:
-    """Return the times (N,) [s] of all samples since the first sample, from stamps or a stated rate."""
+    """Return the times (N,) [s] of all samples since the first one, from time stamps or a sampling rate.
+
+    Args:
+        archive: the archive.
+        names: the toolkit's name of a series to the archive's.
+        options: options for reading the file, which may state a sampling rate.
+        count: number N of samples.
+    """
     if "t" not in names:
         rate = options.rate or _rate(archive)
         if not rate > 0:
@@ -235,7 +276,7 @@ def _stamps(archive: _Archive, names: Mapping[str, str], options: RecordingOptio
 
 
 def _rate(archive: _Archive) -> float:
-    """Return the sampling rate that the archive states [Hz]; 0 if it states none."""
+    """Return the sampling rate that is stored in the archive [Hz]; 0 if there is none."""
     for name in RATES:
         rate = archive.few(name, 1)
         if rate is not None:
@@ -244,7 +285,17 @@ def _rate(archive: _Archive) -> float:
 
 
 def _used(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: Ends) -> tuple[np.ndarray, list[str]]:
-    """Return the rows to read (those of the cut, else of the file's use_range, else all), and notes."""
+    """Return the indices of the rows to read, and notes.
+
+    These are the rows within `ends` if given, otherwise within the archive's ``use_range`` if it has one, otherwise
+    all. If there are more than `options.samples`, pieces spread over them are read.
+
+    Args:
+        archive: the archive.
+        t: (N,) times of all samples [s].
+        options: options for reading the file.
+        ends: begin and end of the part to read [s]; (None, None): no bounds.
+    """
     use_range = None
     if options.use_range and ends == (None, None):
         use_range = archive.few("use_range", 2)
@@ -260,7 +311,7 @@ def _used(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: End
 
 
 def _joint_names(archive: _Archive) -> list[str]:
-    """Return the joints' names; an empty list if the archive states none."""
+    """Return the joint names that are stored in the archive; an empty list if there are none."""
     if "joint_names" not in archive.members:
         return []
     names = []
@@ -272,7 +323,15 @@ def _joint_names(archive: _Archive) -> list[str]:
 
 
 def _arrange(values: np.ndarray, order: list[int], factor: float) -> np.ndarray:
-    """Return the columns in `order`, in SI; copied only if order or unit changes."""
+    """Return the columns of an array in the order of indices `order`, multiplied by `factor`.
+
+    The array is copied only if order or unit changes.
+
+    Args:
+        values: (N, n) array.
+        order: column indices of the robot's joints.
+        factor: factor to SI.
+    """
     if order != list(range(values.shape[1])):
         values = values[:, order]
     if factor != 1.0:

@@ -33,7 +33,13 @@ FRANKA_STATE = "franka_msgs/msg/FrankaRobotState"  # of franka_ros2: a joint sta
 
 
 def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Recording:
-    """Return the recording of a bag's joint states; values are not checked, only shapes."""
+    """Return the recording of the joint states in a ROS bag; shapes are checked, values are not.
+
+    Args:
+        path: the bag, a file or a folder.
+        joints: the robot's joints, in whose order columns are put; None: as in the first message.
+        options: options for reading the bag: topic, kind of the efforts.
+    """
     with opened(path) as reader:
         connections = connections_of(
             reader, (*JOINT_STATE, FRANKA_STATE), options.topic, path, "joint states", "topic = '...'", "/joint_states"
@@ -43,7 +49,7 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
         require(parts[series].size, f"its joint states have no {quantity}", MeasurementError, path)
     notes = []
     if skipped:
-        notes.append(f"{skipped} messages without one of the joints are not used")
+        notes.append(f"{skipped} messages that lack a joint are not used")
     if not parts["header"].any():
         notes.append("message headers have no stamps; the logging times are used, which jitter more")
     return Recording(
@@ -60,7 +66,11 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
 
 @contextmanager
 def opened(path: Path) -> Iterator[AnyReader]:
-    """Yield a reader of a bag; convert all errors of `rosbags` to `MeasurementError`."""
+    """Yield a reader of a ROS bag; errors of the package `rosbags` become MeasurementError.
+
+    Args:
+        path: the bag, a file or a folder.
+    """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
@@ -75,14 +85,18 @@ def opened(path: Path) -> Iterator[AnyReader]:
 def connections_of(
     reader: AnyReader, kinds: Sequence[str], topic: str, path: Path, what: str, option: str, usual: str = ""
 ) -> list[Connection]:
-    """Return a bag's connections of one topic with messages of the given types.
+    """Return a bag's connections for one topic with messages of the given types.
 
     Args:
+        reader: reader of the bag.
+        kinds: accepted message types.
         topic: the requested topic; if empty, the only topic found, or the `usual` one.
-        what, option: words for the topics' content and name of the option that selects a topic, for messages.
+        path: the bag, for messages.
+        what, option: description of the topics' content, and the option that selects a topic, for messages.
+        usual: topic that is preferred if there are several.
 
     Raises:
-        MeasurementError: if there is no such topic, or there are several and none is requested.
+        MeasurementError: there is no such topic, or there are several and none is requested.
     """
     connections = [connection for connection in reader.connections if connection.msgtype in kinds]
     topics = sorted({connection.topic for connection in connections})
@@ -103,7 +117,14 @@ def connections_of(
 def joint_states(
     reader: AnyReader, connections: list[Connection], joints: Joints | None, path: Path
 ) -> tuple[tuple[str, ...], dict[str, np.ndarray], int]:
-    """Return the joint names, arrays of stamps [ns], q, v and effort, and the number of unused messages."""
+    """Return the joint names, arrays of time stamps [ns], q, v and effort, and the number of unused messages.
+
+    Args:
+        reader: reader of the bag.
+        connections: connections of the topic.
+        joints: the robot's joints; messages without one of them are not used. None: as in the first message.
+        path: the bag, for messages.
+    """
     names = joints.names if joints else ()
     order: dict[tuple[str, ...], list[int] | None] = {}
     rows: dict[str, list[object]] = {"header": [], "logged": [], "q": [], "v": [], "effort": []}
@@ -132,24 +153,32 @@ def joint_states(
 
 
 def header_stamp(message: Any) -> int:
-    """Return the stamp in a message's header [ns]; 0 if not set."""
+    """Return the time stamp in a message's header [ns]; 0 if it is not set."""
     return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 
 
 def _stack(values: list[object], series: str, path: Path) -> np.ndarray:
-    """Return the rows as one array; an empty array if no message contains this quantity."""
+    """Return a quantity's rows as one array; an empty array if no message contains the quantity.
+
+    Args:
+        values: one row per message; None where the message does not contain the quantity.
+        series: name of the quantity, for messages.
+        path: the bag, for messages.
+    """
     missing = [k for k, value in enumerate(values) if value is None]
     if len(missing) == len(values):
         return np.empty((0, 0))
     if missing:
-        refuse_data(path, f"this message has no {series}, other messages have", series, missing[0] + 1)
+        refuse_data(
+            path, f"this message has no {series}, unlike other messages: cut this part out", series, missing[0] + 1
+        )
     return np.array(values)
 
 
 def _refuse_joints(names: Sequence[str], message_names: Sequence[tuple[str, ...]], path: Path) -> None:
     require(message_names, "its topic of joint states has no messages", MeasurementError, path)
     bag_names = sorted(set().union(*message_names))
-    fault = "no message with all joints at once"
+    fault = "no message with all joints of the robot at once"
     missing = [name for name in names if name not in bag_names]
     if missing:
         fault = f"no joint '{missing[0]}'{suggestion(missing[0], bag_names)}"

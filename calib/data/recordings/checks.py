@@ -17,22 +17,23 @@ from calib.units import DEG
 
 @dataclass(frozen=True)
 class RecordingBounds:
-    """Bounds on the values of a recording; all of them our choice.
+    """Bounds on the values of a recording; all of them are our choice.
 
     Attributes:
-        min_samples: of a recording, for filters to begin and to end; unknowns are counted later.
-        min_rate, max_rate: of sampling [Hz].
-        min_travel: smallest travel of a moving joint [rad or m], above encoder noise.
-        max_compared: rows searched for two nearly equal poses.
-        max_apart: largest difference of nearly equal poses, as a share of each joint's travel.
+        min_samples: smallest number of samples, for filters to start and to end.
+        min_rate, max_rate: smallest and largest sampling rate [Hz].
+        min_travel: smallest range of a moving joint [rad or m], above encoder noise.
+        max_compared: largest number of rows among which two nearly equal poses are sought.
+        max_apart: largest difference of nearly equal poses, as a share of each joint's range.
         max_effort: largest plausible torque, as a multiple of the joint's limit.
-        max_spike_share, max_spikes: largest share and number of rows with torque spikes (the larger counts).
-        max_unit_share: share of rows above which large torques mean another unit, not spikes.
-        min_spike_beyond, min_spike: times what the other rows stay below, of a spike beyond the joint's limit, or
-            within it.
-        max_number: of any quantity of a robot, whatever its unit.
-        max_jump: off the slope of the rows around it [rad]; real positions are by 7 mrad; in m a tenth.
-        max_degrees: of a joint, four turns: larger numbers are no degrees.
+        max_spike_share, max_spikes: largest share, and largest number, of rows with torque spikes (the larger counts).
+        max_unit_share: share of rows above which large torques indicate another unit rather than spikes.
+        min_spike_beyond, min_spike: size of a spike beyond the joint's limit, and of one within it, as a multiple of
+            the bound below which the other rows are.
+        max_number: largest plausible number of any quantity of a robot, in whatever unit.
+        max_jump: largest deviation of a position from the slope of the rows around it [rad]; in real logs 7 mrad occur.
+            For prismatic joints a tenth of it [m].
+        max_degrees: largest plausible joint angle in degrees, four turns; larger numbers are not degrees.
     """
 
     min_samples: int = 20
@@ -57,13 +58,17 @@ NEEDED = ("t", "q", "effort", "v", "tau_link", "tau_motor")
 
 
 def check_recording(recording: Recording, joints: Joints | None = None) -> Recording:
-    """Return the recording with notes on odd values; refuse impossible ones.
+    """Return the recording with notes on unusual values; refuse impossible values.
+
+    Args:
+        recording: the recording as read.
+        joints: types and limits of the joints; None: unknown.
 
     Raises:
-        MeasurementError: for too few samples, values that are not finite, stamps that do not increase, degrees in place
+        MeasurementError: too few samples, values that are not finite, time stamps that do not increase, degrees instead
             of radians, or a torque that is constant while its joint moves.
     """
-    few = f"{len(recording)} samples are too few for filters; at least {LIMITS.min_samples} are needed"
+    few = f"{len(recording)} samples are too few for filters; record {LIMITS.min_samples} or more"
     require(len(recording) >= LIMITS.min_samples, few, MeasurementError, recording.file)
     recording = _without_absent(recording)
     _check_finite(recording)
@@ -81,11 +86,12 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
 
 
 def _without_absent(recording: Recording) -> Recording:
-    """Return the recording without velocities that are NaN in every row: drivers write NaN for what they do not
-    provide.
+    """Return the recording without velocities that are NaN in every row.
+
+    Drivers write NaN for quantities that they do not provide.
 
     Raises:
-        MeasurementError: if positions or torques of a joint are NaN in every row.
+        MeasurementError: positions or torques of a joint are NaN in every row.
     """
     absent = {}
     for name in NEEDED[1:]:
@@ -104,14 +110,19 @@ def _without_absent(recording: Recording) -> Recording:
     for name, quantity in quantities:
         if absent[name]:
             joints = ", ".join(recording.joint_names[j] for j in absent[name])
-            notes.append(f"{quantity} of {joints} are NaN in every row: not provided, and not used for any joint")
+            notes.append(f"{quantity} of {joints} are NaN in every row, so they are not used for any joint")
     removed = dict.fromkeys(name for name, joints in absent.items() if joints)
     return _noted(replace(recording, **removed), *notes)
 
 
 def _check_finite(recording: Recording, limit: float = np.inf) -> None:
-    """Refuse NaN, infinities and values beyond `limit`; NaN is allowed in `q_link`, for joints without a second
-    encoder.
+    """Raise MeasurementError for NaN, infinities and values beyond `limit`.
+
+    NaN is allowed in `q_link`, for joints without a second encoder.
+
+    Args:
+        recording: the recording.
+        limit: largest absolute value of any number in the recording.
     """
     series = []
     columns: list[str] = []
@@ -128,10 +139,15 @@ def _check_finite(recording: Recording, limit: float = np.inf) -> None:
 
 
 def _sound_part(recording: Recording, bad: np.ndarray) -> str:
-    """Return words on the cut to the longest part of rising stamps without a row marked in `bad` (N,) or (N, k).
+    """Return advice, as text, to cut the recording to its longest part without faulty rows.
 
-    A cut refers to the latest stamp up to each row. "" where that part is too short, or where the file was read in
-    pieces, since the rows in between are unknown.
+    A part has increasing time stamps and no row that is marked in `bad`, (N,) or (N, k). A cut refers to the latest
+    time stamp up to each row. The text is empty if that part is too short, or if the file was read in pieces, since the
+    rows between the pieces are unknown.
+
+    Args:
+        recording: the recording.
+        bad: rows, or cells, with faulty values.
     """
     if np.ptp(recording.rows) + 1 > len(recording):
         return ""
@@ -147,11 +163,15 @@ def _sound_part(recording: Recording, bad: np.ndarray) -> str:
 def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
     """Return the recording without the few rows that have impossible torques (spikes of the log).
 
-    A spike exceeds `max_effort` times the joint's limit and `min_spike_beyond` times the bound below which all but
-    `max_spike_share` of the rows stay; or, whatever the limit, `min_spike` times that bound.
+    Let b be the bound that all but `max_spike_share` of the rows do not exceed. A spike exceeds both `max_effort` times
+    the joint's limit and `min_spike_beyond` times b; or, whatever the limit, `min_spike` times b.
+
+    Args:
+        recording: the recording.
+        joints: the robot's joints with their limits; None: unknown limits.
 
     Raises:
-        MeasurementError: if more rows, up to `max_unit_share`, exceed the limit by as much.
+        MeasurementError: more rows than the allowed share, but at most `max_unit_share`, have such torques.
     """
     count = len(recording)
     max_count = max(LIMITS.max_spikes, int(LIMITS.max_spike_share * count))
@@ -190,14 +210,19 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
 
 
 def _effort_limits(recording: Recording, joints: Joints | None) -> np.ndarray:
-    """Return the effort limits (n,) of the joints; infinite where unknown, and for currents."""
+    """Return the effort limits (n,) of the joints; infinite if unknown, and for currents.
+
+    Args:
+        recording: the recording, which has torques or currents.
+        joints: the robot's joints with their limits; None: unknown.
+    """
     if joints is None or recording.kind != "torque":
         return np.full(recording.n, np.inf)
     return np.where(np.isfinite(joints.effort) & (joints.effort > 0), joints.effort, np.inf)
 
 
 def _drop_repeats(recording: Recording) -> Recording:
-    """Return the recording without rows that a logger wrote twice: same stamp, same positions, same torques."""
+    """Return the recording without rows that a logger wrote twice: equal time stamp, positions and torques."""
     repeats = np.diff(recording.t) == 0
     for values in (recording.q, recording.effort):
         repeats &= (np.diff(values, axis=0) == 0).all(axis=1)
@@ -211,7 +236,11 @@ def _drop_repeats(recording: Recording) -> Recording:
 
 
 def _check_time(recording: Recording) -> None:
-    """Refuse stamps (N,) [s] that do not increase, or whose step looks like another unit."""
+    """Raise MeasurementError for time stamps that do not increase, or whose step suggests another unit than seconds.
+
+    Args:
+        recording: the recording.
+    """
     t = recording.t
     step = np.diff(t)
     goes_back, stands_still = np.append(False, step < 0), np.append(False, step == 0)
@@ -247,7 +276,14 @@ def _check_time(recording: Recording) -> None:
 
 
 def _check_size(recording: Recording, joints: Joints | None = None) -> None:
-    """Refuse positions beyond any joint's travel: degrees, millimetres, or columns of another robot."""
+    """Raise MeasurementError for positions that no joint can reach.
+
+    Likely causes are degrees, millimetres, or columns of another robot.
+
+    Args:
+        recording: the recording.
+        joints: types and limits of the joints; None: unknown.
+    """
     kinds = joints.kinds if joints else ("revolute",) * recording.n
     max_size = max_travel(kinds)
     if joints is not None:
@@ -265,7 +301,13 @@ def _check_size(recording: Recording, joints: Joints | None = None) -> None:
 
 
 def _likely_unit(recording: Recording, joint: int, unit: str) -> str:
-    """Return advice on positions of a joint [rad or m] beyond its travel, that may be in another unit."""
+    """Return advice on the positions of a joint that exceed its range and may be in another unit.
+
+    Args:
+        recording: the recording [rad or m].
+        joint: index of the joint.
+        unit: the unit in which the positions may be, deg or mm.
+    """
     if unit == "deg" and np.abs(recording.q[:, joint]).max() > LIMITS.max_degrees:
         return (
             "too large for deg, too: encoder counts? Convert them to rad or deg, zero and counts per turn allowed for"
@@ -274,7 +316,11 @@ def _likely_unit(recording: Recording, joint: int, unit: str) -> str:
 
 
 def _check_speed(recording: Recording) -> None:
-    """Refuse velocities that differ from the slope of the positions by the factor 180/π (degrees)."""
+    """Raise MeasurementError if velocities differ from the slope of the positions by the factor 180/π (degrees).
+
+    Args:
+        recording: the recording; without measured velocities nothing is checked.
+    """
     if recording.v is None:
         return
     slope = np.diff(recording.q, axis=0) / np.diff(recording.t)[:, None]
@@ -290,7 +336,14 @@ def _check_speed(recording: Recording) -> None:
 
 
 def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
-    """Return a description of positions that jump relative to the surrounding rows (encoder, clock, joined logs)."""
+    """Return descriptions of positions that jump relative to the rows around them; an empty list without jumps.
+
+    Causes are encoders, clocks, or joined logs.
+
+    Args:
+        recording: the recording.
+        joints: types of the joints; None: all revolute.
+    """
     if len(recording) < 5:
         return []
     step = np.diff(recording.t)
@@ -317,7 +370,12 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
 
 
 def _columns(recording: Recording, name: str) -> list[str]:
-    """Return the column labels of a series for messages: ``effort of elbow (joint 3)``."""
+    """Return the label of each joint's column of a series, for messages, such as ``effort of elbow (joint 3)``.
+
+    Args:
+        recording: the recording.
+        name: name of the series, such as ``q`` or ``effort``.
+    """
     label = recording.kind if name == "effort" else name
     return [f"{label} of {joint} (joint {j + 1})" for j, joint in enumerate(recording.joint_names)]
 
@@ -334,7 +392,7 @@ def _still(recording: Recording) -> list[str]:
     notes = []
     for j in np.flatnonzero(stands):
         fixed = np.ptp(recording.q[:, j]) < BOUNDS.min_travel
-        travel = "is one number" if fixed else f"moves less than {LIMITS.min_travel:g}"
+        travel = "is constant" if fixed else f"moves less than {LIMITS.min_travel:g}"
         effort = f", and so is its {recording.kind}" if dead[j] else ""
         notes.append(
             f"{recording.joint_names[j]} never moves (its position {travel}{effort}): parameters that only its "
@@ -344,10 +402,14 @@ def _still(recording: Recording) -> list[str]:
 
 
 def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
-    """Return notes on torques that do not suit the effort limits (currents, or torques before the gear).
+    """Return notes on torques that do not match the effort limits (currents, or torques before the gear).
+
+    Args:
+        recording: the recording.
+        joints: the robot's joints with their limits; None: unknown.
 
     Raises:
-        MeasurementError: if every joint is far beyond its limit, so that the torques are in another unit.
+        MeasurementError: every joint is far beyond its limit, so that the torques are in another unit.
     """
     peak, limit = np.abs(recording.effort).max(axis=0), _effort_limits(recording, joints)
     is_limited = np.isfinite(limit)
@@ -387,9 +449,12 @@ def _limit_notes(recording: Recording, joints: Joints | None) -> list[str]:
 
 
 def _work_notes(recording: Recording) -> list[str]:
-    """Return a note if torques take energy out of the robot: over a closed path friction requires ∫τᵀ dq > 0.
+    """Return a note if the torques extract energy from the robot: over a closed path, friction requires ∫τᵀ dq > 0.
 
-    No note where the motion does not return to a pose: between different poses gravity does work, too.
+    There is no note if the motion does not return to a pose, since gravity does work between different poses.
+
+    Args:
+        recording: the recording of joint positions q and torques τ.
     """
     rows = _round_trip(recording.q) if recording.kind == "torque" else None
     if rows is None:
@@ -403,8 +468,9 @@ def _work_notes(recording: Recording) -> list[str]:
 
 
 def _round_trip(q: np.ndarray) -> slice | None:
-    """Return the time steps between two rows, far apart in time, of nearly equal poses; None if the motion does not
-    return.
+    """Return the slice of time steps between two rows with nearly equal poses, far apart in time.
+
+    None if the motion does not return to a pose.
     """
     step = max(1, len(q) // LIMITS.max_compared)
     poses = q[::step] / np.maximum(np.ptp(q, axis=0), LIMITS.min_travel)

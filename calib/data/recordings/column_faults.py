@@ -1,7 +1,7 @@
-"""Columns of a recording that stand while what they measure moves: clipped torques and frozen encoders.
+"""Columns of a recording that are constant although the measured quantity changes: clipped torques, frozen encoders.
 
-Said only where columns contradict each other as recorded: a value that is exactly repeated is no measurement of
-something that changes. A joint that stands, and a torque whose largest values differ, are sound.
+A fault is reported only where columns contradict each other. A value that is repeated exactly is no measurement of a
+changing quantity. A joint at rest is no fault, and neither is a torque whose largest values differ.
 """
 
 from collections.abc import Iterator
@@ -27,13 +27,13 @@ ABOUT = 3.0  # factor between that step and the motion expected meanwhile
 
 @dataclass(frozen=True)
 class ColumnFault:
-    """A column of one joint that is constant while what it measures changes.
+    """A column of one joint that is constant although the measured quantity changes.
 
     Attributes:
         kind: ``clipped`` (torque), or ``position`` or ``velocity`` (constant column).
         joint: index of the joint.
         share: share of the moving rows in which a torque is clipped, or of all rows in which a column is constant.
-        values: the extremes at which a torque is clipped [N m or N; A].
+        values: the extreme values at which a torque is clipped [N m or N; A].
         start, stop: times at which the longest constant part begins and ends [s].
         missed: motion that the column does not show [rad or m].
     """
@@ -50,13 +50,13 @@ class ColumnFault:
 def column_faults(
     t: np.ndarray, q: np.ndarray, effort: np.ndarray, v: np.ndarray | None = None
 ) -> tuple[ColumnFault, ...]:
-    """Return the columns of a recording that are constant while what they measure changes; () if there are none.
+    """Return the columns of a recording that are constant although the measured quantity changes; () without any.
 
     Args:
-        t: (N,) stamps as logged [s].
+        t: (N,) time stamps as logged [s].
         q: (N, n) positions [rad or m].
-        effort: (N, n) torques or currents.
-        v: (N, n) measured velocities; None where not recorded.
+        effort: (N, n) torques [N m or N] or currents [A].
+        v: (N, n) measured velocities [rad/s or m/s]; None if not recorded.
     """
     faults = []
     for joint, position in enumerate(q.T):
@@ -71,8 +71,15 @@ def column_faults(
 
 
 def _clipped(joint: int, t: np.ndarray, q: np.ndarray, torque: np.ndarray) -> ColumnFault | None:
-    """Return the fault of a torque that repeats its extreme value exactly while its joint moves at various speeds; or
-    None.
+    """Return the fault of a torque that repeats its extreme value exactly while its joint moves; None without it.
+
+    The joint has to move at various speeds, at which friction would change the torque.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        q: (N, n) positions [rad or m].
+        torque: (N,) torque or current of the joint.
     """
     speed = np.abs(_speed(t, q))
     peak = float(speed.max())
@@ -98,7 +105,14 @@ def _clipped(joint: int, t: np.ndarray, q: np.ndarray, torque: np.ndarray) -> Co
 
 
 def _standing_position(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> ColumnFault | None:
-    """Return the fault of a position that is constant while the measured velocity integrates to a motion; or None."""
+    """Return the fault of a position that is constant while the measured velocity integrates to a motion; or None.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        q: (N,) positions of the joint [rad or m].
+        v: (N,) measured velocities of the joint [rad/s or m/s].
+    """
     min_travel = max(MIN_TRAVEL, MIN_STEPS * _resolution(q))
     parts = []
     for first, last in _constant(q):
@@ -111,7 +125,14 @@ def _standing_position(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) 
 
 
 def _standing_velocity(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> ColumnFault | None:
-    """Return the fault of a velocity that is constant while the position moves at another speed; or None."""
+    """Return the fault of a velocity that is constant while the position moves at another speed; or None.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        q: (N,) positions of the joint [rad or m].
+        v: (N,) measured velocities of the joint [rad/s or m/s].
+    """
     parts = []
     for first, last in _constant(v):
         time = t[first:last] - t[first]
@@ -123,7 +144,13 @@ def _standing_velocity(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) 
 
 
 def _jumping(joint: int, t: np.ndarray, q: np.ndarray) -> ColumnFault | None:
-    """Return the fault of a position that freezes during motion, then jumps by about the motion missed; or None."""
+    """Return the fault of a position that is constant during motion, then jumps by about the missed motion; or None.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        q: (N,) positions of the joint [rad or m].
+    """
     parts = []
     for first, last in _constant(q):
         if first < REACH or last + REACH >= len(q):
@@ -141,7 +168,13 @@ def _jumping(joint: int, t: np.ndarray, q: np.ndarray) -> ColumnFault | None:
 
 
 def _of_parts(kind: str, joint: int, t: np.ndarray, parts: list[tuple[int, int, float]]) -> ColumnFault | None:
-    """Return the fault with these constant parts (first row, row behind the last, motion missed); None for no parts."""
+    """Return the fault of a column from its constant parts; None without parts.
+
+    Args:
+        kind, joint: kind of the fault and index of the joint.
+        t: (N,) time stamps [s].
+        parts: for each part the first row, the row after the last one, and the missed motion [rad or m].
+    """
     if not parts:
         return None
     rows = sum(last - first for first, last, _ in parts)
@@ -150,7 +183,7 @@ def _of_parts(kind: str, joint: int, t: np.ndarray, parts: list[tuple[int, int, 
 
 
 def _constant(values: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Yield the first row and the row behind the last of parts of `MIN_ROWS` or more exactly equal values (N,)."""
+    """Yield the parts of `MIN_ROWS` or more exactly equal values (N,): first row, and the row after the last one."""
     edges = np.flatnonzero(np.concatenate([[True], np.diff(values) != 0.0, [True]]))
     for first, last in zip(edges[:-1].tolist(), edges[1:].tolist()):
         if last - first >= MIN_ROWS:
@@ -158,14 +191,21 @@ def _constant(values: np.ndarray) -> Iterator[tuple[int, int]]:
 
 
 def _resolution(values: np.ndarray) -> float:
-    """Return the smallest step between values (N,), steps by rounding alone ignored; 0 if all values are equal."""
+    """Return the smallest difference between values (N,), rounding errors ignored; 0 if all values are equal."""
     steps = np.diff(np.unique(values))
     steps = steps[steps > 1e-9 * np.abs(values).max(initial=0.0)]
     return float(steps.min(initial=np.inf)) if len(steps) else 0.0
 
 
 def _moved(t: np.ndarray, v: np.ndarray) -> float:
-    """Return the range of the integral of velocities (N,), without gaps in the log [rad or m]."""
+    """Return the range of the integral of velocities v (N,) [rad or m].
+
+    Gaps in the time stamps count as short steps.
+
+    Args:
+        t: (N,) time stamps [s].
+        v: (N,) velocities of one joint [rad/s or m/s].
+    """
     step = np.diff(t)
     step = np.minimum(step, 3.0 * np.median(step))
     mean_velocity = 0.5 * (v[1:] + v[:-1])
@@ -174,13 +214,23 @@ def _moved(t: np.ndarray, v: np.ndarray) -> float:
 
 
 def _wander(t: np.ndarray, v: np.ndarray) -> float:
-    """Return the largest plausible drift [rad or m] of the integral of the white noise in velocities (N,)."""
+    """Return the largest plausible drift [rad or m] that white noise causes in the integral of velocities v (N,).
+
+    Args:
+        t: (N,) time stamps [s].
+        v: (N,) velocities of one joint [rad/s or m/s].
+    """
     noise = float(np.std(np.diff(v))) / np.sqrt(2.0)
     return MAX_WANDER * noise * float(np.median(np.diff(t))) * float(np.sqrt(len(t)))
 
 
 def _speed(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the slope (N,) of positions (N,) between the rows `REACH` before and behind."""
+    """Return the slope (N,) of positions q (N,), from the row `REACH` rows before to the row `REACH` rows after.
+
+    Args:
+        t: (N,) time stamps [s].
+        q: (N,) positions of one joint [rad or m].
+    """
     rows = np.arange(len(t))
     behind = np.minimum(rows + REACH, len(t) - 1)
     before = np.maximum(rows - REACH, 0)

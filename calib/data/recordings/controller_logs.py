@@ -31,19 +31,19 @@ TIME_ROWS = 50
 
 
 class Log(io.StringIO):
-    """A log as the toolkit's own table of text, with notes on how it was read."""
+    """A controller's log, rewritten as the text of a CSV table, with notes on how it was read."""
 
     notes: tuple[str, ...] = ()
 
 
 @cache
 def logs() -> dict[str, ParsedTable]:
-    """Return the known logs by name."""
+    """Return the known logs by name, as the tables of ``logs.toml``."""
     return tomllib.loads(shipped_text("calib.data.recordings", "logs.toml"))
 
 
 def translated(path: str | Path) -> Log | None:
-    """Return the log at `path` as a table of the toolkit; None where it is no known log."""
+    """Return the log at `path` as the text of a CSV table; None if it is not a known log."""
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         head = file.readline(LONGEST)
         form = _form(head)
@@ -71,7 +71,7 @@ def translated(path: str | Path) -> Log | None:
 
 
 def _form(head: str) -> ParsedTable | None:
-    """Return the known log whose files have this first line; None if there is none."""
+    """Return the table in ``logs.toml`` of the known log whose files have the first line `head`; or None."""
     for form in logs().values():
         if re.search(form["header"], head):
             return form
@@ -87,7 +87,13 @@ def _toolkit_name(name: str, columns: Sequence[Sequence[str]]) -> str:
 
 
 def _is_whole(body: str, separator: str | None, column: int) -> bool:
-    """Return whether a column has whole numbers in the first rows."""
+    """Return whether a column contains only whole numbers in the first rows.
+
+    Args:
+        body: rows of the log.
+        separator: separator of the cells; None: blanks.
+        column: index of the column.
+    """
     for line in body.split("\n", TIME_ROWS)[:TIME_ROWS]:
         row = line.split(separator) if line.strip() else []
         if len(row) > column and not re.fullmatch(r"\s*\d+(\.0*)?\s*", row[column]):
@@ -96,7 +102,12 @@ def _is_whole(body: str, separator: str | None, column: int) -> bool:
 
 
 def _with_time(body: str, columns: Sequence[int]) -> str:
-    """Return blank-separated rows with their time since the first row [s] prepended, from seconds and nanoseconds."""
+    """Return blank-separated rows with the time since the first row [s] prepended.
+
+    Args:
+        body: rows of the log.
+        columns: indices of the columns with the time stamps' seconds and nanoseconds.
+    """
     result: list[str] = []
     first_second = 0.0
     for line in body.splitlines():

@@ -1,4 +1,4 @@
-"""Recording logged by a controller during motion: one frozen block per file, independent of the robot."""
+"""Recording of a motion by a controller: one frozen dataclass per file, independent of the robot."""
 
 from __future__ import annotations
 
@@ -34,24 +34,27 @@ class Recording:
     """Logged samples from one file: N samples of n joints.
 
     Attributes:
-        t: (N,) time since the file's first sample [s], strictly rising, not necessarily uniform; a part that was cut
-            out keeps the time of the whole file.
-        q: (N, n) joint positions on the motor side of any elasticity [rad or m].
+        t: (N,) time since the file's first sample [s], strictly increasing, not necessarily uniform. In a part that was
+            cut out, times still count from the file's first sample.
+        q: (N, n) joint positions on the motor side of an elastic joint [rad or m].
         effort: (N, n) torques on the joint side [N·m or N], or motor currents [A].
         kind: kind of `effort`, ``torque`` or ``current``.
         joint_names: n names.
-        v: (N, n) measured velocities [rad/s or m/s]; None where not recorded.
-        tau_link: (N, n) a second torque, of sensors behind the gear [N·m or N]; None where not recorded.
-        tau_motor: (N, n) torque on the motor's side of the gear, as recorded [N·m]; None where not recorded.
-        q_link: (N, n) second encoders, behind the gear [rad or m]; NaN in the columns of joints that have none.
-        q_ref: (N, n) reference positions [rad or m]; tau_ff: (N, n) feedforward torque added by the controller,
-            as torques; None where not recorded.
-        drive_gain: (n,) torque per current that the file states [N·m/A or N/A]; None where it states none.
-        effort_variance: (n,) mean variance of the effort's samples, from repeats [its unit²]; None where not known.
+        v: (N, n) measured velocities [rad/s or m/s]; None if not recorded.
+        tau_link: (N, n) second torque, from sensors after the gear [N·m or N]; None if not recorded.
+        tau_motor: (N, n) torque on the motor side of the gear, as recorded [N·m]; None if not recorded.
+        q_link: (N, n) positions from second encoders, after the gear [rad or m]; NaN in the columns of joints without
+            one; None if no joint has one.
+        q_ref: (N, n) reference positions [rad or m]; None if not recorded.
+        tau_ff: (N, n) feedforward torque added by the controller [N·m or N]; None if not recorded.
+        drive_gain: (n,) torque per current from the file [N·m/A or N/A]; None if the file has none.
+        effort_variance: (n,) mean variance of the effort's samples, from repeats [the effort's unit²]; None if not
+            known.
         file: path of the file.
         rows: (N,) number of each sample in the file, counted from 1.
-        notes: remarks on unusual values that were accepted, for messages; jumps: descriptions of position jumps;
-            faults: columns that are constant while what they measure changes.
+        notes: remarks on unusual values that were accepted, for messages.
+        jumps: descriptions of position jumps.
+        faults: columns that are constant although the measured quantity changes.
     """
 
     t: np.ndarray
@@ -105,13 +108,15 @@ class Recording:
         """Return a recording from arrays.
 
         Args:
-            t: (N,) stamps [s]; q: (N, n) positions [rad or m]; tau: (N, n) torques [N m or N], or currents [A].
-            kind: what `tau` is, ``torque`` or ``current``.
+            t: (N,) time stamps [s].
+            q: (N, n) positions [rad or m].
+            tau: (N, n) torques [N m or N], or currents [A].
+            kind: kind of `tau`, ``torque`` or ``current``.
             joint_names: n names; q1 to qn by default.
-            fields: other fields: ``v``, ``tau_link``, ``q_ref`` ...
+            fields: other fields: ``v``, ``tau_link``, ``q_ref``, ….
 
         Raises:
-            MeasurementError: for inconsistent shapes.
+            MeasurementError: inconsistent shapes.
         """
         q = np.asarray(q, dtype=float)
         names = named(joint_names, q.shape[1])
@@ -133,13 +138,20 @@ class Recording:
     def cut(self, start: float | None = None, stop: float | None = None) -> Recording:
         """Return the recording of the samples with start ≤ t < stop [s]; None: no bound at that end.
 
+        Args:
+            start, stop: begin and end of the part [s], counted from the file's first sample.
+
         Raises:
-            MeasurementError: if no sample is in the interval.
+            MeasurementError: no sample is in the interval.
         """
         return self.take(rows_of_cut(self.t, start, stop, self.file))
 
     def take(self, index: slice | np.ndarray) -> Recording:
-        """Return the recording of the samples at `index`, a slice or a mask (N,), with their times and row numbers."""
+        """Return the recording of the samples at `index`, with their times and row numbers.
+
+        Args:
+            index: a slice, indices, or a mask (N,).
+        """
         series: dict[str, object] = {}
         for name in SERIES:
             values = getattr(self, name)
@@ -148,11 +160,17 @@ class Recording:
 
 
 def rows_in_pieces(t: np.ndarray, first: int, stop: int, max_samples: int | None) -> tuple[np.ndarray, list[str]]:
-    """Return the rows to use of a recording's rows `first` to `stop`, and notes: all, or `max_samples` in pieces.
+    """Return the indices of the rows to use among the rows `first` to `stop`, and notes on the choice.
 
-    One piece is taken at a random position in each of `PIECES` equal parts, so that pieces cover the whole time and do
-    not lock to a period of the motion. All rows are used if they exceed `max_samples` by a quarter at most, or if
-    stamps t (N,) run backwards, which a later check refuses with advice on where to cut.
+    These are all rows, or `max_samples` rows in pieces. Each of `PIECES` equal parts contributes one piece at a random
+    position, so that the pieces cover the whole time and are not periodic like the motion. All rows are used if there
+    are at most a quarter more than `max_samples`. All are used too if the time stamps t (N,) run backwards, since a
+    later check then refuses them with advice on where to cut.
+
+    Args:
+        t: (N,) time stamps of the whole file [s].
+        first, stop: index of the first row, and of the row after the last one.
+        max_samples: largest number of rows; None: no limit.
     """
     count = stop - first
     if max_samples is None or count <= MAX_EXCESS * max_samples:
@@ -172,8 +190,13 @@ def rows_in_pieces(t: np.ndarray, first: int, stop: int, max_samples: int | None
 
 
 def rows_used(t: np.ndarray, ends: Ends, max_samples: int | None, file: str | Path) -> tuple[np.ndarray, list[str]]:
-    """Return the rows of a file with stamps `t` (N,) [s] that are within a cut, at most `max_samples` of them in
-    pieces, and notes.
+    """Return the indices of a file's rows within a cut, at most `max_samples` of them in pieces, and notes.
+
+    Args:
+        t: (N,) time stamps [s].
+        ends: begin and end of the cut [s]; None: no bound.
+        max_samples: largest number of rows; None: no limit.
+        file: the file, for messages.
     """
     cut = slice(0, len(t))
     if ends != (None, None):
@@ -184,7 +207,12 @@ def rows_used(t: np.ndarray, ends: Ends, max_samples: int | None, file: str | Pa
 
 
 def in_pieces(recording: Recording, max_samples: int | None) -> Recording:
-    """Return a recording of at most `max_samples` samples: itself, or pieces spread over it (`rows_in_pieces`)."""
+    """Return the recording, or, if it has more than `max_samples` samples, pieces spread over it (`rows_in_pieces`).
+
+    Args:
+        recording: the recording.
+        max_samples: largest number of samples; None: no limit.
+    """
     rows, notes = rows_in_pieces(recording.t, 0, len(recording), max_samples)
     if not notes:
         return recording
@@ -192,7 +220,10 @@ def in_pieces(recording: Recording, max_samples: int | None) -> Recording:
 
 
 def settled(values: np.ndarray) -> np.ndarray:
-    """Return `values` itself if it is a read-only float array, else a frozen copy (logs are large)."""
+    """Return `values` itself if it is a read-only float array, else a read-only copy.
+
+    This avoids copies of large logs.
+    """
     owner = values
     if isinstance(values, np.ndarray) and values.base is not None:
         owner = values.base
@@ -203,10 +234,14 @@ def settled(values: np.ndarray) -> np.ndarray:
 def earlier(recording: Recording, lag: float) -> Recording:
     """Return the recording with torques and currents shifted `lag` [s] earlier, to the time of the positions.
 
-    Samples without a recorded torque are removed.
+    Samples for which there is no torque are removed.
+
+    Args:
+        recording: the recording.
+        lag: delay of the torques behind the positions of the same row [s].
 
     Raises:
-        MeasurementError: if no sample is left.
+        MeasurementError: no sample remains.
     """
     if not lag:
         return recording
@@ -215,7 +250,10 @@ def earlier(recording: Recording, lag: float) -> Recording:
     if len(t):
         covered = (t >= recording.t[0]) & (t <= recording.t[-1])
     if not covered.any():
-        refuse_data(recording.file, f"a lag of {lag:g} s leaves no sample of a recording of {recording.duration:.3g} s")
+        refuse_data(
+            recording.file,
+            f"a lag of {lag:g} s leaves no sample of a recording of {recording.duration:.3g} s: is it in s?",
+        )
     shifted: dict[str, object] = {}
     for name in LATE:
         values = getattr(recording, name)
@@ -227,7 +265,16 @@ def earlier(recording: Recording, lag: float) -> Recording:
 
 
 def rows_of_cut(t: np.ndarray, start: float | None, stop: float | None, file: str | Path) -> slice:
-    """Return the slice of samples with start ≤ t < stop (tolerance 1 ns); refuse a cut without samples."""
+    """Return the slice of samples with start ≤ t < stop (tolerance 1 ns).
+
+    Args:
+        t: (N,) time stamps [s], increasing.
+        start, stop: begin and end [s]; None: no bound.
+        file: the file, for messages.
+
+    Raises:
+        MeasurementError: the slice is empty.
+    """
     first, end = 0, len(t)
     low = high = ""
     if start is not None:
@@ -243,12 +290,12 @@ def rows_of_cut(t: np.ndarray, start: float | None, stop: float | None, file: st
 
 
 def parse_cut(text: str) -> tuple[str, float | None, float | None]:
-    """Return file, start and stop [s] of a text like ``log.npz@0:9.4``; either end may be absent (``log.npz@2:``).
+    """Return file, start and stop [s] from a text such as ``log.npz@0:9.4``; None for an absent end (``log.npz@2:``).
 
-    Seconds count from the file's first sample. Without an ``@`` the whole text is the file.
+    Seconds count from the file's first sample. A text without ``@`` is a file without a cut.
 
     Raises:
-        UsageError: if the cut is not two times, or contains no time.
+        UsageError: the cut does not consist of two times, or contains no time.
     """
     match = _CUT.match(text)
     if match is None:

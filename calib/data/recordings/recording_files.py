@@ -35,7 +35,16 @@ from calib.records import FieldValues
 
 
 def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
-    """Return the recording in a CSV table from ends[0] to ends[1] [s]; values are not checked; about 20 MB/s."""
+    """Return the recording in a CSV table from ends[0] to ends[1] [s]; values are not checked.
+
+    The speed is about 20 MB/s.
+
+    Args:
+        path: the file.
+        joints: the robot's joints, in whose order columns are put; None: as in the file.
+        options: options for reading the file.
+        ends: begin and end of the part to read; None: no bound.
+    """
     table = _numbered_brackets(read_table(path, doubles=True))
     columns_of = _find_columns(table, options, joints.names if joints else ())
     renamed = one_effort({name: name for name in columns_of}, options, table.header, path)
@@ -44,7 +53,9 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
     for name, columns in columns_of.items():
         if name != "t" and len(columns) != n:
             headings = ", ".join(_headings(table, columns))
-            refuse_data(path, f"{len(columns)} columns of {name} ({headings}) for {n} of q")
+            refuse_data(
+                path, f"has {len(columns)} columns of {name} ({headings}), but {n} of q: one per joint is needed"
+            )
         check_units(name, [table.units[column] for column in columns], joints, path)
 
     t = _stamps(table, columns_of, options)
@@ -89,7 +100,13 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
 
 
 def read_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Return the stamps (N,) [s] and reference positions (N, n) of a table: q_ref, or q without it."""
+    """Return the time stamps (N,) [s] and reference positions (N, n) in a table: q_ref, or q if there is no q_ref.
+
+    Args:
+        path: the CSV table.
+        joints: the robot's n joints, in whose order columns are put.
+        options: options for reading the file.
+    """
     table = _numbered_brackets(read_table(path, doubles=True))
     names = {key: name for key, name in options.names.items() if key in ("t", "q", "q_ref")}
     columns_of = _find_columns(table, replace(options, names=names), joints.names)
@@ -103,7 +120,7 @@ def read_positions(path: Path, joints: Joints, options: RecordingOptions) -> tup
 
 
 def _numbered_brackets(table: Table) -> Table:
-    """Return the table with headings like ``q[1]`` (joint number in brackets) renamed to ``q1``."""
+    """Return the table with headers such as ``q[1]`` (joint number in brackets) renamed to ``q1``."""
     header = []
     units = []
     for name, unit in zip(table.header, table.units):
@@ -114,7 +131,13 @@ def _numbered_brackets(table: Table) -> Table:
 
 
 def _find_columns(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dict[str, list[int]]:
-    """Return the column indices of each series, in the robot's order, by the toolkit's name."""
+    """Return the column indices of each series, in the robot's joint order, by the toolkit's name of the series.
+
+    Args:
+        table: the table.
+        options: options for reading the file, which may name columns.
+        joints: names of the robot's joints.
+    """
     columns_of: dict[str, list[int]] = {}
     for name, synonyms in SYNONYMS.items():
         stems = (options.names[name],) if name in options.names else synonyms
@@ -128,7 +151,7 @@ def _find_columns(table: Table, options: RecordingOptions, joints: Sequence[str]
 
 
 def _stamp_column(table: Table, names: Sequence[str]) -> list[int]:
-    """Return the index of the column with the first of these names that the table has; [] if it has none."""
+    """Return a list with the index of the time stamps' column, the first of `names` in the table; [] if it has none."""
     header = [heading.lower() for heading in table.header]
     for name in names:
         if name.lower() in header:
@@ -137,7 +160,13 @@ def _stamp_column(table: Table, names: Sequence[str]) -> list[int]:
 
 
 def _joint_columns(table: Table, stems: Sequence[str], joints: Sequence[str]) -> list[int]:
-    """Return the indices of the columns of the first quantity that the table has for all joints; [] if it has none."""
+    """Return the column indices of the first quantity in `stems` that the table has for all joints; else [].
+
+    Args:
+        table: the table.
+        stems: accepted names of the quantity.
+        joints: names of the robot's joints.
+    """
     for stem in stems:
         columns = _of_joints(table, stem, joints) or _numbered(table, stem)
         if columns:
@@ -146,7 +175,13 @@ def _joint_columns(table: Table, stems: Sequence[str], joints: Sequence[str]) ->
 
 
 def _of_joints(table: Table, stem: str, joints: Sequence[str]) -> list[int]:
-    """Return the indices of the columns of one quantity that are named after the joints."""
+    """Return the indices of the columns whose names consist of the quantity `stem` and a joint's name; else [].
+
+    Args:
+        table: the table.
+        stem: name of the quantity.
+        joints: names of the robot's joints, in the order of the result.
+    """
     header, stem = [name.lower() for name in table.header], stem.lower()
     for pattern in (f"{stem}_{{}}", f"{stem}{{}}", f"{stem} {{}}", f"{{}}_{stem}", f"{{}}.{stem}", f"{stem}.{{}}"):
         columns = [pattern.format(joint.lower()) for joint in joints]
@@ -156,7 +191,14 @@ def _of_joints(table: Table, stem: str, joints: Sequence[str]) -> list[int]:
 
 
 def _numbered(table: Table, stem: str) -> list[int]:
-    """Return the indices of the numbered columns of one quantity; [] unless numbered from 0 or 1 without gaps."""
+    """Return the indices of the columns named by the quantity `stem` and a number, in order of the numbers.
+
+    [] if there are none, or if they are not numbered from 0 or 1 without gaps.
+
+    Args:
+        table: the table.
+        stem: name of the quantity.
+    """
     numbered: dict[str, list[tuple[int, int]]] = {}
     for column, name in enumerate(table.header):
         column_stem, number = stem_of(name)
@@ -181,7 +223,14 @@ def _joint_names(table: Table, columns: Sequence[int]) -> list[str]:
 
 
 def _values(table: Table, column: int, series: str, options: RecordingOptions) -> np.ndarray:
-    """Return a column in SI; NaN is kept and refused later, if it is within the cut."""
+    """Return a column in SI; NaN is kept, and refused later if it is within the cut.
+
+    Args:
+        table: the table.
+        column: index of the column.
+        series: the toolkit's name of the series, which determines the accepted units.
+        options: options for reading the file, which may state a unit.
+    """
     factor = table.factor(column, SCALES[series], options.units.get(series, ""))
     return table.numbers(table.header[column], None, gaps=True) * factor
 
@@ -203,14 +252,16 @@ Reader = Callable[[Path, Joints | None, RecordingOptions], Recording]
 def read_recording(
     path: str | Path, joints: Joints | None = None, options: RecordingOptions | None = None
 ) -> Recording:
-    """Return the checked recording at `path`, which may be cut in time (``log.npz@0:9.4``).
+    """Return the recording at `path` after all checks; the path may contain a cut in time (``log.npz@0:9.4``).
 
     Args:
+        path: the file.
         joints: the robot's joints; columns are put in their order if the file names its joints. None: as in the file.
+        options: options for reading the file; None: the defaults.
 
     Raises:
-        MeasurementError: for an invalid file or value, with row and column.
-        UsageError: for an invalid cut.
+        MeasurementError: an invalid file or value; the message contains row and column.
+        UsageError: an invalid cut.
     """
     file, start, stop = parse_cut(str(path))
     options = options or RecordingOptions()
@@ -231,7 +282,12 @@ def read_recording(
 
 
 def _described(recording: Recording, controller: str) -> Recording:
-    """Return a recording converted from joint values as the controller shows them to those of the robot description."""
+    """Return a recording converted from the controller's joint convention to that of the robot's description.
+
+    Args:
+        recording: the recording.
+        controller: name of the controller; empty: the recording is returned unchanged.
+    """
     if not controller:
         return recording
     series_of = {
@@ -248,7 +304,12 @@ def _described(recording: Recording, controller: str) -> Recording:
 
 
 def _reader(path: Path, ends: Ends) -> Reader:
-    """Return the reader for a path, chosen by the file's first bytes or suffix; a folder is a bag."""
+    """Return the function that reads a file, chosen by the file's first bytes or suffix; a folder is a ROS bag.
+
+    Args:
+        path: the file.
+        ends: begin and end of the cut [s]; (None, None) without a cut.
+    """
     try:
         if path.exists():
             check_regular(path)
@@ -269,5 +330,5 @@ def _reader(path: Path, ends: Ends) -> Reader:
         fault = "is neither a NumPy archive, a bag nor text" if head else "is empty"
         refuse_data(path, f"{fault}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder")
     if len(head) == 1 << 16 and b"\n" not in head:
-        refuse_data(path, "has a first line of more than 64 kB: not a table")
+        refuse_data(path, "has a first line of more than 64 kB: it is not a table; was it saved as CSV?")
     return partial(read_log, ends=ends)

@@ -83,7 +83,7 @@ SCALES = {
 
 
 def _ours(names: object) -> object:
-    """Return `names` unchanged; refuse names of series that this toolkit does not know."""
+    """Return `names` unchanged; raise ValueError for a name that is not a series of the toolkit."""
     if not isinstance(names, Mapping):
         return names
     for name in names:
@@ -93,7 +93,7 @@ def _ours(names: object) -> object:
 
 
 def _known(units: object) -> object:
-    """Return `units` unchanged; refuse a unit that does not suit its series."""
+    """Return `units` unchanged; raise ValueError for a unit that does not suit its series."""
     if not isinstance(units, Mapping):
         return units
     _ours(units)
@@ -144,13 +144,20 @@ class RecordingOptions:
             _known(self.units)
 
     def factor(self, name: str) -> float:
-        """Return the factor to SI of the unit stated for one of the toolkit's names; 1 if none is stated."""
+        """Return the factor to SI for the unit that the options state for the series `name`; 1 if they state none."""
         unit = self.units.get(name, "")
         return SCALES[name][unit.lower()] if unit else 1.0
 
 
 def check_units(name: str, units: Sequence[str], joints: Joints | None, path: str | Path) -> None:
-    """Refuse units of the series `name` (one per column, "" is SI) that do not suit revolute or prismatic joints."""
+    """Raise MeasurementError for units of a series that do not suit revolute or prismatic joints.
+
+    Args:
+        name: name of the series.
+        units: unit of each column; "" for SI.
+        joints: the robot's joints; None: no check.
+        path: the file, for messages.
+    """
     if joints is None or len(units) != len(joints.names) or name not in ("q", "v", "q_link", "q_ref"):
         return
     for joint, kind, unit in zip(joints.names, joints.kinds, units):
@@ -160,7 +167,10 @@ def check_units(name: str, units: Sequence[str], joints: Joints | None, path: st
 
 
 def stem_of(name: str) -> tuple[str, int | None]:
-    """Return the quantity that a column's name states, in lower case, and its last number: (q, 1) for ``J1 q``."""
+    """Return the quantity in a column's name, in lower case, and the last number in the name: (q, 1) for ``J1 q``.
+
+    The number is None if there is none.
+    """
     match = _NUMBER.search(name)
     number = None
     if match:
@@ -171,7 +181,10 @@ def stem_of(name: str) -> tuple[str, int | None]:
 
 
 def plain_stems(stems: Sequence[str]) -> dict[str, str]:
-    """Return a map to each stem from itself and, if unique, from its form without leading words of `MEASURED`."""
+    """Return a mapping to each stem from the stem itself and from its form without leading words of `MEASURED`.
+
+    A short form that several stems share is left out.
+    """
     short: dict[str, list[str]] = {}
     for stem in stems:
         parts = stem.split("_")
@@ -183,7 +196,13 @@ def plain_stems(stems: Sequence[str]) -> dict[str, str]:
 
 
 def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) -> dict[str, str]:
-    """Return a map from the toolkit's name of each series in the file to the file's name."""
+    """Return a mapping from the toolkit's name of each series in the file to the file's name.
+
+    Args:
+        members: names of the columns or arrays in the file.
+        options: options for reading the file, which may name series.
+        path: the file, for messages.
+    """
     members_by_stem: dict[str, str] = {}
     for member in members:
         stem, number = stem_of(member)
@@ -211,7 +230,14 @@ def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) 
 def one_effort(
     names: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path
 ) -> dict[str, str]:
-    """Return `names` with either ``torque`` or ``current``; without both, ``tau_link`` becomes the torque."""
+    """Return `names` with either ``torque`` or ``current``; ``tau_link`` becomes the torque if the file has neither.
+
+    Args:
+        names: the toolkit's names of series to the file's names.
+        options: options for reading the file.
+        members: all names in the file, for messages.
+        path: the file, for messages.
+    """
     if "q" not in names:
         expected = ", ".join(SYNONYMS["q"])
         message = f"has no joint positions ({expected}); found: {', '.join(members)}"
@@ -235,7 +261,12 @@ def one_effort(
 
 
 def _advice(names: Mapping[str, str], members: Sequence[str]) -> str:
-    """Return advice to name the missing series in the options, with likely columns (by a shared word)."""
+    """Return advice to state the missing series in the options, with columns of the file that share a word with it.
+
+    Args:
+        names: the toolkit's names of the series found, to the file's names.
+        members: all names in the file.
+    """
     stems = []
     for member in members:
         stem = stem_of(member)[0]
@@ -262,7 +293,16 @@ def _advice(names: Mapping[str, str], members: Sequence[str]) -> str:
 
 
 def _two_torques(names: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path) -> list[str]:
-    """Add the motors' torque to `names` as the effort (the sensors' torque if only that is needed)."""
+    """Add the motors' torque to `names` as the effort, or the sensors' torque if only that is needed.
+
+    Returns a list with the name of the added series.
+
+    Args:
+        names: the toolkit's names of series to the file's names; extended in place.
+        options: options for reading the file: whether torques of motors or of sensors are needed.
+        members: all names in the file, for messages.
+        path: the file, for messages.
+    """
     series = "tau_motor" if "tau_motor" in names else "tau_link"
     if "tau_link" not in names or (options.motors and series == "tau_link"):
         torques = "two torques, of motors and of sensors" if options.motors else "torques of sensors"
@@ -276,9 +316,18 @@ def _two_torques(names: dict[str, str], options: RecordingOptions, members: tupl
 
 
 def joint_order(names: list[str], joints: Joints | None, n: int, path: str | Path) -> tuple[list[int], tuple[str, ...]]:
-    """Return the indices of the robot's joints among the file's, and their names; the file may have more joints."""
+    """Return the indices of the robot's joints among the file's joints, and their names.
+
+    The file may have more joints than the robot.
+
+    Args:
+        names: joint names in the file; empty if it has none.
+        joints: the robot's joints; None: the file's order is kept.
+        n: number of joint columns in the file.
+        path: the file, for messages.
+    """
     if names and len(names) != n:
-        refuse_data(path, f"joint_names has {len(names)} names for {n} columns")
+        refuse_data(path, f"joint_names has {len(names)} names for {n} columns: state one per column")
     if joints is None or not names:
         column_names: Sequence[str] = names
         if joints is not None and len(joints.names) == n:

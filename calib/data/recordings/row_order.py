@@ -1,8 +1,8 @@
-"""Rows whose stamps run backwards by a few steps are put in order; rows of two joined logs, or of a set clock, are not.
+"""Rows whose time stamps run backwards by a few steps are sorted; larger steps backwards are not.
 
-Rows written in another order than they were sampled (several threads or sockets) look like rows in the right order with
-stamps that jitter by more than a step. Positions distinguish the two: of two orders of the same samples, the right one
-gives the shorter path.
+Larger steps come from two joined logs, or from a clock that was set. Rows that were written in another order than they
+were sampled (several threads or sockets) look like rows in the right order whose stamps jitter by more than a step.
+Positions distinguish the two cases: of two orders of the same samples, the right one gives the shorter path.
 """
 
 from dataclasses import replace
@@ -17,7 +17,10 @@ MAX_BACK = 5
 
 
 def in_order(recording: Recording) -> Recording:
-    """Return the recording with stamps that run back by up to `MAX_BACK` steps put in order, and a note on it."""
+    """Return the recording sorted by time, with a note on it, if time stamps run back by up to `MAX_BACK` steps.
+
+    Larger steps backwards are not sorted.
+    """
     t = recording.t
     if len(t) < 2 or not np.isfinite(t).all() or not (np.diff(t) < 0.0).any():
         return recording
@@ -28,7 +31,7 @@ def in_order(recording: Recording) -> Recording:
         return recording
     order = np.concatenate([part.start + np.argsort(t[part], kind="stable") for part in parts])
     count = int((back > 0.0).sum())
-    remark = f"{count} stamps are up to {1e3 * back.max():.3g} ms earlier than one before them"
+    remark = f"{count} stamps are up to {1e3 * back.max():.3g} ms earlier than stamps before them"
     if _path_length(recording.q[order]) < _path_length(recording.q):
         ordered = recording.take(order)
         note = f"{remark}: the rows are sorted by their stamps"
@@ -39,17 +42,17 @@ def in_order(recording: Recording) -> Recording:
 
 
 def goes_far_back(t: np.ndarray) -> np.ndarray:
-    """Return the mask (N,) of stamps (N,) that are earlier than the stamp before by more than `MAX_BACK` steps."""
+    """Return for each time stamp (N,) whether it is earlier than the one before by more than `MAX_BACK` steps."""
     return np.append(False, np.diff(t) < -MAX_BACK * _usual_step(t))
 
 
 def _usual_step(t: np.ndarray) -> float:
-    """Return the median distance of neighbouring stamps (N,), regardless of sign."""
+    """Return the median absolute difference between successive time stamps (N,)."""
     return float(np.median(np.abs(np.diff(t))))
 
 
 def _path_length(q: np.ndarray) -> float:
-    """Return the length of the path through positions (N, n), each joint's in units of its travel."""
+    """Return the length of the path through positions q (N, n), with each joint in units of its range."""
     travel = np.ptp(q, axis=0)
     moves = travel > 0.0
     steps = np.abs(np.diff(q[:, moves], axis=0))

@@ -1,10 +1,10 @@
-"""Cut-off frequencies from the data: bandwidth of the motion, noise level, and the filters for them.
+"""Cut-off frequencies from the data: bandwidth of the motion, noise level, and suitable filters.
 
-Gautier's rules, with ω_dyn the highest frequency at which the rigid body moves: the positions' low-pass filter at
-ω_f ≥ 5 ω_dyn, so that it bends nothing in the band, and the parallel decimation at ω_fp ≥ 2 ω_dyn, with
-ω_fp = 2π 0.8 f_m / (2 n_d). Gautier's ω_dyn is that of the closed loop; a log shows only the part of the band that was
-excited (our choice: the frequency below which 95 % of a joint's acceleration power lies, the floor of noise taken off,
-a resonance left out).
+Gautier's rules use ω_dyn, the highest frequency of the rigid-body motion. The low-pass filter of the positions has a
+cut-off ω_f ≥ 5 ω_dyn, so that it does not distort the motion. The parallel decimation has ω_fp ≥ 2 ω_dyn, with ω_fp =
+2π 0.8 f_m / (2 n_d). Gautier's ω_dyn is the bandwidth of the closed loop. A log shows only the excited part of that
+band. Our choice is therefore the frequency below which a joint has 95 % of its acceleration power, after the noise
+floor and a resonance are removed.
 """
 
 from dataclasses import dataclass
@@ -44,9 +44,10 @@ class Cutoffs:
     """Proposed cut-off frequencies of filters and decimation.
 
     Attributes:
-        dynamics: f_dyn of the robot [Hz].
-        position: cut-off of the positions' Butterworth filter, f_q [Hz].
-        band: cut-off of the parallel decimation, f_p [Hz], and factor: n_d of this decimation.
+        dynamics: bandwidth f_dyn of the robot's motion [Hz].
+        position: cut-off f_q of the positions' Butterworth filter [Hz].
+        band: cut-off f_p of the parallel decimation [Hz].
+        factor: decimation factor n_d.
         noise: (n,) standard deviation of white noise in the positions [rad or m], estimated from the spectrum above the
             motion's band.
         reasons: explanations of the values.
@@ -60,18 +61,23 @@ class Cutoffs:
     reasons: tuple[str, ...]
 
     def acceleration_noise(self, cutoff: float | np.ndarray, rate: float) -> np.ndarray:
-        """Return the acceleration noise (n,) due to white position noise at a cut-off f_q [Hz], one or (n,).
+        """Return the acceleration noise (n,) [rad/s² or m/s²] that white position noise causes after the filter.
 
-        σ_a = σ_q (2π)² sqrt(2 f_q⁵ / (5 f_s)), with `rate` f_s [Hz].
+        σ_a = σ_q (2π)² sqrt(2 f_q⁵ / (5 f_s))
+
+        Args:
+            cutoff: cut-off f_q [Hz], one number or (n,).
+            rate: sampling rate f_s [Hz].
         """
         return self.noise * (2 * np.pi) ** 2 * np.sqrt(2 * cutoff**5 / (5 * rate))
 
 
 def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoffs:
-    """Return the cut-offs proposed for a resampled recording.
+    """Return the cut-off frequencies proposed for a resampled recording.
 
     Args:
-        dynamics: f_dyn if known [Hz] (the bandwidth of the position loop); else estimated from the data.
+        sampled: the recording.
+        dynamics: bandwidth f_dyn [Hz] if known (that of the position loop); None: estimated from the data.
     """
     # Slow to load.
     from scipy.signal import welch
@@ -99,14 +105,22 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     position, position_reason = _position_cutoff(f, power, floor, active, dynamics, sampled.rate)
     factor = factor_for(sampled.rate, min(2 * dynamics, USABLE * sampled.rate / 2))
     band = USABLE * sampled.rate / (2 * factor)
-    band_reason = f"f_p = {band:.3g} Hz (2 f_dyn, rounded to a whole decimation factor n_d = {factor})"
+    band_reason = (
+        f"identification band f_p = {band:.3g} Hz (2 f_dyn, rounded to a whole decimation factor n_d = {factor})"
+    )
     noise = np.sqrt(floor * sampled.rate / 2)
     reasons = (dynamics_reason, *peak_notes, position_reason, band_reason)
     return Cutoffs(dynamics, position, band, factor, frozen(noise), reasons)
 
 
 def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:
-    """Raise MeasurementError for a cut-off [Hz] that is not between 0 and half the sampling rate."""
+    """Raise MeasurementError for a cut-off [Hz] that is not between 0 and half the sampling rate `rate` [Hz].
+
+    Args:
+        cutoff: cut-off of a filter [Hz].
+        rate: sampling rate [Hz].
+        file: name of the recording, for messages; "" for none.
+    """
     if not 0 < cutoff < rate / 2:
         message = (
             f"a cut-off of {cutoff:g} Hz is not between 0 and the Nyquist frequency, {rate / 2:g} Hz at {rate:g} Hz: "
@@ -118,9 +132,18 @@ def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:
 def _position_cutoff(
     f: np.ndarray, power: np.ndarray, floor: np.ndarray, active: np.ndarray, dynamics: float, rate: float
 ) -> tuple[float, str]:
-    """Return f_q [Hz] and the reason: 5 f_dyn, or less if noise exceeds 5 % of the acceleration, at least 2 f_dyn.
+    """Return the positions' cut-off f_q [Hz] and the reason for it.
 
-    White noise of density S_0 becomes an acceleration of variance (2π)⁴ S_0 f_q⁵/5.
+    f_q is 5 f_dyn, or less if noise would exceed 5 % of the acceleration, but at least 2 f_dyn. White noise of density
+    S_0 becomes an acceleration of variance (2π)⁴ S_0 f_q⁵/5.
+
+    Args:
+        f: (k,) frequencies [Hz].
+        power: (k, n) power density of the positions.
+        floor: (n,) power density of their noise.
+        active: (n,) whether each joint moves fast enough.
+        dynamics: bandwidth f_dyn [Hz].
+        rate: sampling rate [Hz].
     """
     band = f <= 2 * dynamics
     density = (f[:, None] ** 4 * np.maximum(power - floor, 0))[band]
@@ -132,24 +155,33 @@ def _position_cutoff(
     highest = USABLE * rate / 2
     if highest <= min(5 * dynamics, quiet):
         reason = f"{USABLE:g} of the Nyquist frequency; 5 f_dyn would be {5 * dynamics:.3g} Hz"
-        return highest, f"f_q = {highest:.3g} Hz, {reason}"
+        return highest, f"cut-off of positions f_q = {highest:.3g} Hz, {reason}"
     if quiet >= 5 * dynamics:
-        return 5 * dynamics, f"f_q = {5 * dynamics:.3g} Hz (5 f_dyn)"
+        return 5 * dynamics, f"cut-off of positions f_q = {5 * dynamics:.3g} Hz (5 f_dyn)"
     lower = min(max(quiet, 2 * dynamics), highest)
     reason = f"at 5 f_dyn = {5 * dynamics:.3g} Hz noise exceeds 5 % of the acceleration"
-    return lower, f"f_q = {lower:.3g} Hz: {reason}"
+    return lower, f"cut-off of positions f_q = {lower:.3g} Hz: {reason}"
 
 
 def _active(steps: np.ndarray) -> np.ndarray:
-    """Return the mask (n,) of joints that move fast enough to determine the bandwidth, given their steps (N, n)."""
+    """Return for each joint whether it moves fast enough to determine the bandwidth, (n,) bool.
+
+    Args:
+        steps: (N, n) differences of successive positions [rad or m].
+    """
     speed = np.quantile(np.abs(steps), 0.95, axis=0)
     return speed > MIN_SPEED_SHARE * speed.max()
 
 
 def _choose(per_joint: np.ndarray, dynamics: float | None) -> tuple[float, str]:
-    """Return f_dyn of the robot [Hz] and the reason: that in the options, else from those of the joints (n,)."""
+    """Return the robot's bandwidth f_dyn [Hz] and the reason for it.
+
+    Args:
+        per_joint: (n,) bandwidth of each joint's motion [Hz]; 0 if unknown.
+        dynamics: f_dyn that the options state, which is then returned; None: none.
+    """
     if dynamics is not None:
-        return dynamics, f"f_dyn = {dynamics:.3g} Hz as stated"
+        return dynamics, f"bandwidth of the motion f_dyn = {dynamics:.3g} Hz, as stated"
     fastest = int(np.argmax(per_joint))
     top = float(per_joint[fastest])
     middle = 0.0
@@ -158,19 +190,26 @@ def _choose(per_joint: np.ndarray, dynamics: float | None) -> tuple[float, str]:
     frequency = min(top, MAX_SPREAD * middle)
     if frequency < LOWEST:
         extent = f"ends at {frequency:.2g} Hz" if frequency else "hardly exceeds the noise"
-        return LOWEST, f"f_dyn = {LOWEST:g} Hz: the motion {extent}; friction is faster"
+        return LOWEST, f"bandwidth f_dyn = {LOWEST:g} Hz: the motion {extent}, but friction is faster"
     if frequency > MAX_CUTOFF:
-        reason = f"joint {fastest + 1} moves at {top:.3g} Hz, where no robot is rigid"
-        return MAX_CUTOFF, f"f_dyn = {MAX_CUTOFF:g} Hz: {reason}"
+        reason = f"joint {fastest + 1} moves at {top:.3g} Hz, at which no robot is rigid"
+        return MAX_CUTOFF, f"bandwidth of the motion f_dyn = {MAX_CUTOFF:g} Hz: {reason}"
     if frequency < top:
         reason = f"{MAX_SPREAD:g} times the median: joint {fastest + 1}'s {top:.3g} Hz is an outlier"
-        return frequency, f"f_dyn = {frequency:.3g} Hz, {reason}"
-    return frequency, f"f_dyn = {frequency:.3g} Hz: 95 % of the acceleration power of joint {fastest + 1} lies below"
+        return frequency, f"bandwidth of the motion f_dyn = {frequency:.3g} Hz, {reason}"
+    return (
+        frequency,
+        f"bandwidth f_dyn = {frequency:.3g} Hz: 95 % of the acceleration power of joint {fastest + 1} is below it",
+    )
 
 
 def _joint_dynamics(f: np.ndarray, power: np.ndarray, floor: float) -> tuple[float, float]:
-    """Return the highest frequency of one joint's motion, and the frequency of a resonance above it (NaN without one)
-    [Hz].
+    """Return the highest frequency of a joint's motion, and that of a resonance above it [Hz]; NaN without a resonance.
+
+    Args:
+        f: (k,) frequencies [Hz].
+        power: (k,) power density of the positions.
+        floor: power density of their noise.
     """
     smooth = uniform_filter1d(power, 5, mode="nearest")
     peak = int(np.argmax(f**2 * np.maximum(smooth - MIN_ABOVE_FLOOR * floor, 0)))

@@ -1,12 +1,11 @@
-"""Zero-phase low-pass filters and central differences along the first axis of evenly sampled arrays.
+"""Zero-phase low-pass filters, central differences and parallel decimation of evenly sampled arrays.
 
-Parallel decimation: the same low-pass filter and thinning for the torque and for every column of W.
-
-Filtering is linear along time, so y = W x + ρ becomes y_f = W_f x + ρ_f with the *same* x, whatever the filter: the
-filter removes what lies above the band of the model (ripple, flexibility, noise) and introduces no bias (Gautier's
-parallel decimation; figures below from Briot & Gautier's DualV studies and the TX40 slides). The filter is finite,
-symmetric and evaluated at the kept samples only: it has no phase and can run over blocks; rows whose window exceeds the
-ends of a segment are left out.
+All act along the first axis. Parallel decimation applies one low-pass filter and decimation to the torque and to every
+column of the regressor W. Filtering is linear along time, so that y = W x + ρ becomes y_f = W_f x + ρ_f with the *same*
+parameters x, whatever the filter. The filter removes frequencies above the band of the model (ripple, flexibility,
+noise) and introduces no bias (Gautier's parallel decimation; the figures below are from Briot & Gautier's DualV studies
+and the TX40 slides). The filter is finite, symmetric and evaluated at the kept samples only. It has no phase shift and
+can be applied block by block. Samples whose filter window exceeds the ends of a segment are left out.
 """
 
 from collections.abc import Iterable, Iterator
@@ -39,11 +38,11 @@ CURVATURE = {1: (1.0,), 2: (4 / 3, -1 / 12), 3: (3 / 2, -3 / 20, 1 / 90), 4: (8 
 
 @dataclass(frozen=True, eq=False)
 class Decimator:
-    """Low-pass filter and decimation that keeps one of `factor` samples.
+    """Low-pass filter with decimation, which keeps one of `factor` samples.
 
     Attributes:
-        factor: n_d; 1 changes nothing.
-        taps: (2 h + 1,) weights of the samples k-h … k+h, symmetric, of sum 1.
+        factor: decimation factor n_d; 1 changes nothing.
+        taps: (2 h + 1,) symmetric weights of the samples k-h … k+h, with sum 1.
         rate: sampling rate of the signal before decimation [Hz].
         band: cut-off f_p = 0.8 rate / (2 n_d) [Hz]; lower frequencies pass.
     """
@@ -60,15 +59,21 @@ class Decimator:
 
 
 def design_decimator(rate: float, factor: int, kind: str = "kaiser") -> Decimator:
-    """Return the filter that keeps one of `factor` samples of a signal at `rate` [Hz].
+    """Return the filter that keeps one of `factor` samples of a signal sampled at `rate` [Hz].
 
-    ``chebyshev``: Matlab's and Gautier's decimate: type I, order 8, 0.05 dB, cut-off 0.8 of the new Nyquist frequency,
-    run forwards and backwards; taken as its impulse response (the inverse transform of |H|²), truncated where it falls
-    to 1e-4: some 46 n_d samples on each side. ``kaiser``: a windowed sinc with the same band, 60 dB down from 1.2 of
-    the new Nyquist frequency on, 9 n_d samples on each side: a fifth of the work and of the lost ends (our default).
+    ``chebyshev`` is the decimate function of Matlab and Gautier: type I, order 8, 0.05 dB, cut-off 0.8 of the new
+    Nyquist frequency, applied forwards and backwards. It is represented by its impulse response (the inverse transform
+    of |H|²), truncated where the response has fallen to 1e-4: some 46 n_d samples on each side. ``kaiser`` (our
+    default) is a windowed sinc with an equal band, 60 dB down from 1.2 of the new Nyquist frequency on, with 9 n_d
+    samples on each side: it needs a fifth of the work, and loses a fifth of the samples at the ends.
+
+    Args:
+        rate: sampling rate [Hz].
+        factor: decimation factor n_d.
+        kind: ``kaiser`` or ``chebyshev``.
 
     Raises:
-        CalibError: for a factor below 1 or an unknown kind.
+        CalibError: a factor below 1 or an unknown kind.
     """
     message = f"decimation by {factor} with a '{kind}' filter: expected at least 1, and {' or '.join(KINDS)}"
     require(factor >= 1 and kind in KINDS, message)
@@ -80,30 +85,52 @@ def design_decimator(rate: float, factor: int, kind: str = "kaiser") -> Decimato
 
 
 def factor_for(rate: float, band: float) -> int:
-    """Return the largest n_d whose filter keeps `band` [Hz]: floor(0.8 rate / (2 f_p)), at least 1."""
+    """Return the largest decimation factor n_d whose filter passes `band` f_p [Hz], at least 1.
+
+    n_d = floor(0.8 rate / (2 f_p))
+
+    Args:
+        rate: sampling rate before decimation [Hz].
+        band: f_p, highest frequency to keep [Hz].
+    """
     return max(1, int(SHARE * rate / (2 * band) + 1e-9))
 
 
 def kept(segment: np.ndarray, decimator: Decimator) -> np.ndarray:
-    """Return the indices (M,) of the samples that `decimate` keeps, given rising segment numbers (N,)."""
+    """Return the indices (M,) of the samples that `decimate` keeps.
+
+    Args:
+        segment: (N,) number of each sample's segment, increasing.
+        decimator: the decimation.
+    """
     reach, factor = decimator.reach, decimator.factor
     parts = [np.arange(rows.start + reach, rows.stop - reach, factor) for rows in segments(segment)]
     return np.concatenate(parts)
 
 
 def segments(segment: np.ndarray) -> list[slice]:
-    """Return the slices of the samples with the same segment number, given rising numbers (N,)."""
+    """Return the slice of each segment's samples.
+
+    Args:
+        segment: (N,) number of each sample's segment, increasing.
+    """
     edges = np.concatenate([[0], np.flatnonzero(np.diff(segment)) + 1, [len(segment)]])
     return [slice(int(start), int(stop)) for start, stop in pairwise(edges)]
 
 
 def longest(segment: np.ndarray) -> slice:
-    """Return the slice of the longest segment, given rising segment numbers (N,)."""
+    """Return the slice of the longest segment's samples; `segment` (N,) are increasing segment numbers."""
     return max(segments(segment), key=lambda rows: rows.stop - rows.start)
 
 
 def decimate(values: np.ndarray, decimator: Decimator, segment: np.ndarray | None = None) -> np.ndarray:
-    """Return `values` (N, ...) filtered and decimated to the samples `kept` (M, ...), segment by segment."""
+    """Return `values` (N, ...) filtered and decimated segment by segment, (M, ...), at the samples `kept`.
+
+    Args:
+        values: samples.
+        decimator: the decimation.
+        segment: (N,) number of each sample's segment, increasing; None: one segment.
+    """
     values = np.asarray(values, dtype=float)
     if segment is None:
         segment = np.zeros(len(values), dtype=int)
@@ -115,10 +142,12 @@ def decimate(values: np.ndarray, decimator: Decimator, segment: np.ndarray | Non
 
 
 def spread(values: np.ndarray, decimator: Decimator, length: int) -> np.ndarray:
-    """Return the adjoint of `decimate` on one segment of `length` samples: Σ y · decimate(x) = Σ spread(y) · x.
+    """Return the adjoint of `decimate` on one segment: Σ y · decimate(x) = Σ spread(y) · x.
 
     Args:
-        values: (M, ...) at the kept samples.
+        values: (M, ...) values y at the kept samples.
+        decimator: the decimation.
+        length: number of samples of the segment.
     """
     r, taps, count = decimator.factor, decimator.taps, len(values)
     phases = -(-len(taps) // r)
@@ -133,9 +162,13 @@ def spread(values: np.ndarray, decimator: Decimator, length: int) -> np.ndarray:
 
 
 def decimate_blocks(blocks: Iterable[np.ndarray], decimator: Decimator) -> Iterator[np.ndarray]:
-    """Yield, block by block, the decimation of one segment given as blocks (..., N_i).
+    """Yield, block by block, the decimation of one segment whose samples are given as blocks (..., N_i).
 
-    The sample axis is the last one. Memory holds one block and the earlier samples that windows still need.
+    The sample axis is the last one. Only one block and the earlier samples that windows still need are in memory.
+
+    Args:
+        blocks: blocks of the segment's samples, in order of time.
+        decimator: the decimation.
     """
     r, taps = decimator.factor, decimator.taps
     if r == 1 and len(taps) == 1:
@@ -156,8 +189,14 @@ def decimate_blocks(blocks: Iterable[np.ndarray], decimator: Decimator) -> Itera
 def _windows(values: np.ndarray, taps: np.ndarray, r: int, count: int) -> np.ndarray:
     """Return the filtered values (..., count) of the first `count` windows of values (..., N), one every r samples.
 
-    Windows are computed in groups as a product with a band matrix of taps: twice the multiplications, but much faster
-    owing to the processor's cache.
+    Windows are computed in groups, as a product with a band matrix of weights. This needs twice the multiplications,
+    but is much faster owing to the processor's cache.
+
+    Args:
+        values: (..., N) samples.
+        taps: (2 h + 1,) weights of the samples in one window.
+        r: distance between windows, in samples.
+        count: number of windows.
     """
     flat = values.reshape(-1, values.shape[-1])
     together = min(count, -(-len(taps) // r))
@@ -192,7 +231,12 @@ def _chebyshev(factor: int) -> np.ndarray:
 
 
 def too_short(motion_length: int, decimator: Decimator) -> MeasurementError:
-    """Return the error about a motion that is shorter than the filter's window."""
+    """Return the error about a motion of `motion_length` samples, which is shorter than the filter's window.
+
+    Args:
+        motion_length: number of samples of the motion.
+        decimator: the filter.
+    """
     needed = len(decimator.taps) / decimator.rate
     duration = motion_length / decimator.rate
     message = f"decimation by {decimator.factor} needs {needed:.3g} s without a gap, found {duration:.3g} s"
@@ -200,17 +244,18 @@ def too_short(motion_length: int, decimator: Decimator) -> MeasurementError:
 
 
 def low_pass(values: np.ndarray, rate: float, cutoff: float, order: int = ORDER) -> np.ndarray:
-    """Return `values` (N, ...) low-passed by a Butterworth filter, forwards and backwards (no phase shift).
+    """Return `values` (N, ...) filtered by a Butterworth low-pass forwards and backwards, without phase shift.
 
-    Gain |H(f)|² = 1 / (1 + (f/f_c)^(2 order)): 1/2 at the cut-off f_c, where a single pass has 1/√2. The ends are
-    extended by odd reflection over 3 rate/f_c samples; about 2/f_c seconds at each end are affected.
+    The gain is |H(f)|² = 1 / (1 + (f/f_c)^(2 order)): 1/2 at the cut-off f_c, where a single pass has 1/√2. The ends
+    are extended by odd reflection over 3 rate/f_c samples; about 2/f_c seconds at each end are affected.
 
     Args:
-        values: (N, ...) samples of a segment without gaps, no NaN.
-        rate, cutoff: [Hz].
+        values: (N, ...) samples of a segment without gaps or NaN.
+        rate, cutoff: sampling rate and cut-off f_c [Hz].
+        order: order of a single pass.
 
     Raises:
-        MeasurementError: for a cut-off at or above the Nyquist frequency, or not above zero.
+        MeasurementError: a cut-off at or above the Nyquist frequency, or not above zero.
     """
     if not 0 < cutoff < rate / 2:
         message = f"a cut-off of {cutoff:g} Hz is not between 0 and the Nyquist frequency {rate / 2:g} Hz: lower it"
@@ -224,16 +269,27 @@ def low_pass(values: np.ndarray, rate: float, cutoff: float, order: int = ORDER)
 
 
 def border(rate: float, cutoff: float) -> int:
-    """Return the number of samples at each end affected by `low_pass`: 2 rate/f_c, our choice (0.8 % remain)."""
+    """Return the number of samples at each end that `low_pass` affects: 2 rate/f_c, our choice (0.8 % remain).
+
+    Args:
+        rate: sampling rate [Hz].
+        cutoff: cut-off f_c of the filter [Hz].
+    """
     return int(np.ceil(2 * rate / cutoff))
 
 
 def slope(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
     """Return the time derivative of `values` (N, ...) by central differences; NaN in the `width` rows at each end.
 
-    ẋ_k = rate Σ_i c_i (x_{k+i} - x_{k-i}). At ω and the period Δ the classic two-point form (width 1) falls short by
-    (ωΔ)²/6: 6.6 % at a tenth of the sampling rate; width 4 by (ωΔ)⁸/630: 0.004 % (our default: log rates are low, and
-    noise is removed by the low-pass filter).
+    ẋ_k = rate Σ_i c_i (x_{k+i} - x_{k-i}). At the angular frequency ω and the sampling period Δ, the classic two-point
+    form (width 1) is too small by the relative error (ωΔ)²/6, which is 6.6 % at a tenth of the sampling rate. Width 4
+    is too small by (ωΔ)⁸/630, which is 0.004 % there. It is our default, since log rates are low, and the low-pass
+    filter removes noise.
+
+    Args:
+        values: (N, ...) samples of a segment without gaps.
+        rate: sampling rate [Hz].
+        width: number of samples on each side that the differences use.
     """
     return _differences(values, SLOPE[width], rate, -1.0)
 
@@ -241,7 +297,13 @@ def slope(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
 def curvature(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
     """Return the second time derivative of `values` (N, ...) by central differences; NaN at the ends as in `slope`.
 
-    ẍ_k = rate² Σ_i d_i (x_{k+i} - 2 x_k + x_{k-i}); relative error (ωΔ)²/12 for width 1.
+    ẍ_k = rate² Σ_i d_i (x_{k+i} - 2 x_k + x_{k-i}). At the angular frequency ω and the sampling period Δ, the relative
+    error of width 1 is (ωΔ)²/12.
+
+    Args:
+        values: (N, ...) samples of a segment without gaps.
+        rate: sampling rate [Hz].
+        width: number of samples on each side that the differences use.
     """
     return _differences(values, CURVATURE[width], rate**2, 1.0)
 

@@ -1,12 +1,13 @@
-"""Steps of an even clock at which samples were taken (a lattice with holes), from jittering stamps with lost samples.
+"""Sample numbers on an even clock (a lattice with holes), from jittering time stamps with lost samples.
 
-    t_i = T (k_i + d_i) + jitter_i,    k_i whole numbers that rise by 1 or more, d_i a slow drift in steps
+    t_i = T (k_i + d_i) + jitter_i,    k_i whole numbers that increase by 1 or more, d_i a slow drift in steps
 
-Steps between two stamps do not determine k: both stamps jitter, and a wrong step falsifies all later samples. The phase
-does: exp(2πi t / T) has the same direction for all k. The direction of its mean over a few samples gives the drift, and
-the length of the mean the jitter (1 without, exp(-2 π² σ² / T²) for one of σ; 0 where stamps are no lattice at all).
-Estimation of a period from sparse, noisy times: Fogel and Gavish (1988), Sidiropoulos, Swami and Sadler (2005), who
-take the largest periodogram as here; following a drift is our addition.
+The difference of two stamps does not determine their step in k reliably: both stamps jitter, and one wrong step makes
+all later k wrong. The phase exp(2πi t / T) is more reliable, since it is equal for all k. The direction of its mean
+over some samples gives the drift, and the length of the mean gives the jitter: 1 without jitter, exp(-2 π² σ² / T²) for
+a jitter of standard deviation σ, and 0 for stamps that are on no lattice. Estimation of a period from sparse, noisy
+times: Fogel and Gavish (1988); Sidiropoulos, Swami and Sadler (2005), who maximise the periodogram, as is done here. To
+follow a drift is our addition.
 """
 
 from dataclasses import dataclass
@@ -26,12 +27,12 @@ MAX_TRIED = 20_000  # samples on which they are tried
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Steps of an even clock.
+    """Sample numbers on an even clock.
 
     Attributes:
-        steps: (N,) whole numbers k, rising.
-        period: T [s].
-        concentration: concentration of the phases about their drift, from 0 (none) to 1 (no jitter).
+        steps: (N,) whole numbers k, increasing.
+        period: period T of the clock [s].
+        concentration: length of the phases' mean about their drift, from 0 (random phases) to 1 (no jitter).
     """
 
     steps: np.ndarray
@@ -40,11 +41,14 @@ class Lattice:
 
 
 def find_lattice(t: np.ndarray, drift_samples: int, rounds: int = 3) -> Lattice | None:
-    """Return the lattice of rising stamps t (N,) [s]; None where they jitter by more than about a quarter of a step.
+    """Return the even clock behind increasing time stamps t (N,) [s].
+
+    None if the stamps jitter by more than about a quarter of the period.
 
     Args:
-        drift_samples: samples over which a drift of the stamps is followed.
-        rounds: number of rounds, each rounding the stamps to steps and fitting the period to the steps.
+        t: the time stamps.
+        drift_samples: number of samples over which the phase is averaged to follow a drift of the stamps.
+        rounds: number of iterations; each rounds the stamps to steps and fits the period to the steps.
     """
     period = _likeliest_period(t)
     steps, concentration = np.arange(len(t)), 0.0
@@ -57,7 +61,7 @@ def find_lattice(t: np.ndarray, drift_samples: int, rounds: int = 3) -> Lattice 
 
 
 def _likeliest_period(t: np.ndarray) -> float:
-    """Return the period near the median step for which short runs of stamps agree best on their phase [s]."""
+    """Return the period near the median step [s] for which the phases within short runs of stamps agree best."""
     median = float(np.median(np.diff(t)))
     compared = t[: max(len(t[:MAX_TRIED]) // VOTES, 1) * VOTES]
     runs = compared.reshape(-1, min(VOTES, len(compared)))
@@ -67,7 +71,15 @@ def _likeliest_period(t: np.ndarray) -> float:
 
 
 def _rounded(t: np.ndarray, period: float, drift_samples: int) -> tuple[np.ndarray, float]:
-    """Return the steps (N,) nearest to the stamps, their drift allowed for, and the concentration of their phases."""
+    """Return the step number (N,) nearest to each time stamp after removing drift.
+
+    The second value is the concentration of the phases, from 0 (random) to 1 (no jitter).
+
+    Args:
+        t: (N,) time stamps [s].
+        period: period of the clock [s].
+        drift_samples: number of samples over which the phase is averaged to follow a drift of the stamps.
+    """
     stops = np.flatnonzero(np.diff(t) > LONG_STOP * period) + 1
     steps, votes = np.zeros(len(t), dtype=int), 0.0
     for start, end in pairwise([0, *stops.tolist(), len(t)]):
@@ -89,5 +101,5 @@ def _rounded(t: np.ndarray, period: float, drift_samples: int) -> tuple[np.ndarr
 
 
 def _directions(t: np.ndarray, period: float) -> np.ndarray:
-    """Return the phases of stamps [s] as complex numbers of length 1."""
+    """Return the phases exp(2πi t / T) of time stamps t [s] for the period T = `period` [s]."""
     return np.exp(2j * np.pi * (t / period))

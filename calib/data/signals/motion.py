@@ -1,8 +1,8 @@
-"""Motion for identification from a raw recording: filtered positions, derivatives and torques on one even grid.
+"""Motion for identification from a raw recording: filtered positions, derivatives and torques on an even time grid.
 
-`Motion` is the only type with accelerations, so that an unfiltered log cannot reach a regressor. Its torques are as
-recorded (on the even grid): the parallel decimation filters them, and every column of W in the same way
-(`calib.data.signals.filtering`).
+`Motion` is the only type with accelerations, so that an unfiltered log cannot be used in a regressor. Its torques are
+unfiltered, interpolated on the grid. The parallel decimation later filters the torques and every column of the
+regressor W by one filter (`calib.data.signals.filtering`).
 """
 
 from collections.abc import Callable, Sequence
@@ -53,6 +53,7 @@ ROWS = (
     "q_link",
     "q_ref",
     "tau_ff",
+    "q_measured",
     "v_measured",
 )
 
@@ -90,30 +91,31 @@ class FilterOptions:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Filtered motion: N samples on an even grid, in segments without gaps.
+    """Filtered motion: N samples on an even time grid, in segments without gaps.
 
-    Coulomb friction puts a corner into the velocity at a change of sign: the acceleration falls by 2 Fc / M. A filter
-    rounds the corner off and delays the zero, so that friction's column lags behind, and the motor inertia Ia is
-    estimated too large (by 2 % at f_q = 10 Hz on a simulated LWR4+). Velocities tolerate more noise than accelerations,
-    and so have a separate cut-off.
+    At a change of sign of the velocity, Coulomb friction makes the acceleration fall by 2 Fc / M, which is a corner in
+    the course of the velocity. A filter rounds this corner and delays the velocity's zero. The friction's column in the
+    regressor is then late, and the motor inertia Ia is estimated too large (by 2 % at f_q = 10 Hz on a simulated
+    LWR4+). Velocities tolerate more noise than accelerations, and therefore have a separate, higher cut-off.
 
     Attributes:
-        t: (N,) [s]; within a segment in steps of 1/rate.
-        q, v, a: (N, n) filtered position [rad or m] and its central differences [/s], [/s²].
-        effort: (N, n) torque [N·m or N] or current [A] (`kind`), not filtered; interpolated where a sample is
-            missing (weight 0).
-        weight: (N,) 1 at a sample, 0 at one that was lost and interpolated.
-        segment: (N,) number of the segment, rising.
-        rate: [Hz].
-        band: f_p, the identification band [Hz].
-        cutoff: (n,) f_q [Hz].
-        velocity_cutoff: (n,) f_v [Hz], cut-off of the positions from which v is computed.
+        t: (N,) times [s], in steps of 1/rate within a segment.
+        q, v, a: (N, n) filtered position [rad or m], and velocity [/s] and acceleration [/s²] by central differences.
+        effort: (N, n) torque [N·m or N] or current [A] (`kind`), not filtered; interpolated where a sample is missing
+            (weight 0).
+        weight: (N,) 1 at a sample, 0 at a lost one that was interpolated.
+        segment: (N,) number of each sample's segment, increasing.
+        rate: sampling rate [Hz].
+        band: cut-off f_p of the parallel decimation, the identification band [Hz].
+        cutoff: (n,) cut-off f_q of the positions [Hz].
+        velocity_cutoff: (n,) cut-off f_v of the positions from which v is computed [Hz].
         decimator: the filter of the parallel decimation to `band`.
-        joint_names, kind, file, drive_gain, effort_variance: those of the recording. tau_link, tau_motor, q_link,
-            q_ref, tau_ff, v_measured: (N, n) further series of the recording on the grid, not filtered; None where not
-            recorded.
-        sampling, cutoffs: reports of resampling and of the cut-offs; notes: remarks for the user; jumps, faults: those
-            of the recording.
+        joint_names, kind, file, drive_gain, effort_variance: those of the recording.
+        tau_link, tau_motor, q_link, q_ref, tau_ff, q_measured, v_measured: (N, n) further series of the recording on
+            the grid, not filtered; None if not recorded.
+        sampling, cutoffs: reports of resampling and of the choice of cut-offs.
+        notes: remarks for the user.
+        jumps, faults: those of the recording.
         located: time at which a designed motion, used as the reference, begins [s]; None for another reference.
     """
 
@@ -140,6 +142,7 @@ class Motion:
     q_link: np.ndarray | None = None
     q_ref: np.ndarray | None = None
     tau_ff: np.ndarray | None = None
+    q_measured: np.ndarray | None = None
     v_measured: np.ndarray | None = None
     drive_gain: np.ndarray | None = None
     effort_variance: np.ndarray | None = None
@@ -152,11 +155,11 @@ class Motion:
 
     @property
     def n(self) -> int:
-        """The number of joints."""
+        """Number of joints."""
         return self.q.shape[1]
 
     def part(self, rows: slice) -> "Motion":
-        """Return the motion of a slice of its samples."""
+        """Return the motion with only the samples in the slice `rows`."""
         series: dict[str, object] = {}
         for name in ROWS:
             values = getattr(self, name)
@@ -165,21 +168,29 @@ class Motion:
         return replace(self, **series)
 
     def in_band(self, values: np.ndarray) -> np.ndarray:
-        """Return `values` (N, ...) low-passed to the identification band, at the full rate, segment by segment."""
+        """Return `values` (N, ...) low-pass filtered to the identification band, segment by segment, not decimated."""
         cutoff = min(self.band, USABLE * self.rate / 2)
         parts = [filtering.low_pass(values[rows], self.rate, cutoff) for rows in filtering.segments(self.segment)]
         return np.concatenate(parts)
 
     def standstill(self, slow: float | Sequence[float] = STANDSTILL_SHARE) -> np.ndarray:
-        """Return the mask (N,) of samples with all joints at rest, where friction is unknown up to Coulomb's value."""
+        """Return the samples at which all joints are at rest, (N,) bool.
+
+        At rest, friction is unknown up to Coulomb's value.
+
+        Args:
+            slow: speed below which a joint counts as at rest: a share of its peak speed, or (n,) [rad/s or m/s].
+        """
         return np.asarray(~moving(self, slow).any(axis=1))
 
     def velocity_noise(self, cutoff: float | None = None) -> np.ndarray:
-        """Return the standard deviation (n,) of filtered velocities due to white position noise [rad/s or m/s].
+        """Return the standard deviation (n,) of the filtered velocities due to white position noise [rad/s or m/s].
 
-        With `cutoff` [Hz], the noise of velocities from positions filtered at this lower cut-off.
+        σ_v² = σ_q² (2/f_s) ∫ (2πf)² |H(f)|⁴ df, with |H|² the gain of both passes; this is about σ_q² (2/f_s) (2π)²
+        f³/3 for the cut-off f.
 
-        σ_v² = σ_q² (2/f_s) ∫ (2πf)² |H(f)|⁴ df with |H|² of the two passes, about σ_q² (2/f_s) (2π)² f_q³/3.
+        Args:
+            cutoff: cut-off of the positions from which velocities are computed [Hz]; None: that of this motion.
         """
         velocity_cutoff = self.velocity_cutoff if cutoff is None else cutoff
         return self.cutoffs.noise * 2 * np.pi * np.sqrt(2 * velocity_cutoff**3 / (3 * self.rate))
@@ -191,16 +202,18 @@ def make_motion(
     sampled: Resampled | None = None,
     cutoffs: Cutoffs | None = None,
 ) -> Motion:
-    """Return the motion of a recording: resampled to an even grid, low-passed without phase shift, differentiated.
+    """Return the motion of a recording: resampled to an even grid, filtered without phase shift, differentiated.
 
     Args:
+        recording: the recording.
+        options: options of filtering; None: the defaults.
         sampled: the resampled recording, if already computed with the same clock and gap; None to compute it.
         cutoffs: cut-offs proposed for `sampled`, if already computed with the same f_dyn; None to compute them.
 
     Raises:
-        MeasurementError: for a cut-off at or above the Nyquist frequency; for segments shorter than the filters'
-            borders.
-        UsageError: if the number of cut-offs differs from the number of joints.
+        MeasurementError: a cut-off at or above the Nyquist frequency, or segments shorter than the ends that the
+            filters affect.
+        UsageError: the number of cut-offs differs from the number of joints.
     """
     options = options or FilterOptions()
     if sampled is None:
@@ -237,8 +250,8 @@ def make_motion(
     rows = _span(mask)
     series: FieldValues = {}
     for name, values in sampled.series.items():
-        if name != "q":
-            series["v_measured" if name == "v" else name] = read_only(values[rows])
+        field = f"{name}_measured" if name in ("q", "v") else name
+        series[field] = read_only(values[rows])
     return Motion(
         t=read_only(sampled.t[rows]),
         q=read_only(q[rows]),
@@ -271,12 +284,18 @@ def _check_cutoffs(cutoffs: np.ndarray, rate: float, file: str) -> None:
 
 
 def with_reference(motion: Motion, path: Path, joints: Joints, options: RecordingOptions) -> Motion:
-    """Return the motion with the reference positions of the file at `path`, interpolated at its samples.
+    """Return the motion with the reference positions from the file at `path`, interpolated at the motion's samples.
 
-    Both files count time from their first sample.
+    In both files, time counts from the first sample.
+
+    Args:
+        motion: the motion.
+        path: the reference file.
+        joints: the robot's joints.
+        options: options for reading the file.
 
     Raises:
-        MeasurementError: if the file is not a reference, has other joints, or does not span the motion.
+        MeasurementError: the file is not a reference, has other joints, or does not cover the time of the motion.
     """
     with refused_as(MeasurementError, OSError, "cannot be read: {}", path):
         check_regular(path)
@@ -287,7 +306,9 @@ def with_reference(motion: Motion, path: Path, joints: Joints, options: Recordin
     else:
         t, q = read_positions(path, joints, options)
     if q.shape[1:] != (motion.n,):
-        refuse_data(path, f"has {q.shape[1]} joints, the recording has {motion.n}")
+        refuse_data(
+            path, f"has {q.shape[1]} joints, the recording has {motion.n}: is it the reference of this recording?"
+        )
     if len(t) < MIN_REFERENCE_SAMPLES or not np.isfinite(q).all() or not (np.diff(t) > 0.0).all():
         refuse_data(path, "a reference needs ten samples or more, finite numbers and increasing stamps")
     slack = 1.5 * float(np.median(np.diff(t)))
@@ -302,7 +323,13 @@ def with_reference(motion: Motion, path: Path, joints: Joints, options: Recordin
 
 
 def moving(motion: Motion, slow: float | Sequence[float] = STANDSTILL_SHARE) -> np.ndarray:
-    """Return the mask (N, n) of moving joints: |v_j| ≥ `slow`, a share of the peak, or (n,) [rad/s or m/s]."""
+    """Return at which samples each joint moves, (N, n) bool: where |v_j| ≥ `slow`.
+
+    Args:
+        motion: the motion.
+        slow: threshold: a share of each joint's peak speed, or (n,) [rad/s or m/s]. The threshold is at least three
+            standard deviations of the velocity noise.
+    """
     peak = np.abs(motion.v).max(axis=0)
     threshold = slow * peak if isinstance(slow, (int, float)) else np.asarray(slow, dtype=float)
     noise = 3 * motion.velocity_noise()
@@ -310,7 +337,16 @@ def moving(motion: Motion, slow: float | Sequence[float] = STANDSTILL_SHARE) -> 
 
 
 def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: float) -> np.ndarray:
-    """Return f_v (n,) [Hz], at which noise reaches `MAX_NOISE` of the accelerations (N, n); between f_q and 5 f_q."""
+    """Return the velocities' cut-off f_v (n,) [Hz], at which noise reaches the share `MAX_NOISE` of the accelerations.
+
+    f_v is limited to the range from f_q to 5 f_q.
+
+    Args:
+        cutoffs: proposed cut-offs, with the position noise.
+        cutoff: (n,) cut-off f_q of the positions [Hz].
+        a: (N, n) accelerations [rad/s² or m/s²].
+        rate: sampling rate [Hz].
+    """
     rms = np.sqrt(np.mean(a**2, axis=0))
     noise_share = cutoffs.acceleration_noise(cutoff, rate) / np.maximum(rms, 1e-12)
     # The noise grows with f_q^2.5.
@@ -320,7 +356,13 @@ def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: 
 
 
 def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
-    """Return the positions (N, n) low-passed at each joint's cut-off (n,) [Hz], segment by segment."""
+    """Return the positions (N, n) low-pass filtered at each joint's cut-off (n,) [Hz], segment by segment.
+
+    Args:
+        sampled: the resampled recording.
+        cutoff: (n,) cut-offs f_q [Hz].
+        order: order of the Butterworth filter in one pass.
+    """
     # By joints, as all that follows reads them.
     result = np.array(sampled.series["q"], order="F")
     for rows in filtering.segments(sampled.segment):
@@ -332,13 +374,30 @@ def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
 def _differences(
     derivative: Callable[[np.ndarray, float, int], np.ndarray], q: np.ndarray, sampled: Resampled, width: int
 ) -> np.ndarray:
-    """Return first or second derivatives (N, n) of q (N, n), segment by segment."""
+    """Return the first or second time derivative (N, n) of positions q (N, n), segment by segment.
+
+    Args:
+        derivative: `slope` or `curvature`.
+        q: the positions.
+        sampled: the recording, whose segments and sampling rate are used.
+        width: number of samples on each side that the central differences use.
+    """
     parts = [derivative(q[rows], sampled.rate, width) for rows in filtering.segments(sampled.segment)]
     return np.concatenate(parts)
 
 
 def _unaffected(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file: str) -> np.ndarray:
-    """Return the mask (N,) of samples that the filters' ends do not affect; refuse a motion without such samples."""
+    """Return the samples that the ends of the filters do not affect, (N,) bool.
+
+    Args:
+        sampled: the resampled recording.
+        cutoff: (n,) cut-offs of the positions [Hz].
+        options: options of filtering, with the time to remove at the ends.
+        file: name of the recording, for messages.
+
+    Raises:
+        MeasurementError: there are no such samples.
+    """
     if options.borders is None:
         border = filtering.border(sampled.rate, float(cutoff.min()))
         reason = "the filters' ends"
@@ -359,7 +418,7 @@ def _unaffected(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, 
 
 
 def _span(mask: np.ndarray) -> np.ndarray | slice:
-    """Return a mask (N,), or a slice if its samples are contiguous (slices copy nothing)."""
+    """Return a mask (N,), or the equivalent slice if the selected samples are contiguous (slices avoid copies)."""
     first = int(np.argmax(mask))
     stop = len(mask) - int(np.argmax(mask[::-1]))
     return slice(first, stop) if mask[first:stop].all() else mask
@@ -386,12 +445,17 @@ def _per_joint(cutoff: float | tuple[float, ...], recording: Recording) -> np.nd
 
 
 def _reasons(cutoffs: Cutoffs, options: FilterOptions) -> tuple[str, ...]:
-    """Return sentences on where the cut-offs come from."""
+    """Return sentences that explain how the cut-offs were chosen.
+
+    Args:
+        cutoffs: the proposed cut-offs.
+        options: options of filtering, which may state others.
+    """
     lines = []
     for name, option in (("cutoff", options.cutoff), ("band", options.band)):
         if option is not None:
             frequencies = " ".join(f"{frequency:.4g}" for frequency in np.atleast_1d(option))
-            lines.append(f"{name} = {frequencies} Hz, stated, or that of the training motion")
+            lines.append(f"{name} = {frequencies} Hz, as stated or as for the training motion")
     # Both are stated: none was chosen from the data.
     if len(lines) == 2:
         return tuple(lines)

@@ -1,4 +1,4 @@
-"""Persistency of excitation of a motion, without a model: single sines, coupled joints, repeats of a motion."""
+"""Excitation of the robot by a motion, judged without a model: single sines, coupled joints, repeats of a motion."""
 
 from dataclasses import dataclass
 from itertools import combinations
@@ -31,11 +31,11 @@ MAX_DISTANCE = 0.05
 
 @dataclass(frozen=True)
 class ExcitationReport:
-    """How richly a motion excites the robot.
+    """How well a motion excites the robot.
 
     Attributes:
-        functions: number of independent functions of time in all positions (2 for one sine).
-        poor: whether the motion is one frequency, or fewer functions of time than half the joints that move.
+        functions: number of linearly independent functions of time in all positions (2 for one sine).
+        poor: whether the motion has one frequency, or fewer functions of time than half the moving joints.
         seconds: duration with at least one moving joint [s].
         notes: remarks for the user.
     """
@@ -47,9 +47,9 @@ class ExcitationReport:
 
 
 def report_excitation(motion: Motion) -> ExcitationReport:
-    """Return how richly a motion excites the robot, from the positions of its longest segment.
+    """Return how well a motion excites the robot, from the positions of the motion's longest segment.
 
-    One frequency cannot separate inertia from gravity and stiffness: with q = A sin ωt, q̈ = -ω² (q - q̄).
+    A single frequency cannot separate inertia from gravity and stiffness: with q = q̄ + A sin ωt, q̈ = -ω² (q - q̄).
     """
     rows = longest(motion.segment)
     step = 1
@@ -71,7 +71,10 @@ def report_excitation(motion: Motion) -> ExcitationReport:
     if len(moving) and one_frequency:
         low, high = frequency.min(), frequency.max()
         hertz = f"{low:.3g} Hz" if high - low < FREQUENCY_SPREAD * high else f"{low:.3g} to {high:.3g} Hz"
-        notes.append(f"each joint moves at one frequency ({hertz}): inertia, gravity and stiffness are inseparable")
+        notes.append(
+            f"each joint moves at one frequency ({hertz}): inertia, gravity and stiffness are not identifiable "
+            "separately"
+        )
     correlation = normalised.T @ normalised
     pairs = []
     for i, j in combinations(moving, 2):
@@ -89,10 +92,15 @@ def report_excitation(motion: Motion) -> ExcitationReport:
 def repeats(training: Motion, test: Motion) -> float:
     """Return the share (0 to 1) of a test motion's moving samples whose state also occurs in the training motion.
 
-    A state is (q, v); it occurs in the training motion if the nearest state there differs by less than 5 % of that
-    motion's spread, rms over the coordinates. A repeat is recognised in spite of a shift in time, another number of
-    laps or another order of parts; the same path at another speed is no repeat. A repeat is no independent test: the
-    fit has already absorbed the model's errors along that path (our choice: refuse from a half on).
+    A state is (q, v). It occurs in the training motion if the nearest state there differs by less than 5 % of that
+    motion's standard deviation, rms over the coordinates. A repeat is recognised in spite of a shift in time, another
+    number of cycles or another order of parts. The same path at another speed is no repeat. A repeat is no independent
+    test, since the fit has already absorbed the model's errors along that path. Our choice is to refuse a test motion
+    with a share of a half or more.
+
+    Args:
+        training: the motion that was fitted.
+        test: the motion for validation.
     """
     moves = np.ptp(training.q, axis=0) > MIN_TRAVEL
     if not moves.any() or training.n != test.n:
@@ -111,14 +119,24 @@ def repeats(training: Motion, test: Motion) -> float:
 
 
 def _moving_states(motion: Motion, max_states: int) -> np.ndarray:
-    """Return the states (q, v) of moving samples, thinned to about `max_states` (M, 2 n)."""
+    """Return the states (q, v) of moving samples, thinned to about `max_states` rows: (M, 2 n).
+
+    Args:
+        motion: the motion.
+        max_states: approximate number M of states.
+    """
     rows = np.flatnonzero(~motion.standstill())
     rows = rows[:: max(1, len(rows) // max_states)]
     return np.hstack([motion.q[rows], motion.v[rows]])
 
 
 def _best_sine(q: np.ndarray, rate: float) -> tuple[float, float]:
-    """Return the share of the variance of a series (N,) explained by its best sine, and the frequency [Hz]."""
+    """Return the largest share of the variance of a series (N,) that one sine explains, and its frequency [Hz].
+
+    Args:
+        q: (N,) positions of one joint [rad or m].
+        rate: sampling rate [Hz].
+    """
     window = np.hanning(len(q) + 1)[:-1]
     size = int(next_fast_len(4 * len(q), real=True) or 0)
     power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), size)) ** 2
@@ -129,7 +147,13 @@ def _best_sine(q: np.ndarray, rate: float) -> tuple[float, float]:
 
 
 def _one_sine(q: np.ndarray, f: float, rate: float) -> float:
-    """Return the share of the variance of `q` (N,) explained by one sine of frequency `f` [Hz] and a constant."""
+    """Return the share of the variance of `q` (N,) that a constant and one sine of frequency `f` [Hz] explain.
+
+    Args:
+        q: (N,) positions of one joint [rad or m].
+        f: frequency of the sine [Hz].
+        rate: sampling rate [Hz].
+    """
     step = max(1, int(rate / (20 * f)), len(q) // MAX_STATES)
     y = q[::step] - q[::step].mean()
     angle = 2 * np.pi * f * np.arange(0, len(q), step) / rate

@@ -1,22 +1,23 @@
-"""Recordings resampled to an even grid: samples are dated, short gaps bridged, long gaps kept, all of it reported.
+"""Recordings resampled to an even time grid: samples are dated, short gaps interpolated, long gaps kept and reported.
 
-Stamps do not always state when a sample was taken.
+Time stamps do not always state when a sample was taken. A controller samples evenly, but a program that logs the
+samples is scheduled unevenly: it misses some samples and reads some twice. If the logger made the time stamps, an error
+δt of a stamp shifts the sample's position by v·δt, which two derivatives turn into false accelerations. A joint that
+looks noisy may only be badly dated. Three clocks are tried, and the one with the smoothest positions is used:
 
-A controller samples evenly; a program that logs it wakes up unevenly, misses samples and reads some twice. Stamps put
-on by the logger then move every sample by v·δt, which two derivatives make into false accelerations, and a joint that
-seems noisy is only badly dated. Three clocks are tried; the one with the smoothest positions is used:
+``stamps``  the time stamps as recorded; ``even``    a constant period with a slow drift. Lost samples are found from a
+lattice with holes
+            (`calib.data.signals.lattice`); for stamps with more jitter, from the whole periods by which stamps
+            stay late;
+``counted`` the number of periods between two samples from the motion, Δk = Δq·v̄ / (T |v̄|²), if these are whole
+            numbers (v̄ is the mean of the two measured velocities); zero means a sample read twice, which is
+            removed.
 
-``stamps``  the stamps as recorded;
-``even``    one step, samples lost where a stamp is late by whole steps, a slow drift followed: a lattice with holes
-            (`calib.data.signals.lattice`), or, of stamps that jitter by more, whole steps by which they stay late;
-``counted`` the number of steps between two samples from the motion itself, Δk = Δq·v̄ / (T |v̄|²), where that is whole
-            numbers (v̄ the mean of the two measured velocities); zero is a sample read twice, which is left out.
-
-The measure is the rms of the fourth differences of q on the even grid. The length of counted steps follows from the
-measured velocities, unless the stamps differ by more than `APART`: then stamps or velocities have a wrong scale, the
-stamps' rate is kept, and a later check reports velocities that are not the slopes of the positions. All of this is our
-choice. Seen in real logs: the Panda's is counted (6 % read twice, 7 % missed), the LWR4+'s and TIAGo's are even, the
-UR10e's stamps are true.
+Smoothness is measured by the rms fourth difference of q on the even grid. The period of the counted clock follows from
+the measured velocities. If it differs from that of the stamps by more than `APART`, either stamps or velocities have a
+wrong scale: then the stamps' rate is used, and a later check reports velocities that are not the slopes of the
+positions. All of this is our choice. In real logs, the Panda's samples have to be counted (6 % read twice, 7 % missed),
+those of the LWR4+ and TIAGo are even, and the UR10e's stamps are correct.
 """
 
 from dataclasses import dataclass
@@ -66,11 +67,12 @@ class SampleClock:
 
     Attributes:
         kind: one of `CLOCKS`.
-        t: (N,) times [s]; those of kept samples rise strictly.
-        keep: (N,) mask; False where a sample was read a second time.
-        period: length of one step [s].
-        times: step from the measured velocities divided by the step from the stamps; NaN where steps are not counted.
-        roughness: clock → rms of the fourth differences of q under it, relative to that under the stamps.
+        t: (N,) times [s], strictly increasing over the kept samples.
+        keep: (N,) False for a sample that was read a second time.
+        period: sampling period [s].
+        times: period from the measured velocities divided by the period from the stamps; NaN for a clock that is not
+            counted.
+        roughness: name of each clock to the rms fourth difference of q, relative to that with the clock ``stamps``.
     """
 
     kind: str
@@ -82,10 +84,14 @@ class SampleClock:
 
 
 def find_clock(recording: Recording, kind: str = "auto") -> SampleClock:
-    """Return the clock `kind`; with ``auto`` the clock with the smoothest positions.
+    """Return the clock `kind` of a recording; for ``auto``, the clock with the smoothest positions.
+
+    Args:
+        recording: the recording.
+        kind: one of `CLOCKS`, or ``auto``.
 
     Raises:
-        UsageError: for an unknown clock, or a clock that this recording does not allow.
+        UsageError: an unknown clock, or a clock that is not possible for this recording.
     """
     require(kind in ("auto", *CLOCKS), f"clock: expected one of auto, {', '.join(CLOCKS)}, found '{kind}'", UsageError)
     fresh = ~_read_twice(recording)
@@ -102,7 +108,9 @@ def find_clock(recording: Recording, kind: str = "auto") -> SampleClock:
         dates, keep, period, step_ratio = counted
         clocks["counted"] = (dates, keep, period)
     if kind != "auto" and kind not in clocks:
-        raise UsageError(f"clock '{kind}': cannot date the samples of {recording.file or 'this recording'}")
+        raise UsageError(
+            f"clock '{kind}': cannot date the samples of {recording.file or 'this recording'}; use clock = 'auto'"
+        )
     roughness = {name: _roughness(recording.q, *clock) for name, clock in clocks.items()}
     roughness_of_stamps = max(roughness["stamps"], 1e-300)
     relative = {name: value / roughness_of_stamps for name, value in roughness.items()}
@@ -114,10 +122,13 @@ def find_clock(recording: Recording, kind: str = "auto") -> SampleClock:
 
 
 def _read_twice(recording: Recording) -> np.ndarray:
-    """Return the mask (N,) of rows that repeat the row before, in positions and torques, while the robot moves.
+    """Return the rows that repeat the row before, in positions and torques, while the robot moves: (N,) bool.
 
-    Such a row is the last sample read again because the next sample was late. Rows of a robot at rest may be equal,
-    too: only short runs between rows of different positions are marked.
+    Such a row is the last sample read again because the next one was late. Rows of a robot at rest may be equal, too.
+    Therefore only short runs of equal rows between rows of different positions are marked.
+
+    Args:
+        recording: the recording of N samples.
     """
     q_changes = np.asarray(np.diff(recording.q, axis=0).any(axis=1))
     effort_changes = np.asarray(np.diff(recording.effort, axis=0).any(axis=1))
@@ -132,7 +143,13 @@ def _read_twice(recording: Recording) -> np.ndarray:
 
 
 def _even_times(t: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Return even times k T + drift (N,), k counting lost samples, and T [s]; None if uneven."""
+    """Return times k T + drift (N,) [s], where k counts lost samples too, and the period T [s].
+
+    None if the samples are not even.
+
+    Args:
+        t: (N,) time stamps [s].
+    """
     lattice = find_lattice(t, DRIFT_SAMPLES)
     if lattice is not None:
         k = lattice.steps
@@ -149,16 +166,20 @@ def _even_times(t: np.ndarray) -> tuple[np.ndarray, float] | None:
 
 
 def _counted_times(recording: Recording, keep_velocities: bool) -> tuple[np.ndarray, np.ndarray, float, float] | None:
-    """Return times from counted steps; None if steps are not whole numbers.
+    """Return times from counted periods; None if the counts are not whole numbers.
 
-    Where the robot is too slow for counting, a repeated row counts 0 and any other row 1; a wrong count matters little
-    there, since an error of time acts through the speed. Stops of the log longer than 20 steps are dated by the stamps.
+    Where the robot is too slow for counting, a repeated row counts 0 and any other row 1. A wrong count matters little
+    there, since an error of time acts through the speed. Pauses of the log longer than 20 periods are dated by the
+    stamps.
 
     Args:
-        keep_velocities: whether steps are as long as the velocities say, regardless of the stamps.
+        recording: the recording.
+        keep_velocities: whether the period follows from the velocities, whatever the stamps.
 
     Returns:
-        Times (N,) [s], mask (N,) of samples not read twice, step [s], and step by velocities divided by step by stamps.
+        Times (N,) [s], mask (N,) of samples not read twice, period [s], and this period by velocities divided by the
+            period
+        by stamps.
     """
     if recording.v is None:
         return None
@@ -197,7 +218,14 @@ def _counted_times(recording: Recording, keep_velocities: bool) -> tuple[np.ndar
 
 
 def _lost(t: np.ndarray, step: float) -> np.ndarray:
-    """Return the number of samples missing in each step (N - 1,): whole steps by which later stamps stay late."""
+    """Return the number of samples lost between successive stamps (N - 1,).
+
+    It is the number of whole periods by which all later stamps are late.
+
+    Args:
+        t: (N,) time stamps [s].
+        step: period of the samples [s].
+    """
     lost = np.zeros(len(t) - 1)
     delay = t - step * np.arange(len(t))
     for i in np.flatnonzero(np.diff(t) > 1.5 * step) + 1:
@@ -208,9 +236,9 @@ def _lost(t: np.ndarray, step: float) -> np.ndarray:
 
 
 def _step(t: np.ndarray) -> float:
-    """Return the step of stamps (N,) [s]: the median of steps, or their mean if they differ only by rounding.
+    """Return the period of time stamps (N,) [s]: the median interval, or the mean if intervals differ only by rounding.
 
-    Rounding errors of a median add up along a grid: a thousandth of a step in half an hour at 1 kHz.
+    Rounding errors of a median add up along a grid: a thousandth of a period in half an hour at 1 kHz.
     """
     step = np.diff(t)
     median = float(np.median(step))
@@ -221,7 +249,14 @@ def _step(t: np.ndarray) -> float:
 
 
 def _roughness(q: np.ndarray, t: np.ndarray, keep: np.ndarray, period: float) -> float:
-    """Return the median over the joints of the rms fourth difference of q on an even grid [rad or m]."""
+    """Return the median over the joints of the rms fourth difference of q on an even grid [rad or m].
+
+    Args:
+        q: (N, n) positions.
+        t: (N,) times of the samples [s].
+        keep: (N,) samples to use.
+        period: period of the grid [s].
+    """
     t, q = t[keep][:MAX_COMPARED], q[keep][:MAX_COMPARED]
     # A gap may be of weeks.
     count = min(2 * len(t), int(np.ceil((t[-1] - t[0]) / period)))
@@ -242,12 +277,13 @@ class SamplingReport:
     """Quality of a recording's time stamps.
 
     Attributes:
-        clock: the clock used.
-        jitter: rms and largest distance of the stamps' steps from whole numbers of periods [s].
-        repeated: samples read twice, left out.
-        lost: samples missing between others, interpolated.
-        gaps: (start, length) [s] of the times without a sample that were too long to bridge, where segments end.
-        dropped: (start, length) [s] of segments too short to use.
+        clock: the clock in use.
+        rate: sampling rate [Hz].
+        jitter: rms and largest deviation of the stamps' intervals from whole numbers of periods [s].
+        repeated: number of samples that were read twice and removed.
+        lost: number of missing samples that were interpolated.
+        gaps: (start, length) [s] of the gaps that were too long to interpolate, at which segments end.
+        dropped: (start, length) [s] of the segments that were too short to use.
     """
 
     clock: SampleClock
@@ -259,13 +295,15 @@ class SamplingReport:
     dropped: tuple[tuple[float, float], ...]
 
     def lines(self) -> list[str]:
-        """Return notes on the sampling for the user, one finding per line."""
+        """Return notes on the sampling for the user, one per line."""
         rms, largest = self.jitter
         lines = [f"{self.rate:.6g} Hz; jitter of the stamps: {rms * 1e3:.3g} ms rms, {largest * 1e3:.3g} ms at most"]
         kind, times = self.clock.kind, self.clock.times
         if kind != "stamps":
             share = self.clock.roughness[kind]
-            lines.append(f"samples are dated by the clock '{kind}': positions are {1 / share:.3g} times smoother")
+            lines.append(
+                f"samples are dated by clock '{kind}': positions are {1 / share:.3g} times smoother than by stamps"
+            )
         if kind == "counted" and abs(times - 1.0) > APART:
             lines.append(f"step from measured velocities / step from stamps: {times:.4g}")
         if self.repeated:
@@ -285,15 +323,15 @@ class SamplingReport:
 
 @dataclass(frozen=True, eq=False)
 class Resampled:
-    """A recording resampled to an even grid.
+    """A recording resampled to an even time grid.
 
     Attributes:
-        t: (N,) times [s]; within a segment in steps of 1/rate.
-        series: name (`calib.data.recordings.recording.SERIES`) → (N, n), in the recording's units.
-        weight: (N,) 1 at a sample, 0 at a bridged one.
-        segment: (N,) number of the segment, rising.
-        rate: [Hz].
-        report: quality of the recording's stamps.
+        t: (N,) times [s], in steps of 1/rate within a segment.
+        series: name of a series (`calib.data.recordings.recording.SERIES`) to values (N, n), in the recording's units.
+        weight: (N,) 1 at a sample, 0 at an interpolated time.
+        segment: (N,) number of each sample's segment, increasing.
+        rate: sampling rate [Hz].
+        report: quality of the recording's time stamps.
     """
 
     t: np.ndarray
@@ -305,15 +343,17 @@ class Resampled:
 
 
 def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: float | None = None) -> Resampled:
-    """Return `recording` on an even grid, interpolated by cubic splines (exact where a sample lies on the grid).
+    """Return a recording on an even time grid, interpolated by cubic splines (exact where a sample is on the grid).
 
     Args:
+        recording: the recording.
         clock: ``auto`` or one of `calib.data.signals.resampling.CLOCKS`.
-        gap: the longest time without a sample that is bridged [s], at least 5 periods.
-        rate: sampling rate of the grid [Hz]; None for the recording's. A lower rate is not protected against aliasing.
+        gap: the longest gap that is interpolated [s]; at least 5 periods are.
+        rate: sampling rate of the grid [Hz]; None for the recording's rate. A lower rate is not protected against
+            aliasing.
 
     Raises:
-        MeasurementError: if no segment is long enough.
+        MeasurementError: no segment is long enough.
     """
     sample_clock = find_clock(recording, clock)
     t = sample_clock.t[sample_clock.keep]
@@ -331,7 +371,7 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
         else:
             dropped.append((float(t[start]), float(duration)))
     if not segments:
-        message = f"has gaps: none of its {len(spans)} parts is longer than {MIN_SAMPLES} samples"
+        message = f"has gaps: none of its {len(spans)} parts is longer than {MIN_SAMPLES} samples; record without gaps"
         refuse_data(recording.file, message)
 
     grids: list[np.ndarray] = []
@@ -368,10 +408,14 @@ def _sampling_report(
     is_gap: np.ndarray,
     dropped: list[tuple[float, float]],
 ) -> SamplingReport:
-    """Return the quality of a recording's stamps.
+    """Return the quality of a recording's time stamps.
 
     Args:
-        t: (N,) times of the kept samples [s]. is_gap: (N - 1,) mask of the steps too long to bridge.
+        recording: the recording.
+        clock: the clock in use.
+        rate: sampling rate of the grid [Hz].
+        t: (N,) times of the kept samples [s].
+        is_gap: (N - 1,) whether each interval is too long to interpolate.
         dropped: (start, length) [s] of segments too short to use.
     """
     step = np.diff(t)
@@ -394,7 +438,16 @@ def _sampling_report(
 def _interpolate(
     values: np.ndarray, t: np.ndarray, segments: list[tuple[int, int]], grids: list[np.ndarray]
 ) -> np.ndarray:
-    """Return `values` (N, n) interpolated on the grids, joint by joint (1 h at 1 kHz: 0.2 GB besides the result)."""
+    """Return `values` (N, n) interpolated on the grids, joint by joint.
+
+    For 1 h at 1 kHz this needs 0.2 GB in addition to the result.
+
+    Args:
+        values: values at the samples.
+        t: (N,) times of the samples [s].
+        segments: first sample, and the one after the last, of each segment.
+        grids: times of the grid for each segment [s].
+    """
     if segments == [(0, len(values))] and _on_grid(t, grids[0]):
         return settled(values)
     result = np.empty((sum(len(grid) for grid in grids), values.shape[1]))
@@ -416,12 +469,23 @@ def _interpolate(
 
 
 def _on_grid(t: np.ndarray, grid: np.ndarray) -> bool:
-    """Return whether the sample times equal the grid."""
+    """Return whether sample times equal the times of a grid up to rounding.
+
+    Args:
+        t: (N,) times of the samples [s].
+        grid: times of the grid [s].
+    """
     return len(t) == len(grid) and bool(np.abs(grid - t).max() < 1e-6 * (grid[1] - grid[0]))
 
 
 def _weight(t: np.ndarray, grid: np.ndarray, period: float) -> np.ndarray:
-    """Return the weight of each grid time: 1 if a sample is within 0.75 periods, else 0."""
+    """Return the weight of each time of a grid: 1 if a sample is within 0.75 periods, else 0.
+
+    Args:
+        t: times of the samples [s].
+        grid: times of the grid [s].
+        period: sampling period [s].
+    """
     after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
     distance = np.minimum(np.abs(grid - t[after - 1]), np.abs(t[after] - grid))
     return (distance < SAMPLE_REACH * period).astype(float)

@@ -2,19 +2,19 @@
 
     r = y - π(P c + p),   ∂π/∂x = ∂π/∂point · (ω × R c + v) + ∂π/∂lens + ∂π/∂point · R ∂c/∂shape
 
-with (R, p) the board in the camera's frame. All corners of an image share the six numbers [v; ω]: a QR of its own
-2K x (6 + k + 1) matrix leaves 6 + k + 1 rows of the least-squares problem, the same problem (Golub & Van Loan 2013,
-sec. 5.3), so that thousands of images take the memory of thousands of poses.
+with (R, p) the board in the camera's frame. All corners of an image share the six numbers [v; ω]. A QR factorisation
+therefore reduces the 2K rows of an image of K corners to 6 + k + 1 rows of the same least-squares problem (Golub & Van
+Loan 2013, sec. 5.3; k: number of lens and board values), so that an image takes no more memory than a measured pose.
 
-Noise of images has two parts: that of each corner alone, and that common to all corners of an image.
+The noise of images has two parts: ε is independent from corner to corner, ξ is common to all corners of an image.
 
     r_i = J_i M_i ξ_i + ε_i,   ε ~ N(0, f² σ²),   ξ ~ N(0, diag(s_v², s_v², s_v², s_ω², s_ω², s_ω²))
 
 ξ is the part of a pose that the arm does not repeat or the model does not explain: a displacement and a rotation of
-what the arm carries, common to all corners of the image (M_i takes them to the board's twist). Without this common
-part, forty-eight corners would count as forty-eight measurements of the arm. Both variances are estimated: f from what
-remains in each image after its own best pose (2K - 6 numbers), s_v and s_ω by moments of those best poses' residuals
-beyond what ε explains (variance components; Rao 1972).
+the device on the arm (camera or board); M_i maps them to the board's twist. Without ξ, forty-eight corners would count
+as forty-eight measurements of the arm. Both parts are estimated: f from the corners' residuals after a free pose is
+fitted to each image (2K - 6 degrees of freedom), s_v and s_ω from the differences between free and predicted poses, by
+the part of their squares that ε does not explain (variance components; Rao 1972).
 """
 
 from __future__ import annotations
@@ -33,20 +33,29 @@ from calib.geometry.installation import Seen
 from calib.geometry.residuals import ResidualPart, parts
 from calib.records import Frozen
 
-# change of a noise that repeats no fit, as a share, and of its [m, rad] (our choice)
-MAX_NOISE_CHANGE, MIN_NOISE = 0.05, 2e-6
-# change of an image's weight that repeats no fit
+# Relative and absolute [m, rad] change of a noise estimate up to which the fit is not repeated (our choice).
+MAX_NOISE_CHANGE = 0.05
+MIN_NOISE = 2e-6
+# Change of an image's weight up to which the fit is not repeated.
 MAX_WEIGHT_CHANGE = 0.05
-# squared residuals beyond so many times their median are taken for it (our choice)
+# Squared residuals above this multiple of their median are clipped to it (our choice).
 MAX_RATIO = 25.0
-# of the search for a variance component
+# Smallest factor f: residuals of simulated images may be exactly zero.
+MIN_FACTOR = 1e-3
+# Smallest share of degrees of freedom: with few images, the fit's parameters would take all of them.
+MIN_SPARE_SHARE = 0.2
+# Number of iterations of the search for a variance component.
 MAX_STEPS = 20
-# displacement [m] and turn [rad] of an image that a fit begins with (our choice)
+# Displacement [m] and rotation [rad] common to an image with which a fit begins (our choice).
 FIRST_NOISE = 1e-4
-# tangent of the angle off the axis beyond which a corner is taken at it
+# Tangent of the largest angle off the optical axis at which a corner is projected.
 STEEPEST = {"pinhole": 2.0, "fisheye": 10.0}
-# images reduced at once
+# Number of images that are reduced together; bounds the memory.
 CHUNK = 500
+
+
+def _no_weights() -> np.ndarray:
+    return np.ones(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +74,7 @@ class ImageNoise(Frozen):
     factor: float = 1.0
     displacement: float = 0.0
     turn: float = 0.0
-    weight: np.ndarray = field(default_factory=lambda: np.ones(0))
+    weight: np.ndarray = field(default_factory=_no_weights)
     shared: np.ndarray | None = None
 
     @property
@@ -79,22 +88,24 @@ class ImageNoise(Frozen):
 
     def near(self, noise: ImageNoise) -> bool:
         """Return whether two noise estimates agree, so that the fit is not repeated."""
-        pairs = ((self.factor, noise.factor), (self.displacement, noise.displacement), (self.turn, noise.turn))
-        for a, b in pairs:
-            if abs(a - b) > MAX_NOISE_CHANGE * max(a, b) + MIN_NOISE:
-                return False
-        weight_change = np.abs(self.weight - noise.weight).max(initial=0.0)
-        return bool(weight_change < MAX_WEIGHT_CHANGE)
+        before = np.array([self.factor, self.displacement, self.turn])
+        after = np.array([noise.factor, noise.displacement, noise.turn])
+        largest = np.maximum(before, after)
+        change = np.abs(before - after)
+        if np.any(change > MAX_NOISE_CHANGE * largest + MIN_NOISE):
+            return False
+        weight_change = np.abs(self.weight - noise.weight)
+        return bool(weight_change.max(initial=0.0) < MAX_WEIGHT_CHANGE)
 
 
 @dataclass(frozen=True, eq=False)
-class OwnPoses:
-    """Results of fitting a free pose to each of k images.
+class FreePoses:
+    """Results of fitting a free pose to each of k images: the pose that the image's corners alone determine.
 
     Attributes:
-        residual: (k, 6) best minus predicted pose of what the arm carries, as [v; ω].
+        residual: (k, 6) free minus predicted pose of the device on the arm (camera or board), as [v; ω] [m, rad].
         information: (k, 6, 6) information matrix (inverse covariance) of `residual`, at the stated sigmas.
-        within: (k,) sum of squared residuals of the image's corners after the free pose, in sigmas.
+        within: (k,) sum of squared residuals of the image's corners at the free pose, in units of their sigmas.
         spare: (k,) degrees of freedom of `within`, 2K - 6 for K corners.
     """
 
@@ -104,39 +115,47 @@ class OwnPoses:
     spare: np.ndarray
 
 
-def estimate_noise(fits: OwnPoses, unknowns: int, loss: str = "none", scale: float | None = None) -> ImageNoise:
+def estimate_noise(fits: FreePoses, unknowns: int, loss: str = "none", scale: float | None = None) -> ImageNoise:
     """Return the noise of the images, estimated from the residuals of a fit.
 
     Args:
         fits: fits of a free pose to each image.
         unknowns: number of parameters fitted to the images.
-        loss, scale: the robust loss and its constant, from which the images' weights follow.
+        loss, scale: name of the robust loss, and its constant (None: the default), for the images' weights.
     """
-    k = len(fits.spare)
-    share = max(1.0 - unknowns / max(6 * k, 1), 0.2)
-    # of the corners alone
+    coordinates = max(6 * len(fits.spare), 1)
+    spare_share = max(1.0 - unknowns / coordinates, MIN_SPARE_SHARE)
+
+    # noise of the corners
     factor = 1.0
     determined = fits.spare > 0
     if determined.any():
-        within, spare = fits.within[determined], fits.spare[determined]
+        within = fits.within[determined]
+        spare = fits.spare[determined]
         variance = within.sum() / spare.sum()
         if loss != "none":
             variance = np.median(within / spare)
         factor = float(np.sqrt(variance))
-    factor = max(factor, 1e-3)
+    factor = max(factor, MIN_FACTOR)
 
-    # of the images
-    covariance = factor**2 * np.linalg.pinv(fits.information, hermitian=True)
+    # noise common to the corners of an image
+    cofactors = np.linalg.pinv(fits.information, hermitian=True)
+    covariance = factor**2 * cofactors
     explained = np.einsum("kii->ki", covariance)
     square = fits.residual**2
-    square = np.minimum(square, MAX_RATIO * np.median(square, axis=0)) / share
+    largest = MAX_RATIO * np.median(square, axis=0)
+    square = np.minimum(square, largest) / spare_share
     displacement = _component(square[:, :3], explained[:, :3])
     turn = _component(square[:, 3:], explained[:, 3:])
-    variances = np.repeat(np.square([displacement, turn]), 3)
-    total = covariance + np.diag(variances)
-    weighted = np.linalg.solve(total, fits.residual[:, :, None])[:, :, 0]
-    size = np.sqrt(np.einsum("ki,ki->k", fits.residual, weighted) / 6)
-    return ImageNoise(factor, displacement, turn, weight=robust.weights(size, loss, scale))
+
+    # weights by the Mahalanobis distance of each image
+    deviations = np.repeat([displacement, turn], 3)
+    total = covariance + np.diag(np.square(deviations))
+    column = fits.residual[:, :, None]
+    weighted = np.linalg.solve(total, column)[:, :, 0]
+    squared_distance = np.einsum("ki,ki->k", fits.residual, weighted)
+    weight = robust.weights(np.sqrt(squared_distance / 6), loss, scale)
+    return ImageNoise(factor, displacement, turn, weight)
 
 
 def _component(square: np.ndarray, explained: np.ndarray) -> float:
@@ -147,10 +166,12 @@ def _component(square: np.ndarray, explained: np.ndarray) -> float:
         explained: c, the known part of each residual's variance.
     """
     excess = square - explained
-    value = max(float(np.mean(excess)), 1e-3 * float(np.median(square)))
+    smallest = 1e-3 * float(np.median(square))
+    value = max(float(np.mean(excess)), smallest)
     for _ in range(MAX_STEPS):
         weight = 1.0 / (value + explained) ** 2
-        value = max(float(np.sum(weight * excess) / np.sum(weight)), 0.0)
+        mean = np.sum(weight * excess) / np.sum(weight)
+        value = max(float(mean), 0.0)
         if value == 0.0:
             break
     return float(np.sqrt(value))
@@ -158,20 +179,21 @@ def _component(square: np.ndarray, explained: np.ndarray) -> float:
 
 @dataclass(frozen=True, eq=False)
 class PixelPart(ResidualPart):
-    """Residuals of corners, ordered by image; ``jacobian`` is the Jacobian of each image's board pose.
+    """Residuals of N corners, ordered by image; their Jacobian is the product of `local` and `jacobian`.
 
     Attributes:
-        value, sigma: (2, N) [px].
+        value, sigma: (2, N) residuals and their standard deviations [px].
         jacobian: (f, 6 + k, m) derivatives, by f parameters, of the board's twist [v; ω] in the camera's axes and of
             the k values of lens and board.
         index: (N,) number of the image of each corner.
-        local: (N, 2, 6 + k) derivative of the corner by the rows of `jacobian` [px per unit].
+        local: (N, 2, 6 + k) derivatives of each corner's pixel by the 6 + k rows of `jacobian` [px per unit].
         corner: (N,) number of each corner in the board's table.
         depth: (N,) pixels per metre at the corner's distance, across the line of sight.
-        axes: (m, 3, 3) displacement of what the arm carries (camera or board), in the station's axes, per displacement
-            of the board in the camera's axes.
-        carried: (m, 6, 6) the board's twist per twist [v; ω] of what the arm carries, both in the camera's axes.
-        noise: noise common to the corners of an image; None if corners have their own noise (`scale`) only.
+        axes: (m, 3, 3) matrices that map a displacement of the board in the camera's axes to the displacement of the
+            device on the arm (camera or board) in the station's axes.
+        carried: (m, 6, 6) matrices that map a twist [v; ω] of the device on the arm to the board's twist, both in the
+            camera's axes.
+        noise: noise common to the corners of an image; None if the corners' noise is independent.
     """
 
     local: np.ndarray
@@ -183,14 +205,16 @@ class PixelPart(ResidualPart):
 
     @property
     def height(self) -> int:
-        return len(np.unique(self.index)) * (self.local.shape[2] + 1)
+        rows_per_image = self.local.shape[2] + 1
+        return len(np.unique(self.index)) * rows_per_image
 
     @property
     def per_length(self) -> np.ndarray | float:
         return self.depth
 
     def sizes(self) -> np.ndarray:
-        square = np.sum((self.value / self.depth) ** 2, axis=0)
+        lengths = self.value / self.depth
+        square = np.sum(lengths**2, axis=0)
         count = np.bincount(self.index)
         sums = np.bincount(self.index, square)
         in_image = count > 0
@@ -201,8 +225,9 @@ class PixelPart(ResidualPart):
         lengths_x, lengths_y = self.value / self.depth
         mean_x = np.bincount(image, lengths_x) / count
         mean_y = np.bincount(image, lengths_y) / count
-        # along the line of sight a mean offset says nothing
-        mean = np.vstack([mean_x, mean_y, np.zeros(len(images))])
+        # a mean offset of the corners does not determine the displacement along the line of sight
+        mean_z = np.zeros(len(images))
+        mean = np.vstack([mean_x, mean_y, mean_z])
         displacement = np.einsum("mij,jm->im", self.axes[images], mean)
         return ResidualPart("position", displacement, self.jacobian[:, :0], None, 0, images)
 
@@ -229,41 +254,57 @@ class PixelPart(ResidualPart):
             rows = slice(edges[start], edges[stop])
             counts = np.diff(edges[start : stop + 1])
             unit = scale.T[rows, :, None]
-            columns = [self.local[rows], self.value.T[rows, :, None]]
-            padded = _padded(np.concatenate(columns, axis=2) / unit, counts)
+            value = self.value.T[rows, :, None]
+            table = np.concatenate([self.local[rows], value], axis=2)
+            padded = _padded(table / unit, counts)
             if shared is not None and self.noise is not None:
-                padded = _whitened(padded, _padded(shared[rows] / unit, counts, padded.shape[1]))
-                padded = padded * np.sqrt(self.noise.weight[chunk])[:, None, None]
+                common = _padded(shared[rows] / unit, counts, padded.shape[1])
+                padded = _whitened(padded, common)
+                root_weight = np.sqrt(self.noise.weight[chunk])
+                padded = padded * root_weight[:, None, None]
             triangle = np.asarray(np.linalg.qr(padded, mode="r"))
             reduced_rows = slice(start * width, stop * width)
             residual[reduced_rows] = triangle[:, :, -1].ravel()
-            by_image = self.jacobian[:, :, chunk].transpose(2, 1, 0)
+            jacobian = self.jacobian[:, :, chunk]
+            by_image = jacobian.transpose(2, 1, 0)
             reduced = triangle[:, :, :-1] @ by_image
-            matrix[:, reduced_rows] = reduced.reshape(-1, len(self.jacobian)).T
+            flat = reduced.reshape(-1, len(self.jacobian))
+            matrix[:, reduced_rows] = flat.T
 
     def _shared_errors(self, noise: ImageNoise) -> np.ndarray:
         by_twist = self.local[:, :, :6]
-        return np.einsum("ncl,nlk->nck", by_twist, self.carried[self.index]) * noise.deviations
+        carried = self.carried[self.index]
+        by_carried = np.einsum("ncl,nlk->nck", by_twist, carried)
+        return by_carried * noise.deviations
 
-    def own_poses(self, scale: np.ndarray) -> OwnPoses:
-        """Return the results of fitting a free pose to each image, for corners with standard deviations `scale` (2, N)
-        [px].
+    def free_poses(self, scale: np.ndarray) -> FreePoses:
+        """Return the results of fitting a free pose to each image.
+
+        Args:
+            scale: (2, N) standard deviations of the corners [px].
         """
         images, first = np.unique(self.index, return_index=True)
-        counts = np.diff(np.append(first, len(self.index)))
-        columns = [self.local[:, :, :6], self.value.T[:, :, None]]
-        table = np.concatenate(columns, axis=2) / scale.T[:, :, None]
-        triangle = np.asarray(np.linalg.qr(_padded(table, counts), mode="r"))
+        edges = np.append(first, len(self.index))
+        counts = np.diff(edges)
+        by_twist = self.local[:, :, :6]
+        value = self.value.T[:, :, None]
+        table = np.concatenate([by_twist, value], axis=2)
+        padded = _padded(table / scale.T[:, :, None], counts)
+        triangle = np.asarray(np.linalg.qr(padded, mode="r"))
+        # columns of the triangle: six of the board's twist, then the residual
+        right = triangle[:, :6, 6]
+        remainder = triangle[:, 6, 6]
         system = triangle[:, :6, :6] @ self.carried[images]
         information = system.transpose(0, 2, 1) @ system
-        gradient = np.einsum("kji,kj->ki", system, triangle[:, :6, 6])
+        gradient = np.einsum("kji,kj->ki", system, right)
         inverse = np.linalg.pinv(information, hermitian=True)
         residual = np.einsum("kij,kj->ki", inverse, gradient)
         spare = np.maximum(2 * counts - 6, 0)
-        return OwnPoses(residual, information, triangle[:, 6, 6] ** 2, spare)
+        return FreePoses(residual, information, remainder**2, spare)
 
     def common_noise(self, sigma: np.ndarray, unknowns: int, loss: str, scale: float | None, start: bool) -> ImageNoise:
-        noise = estimate_noise(self.own_poses(sigma), unknowns, loss, scale)
+        fits = self.free_poses(sigma)
+        noise = estimate_noise(fits, unknowns, loss, scale)
         if start:
             noise = replace(noise, displacement=FIRST_NOISE, turn=FIRST_NOISE)
         weight = np.ones(self.jacobian.shape[2])
@@ -273,24 +314,26 @@ class PixelPart(ResidualPart):
     def alone(self, sigma: np.ndarray) -> np.ndarray:
         """Return the residuals (2, N) [px] of all corners after a free pose is fitted to each image."""
         images, image = np.unique(self.index, return_inverse=True)
-        fits = self.own_poses(sigma)
-        twists = np.einsum("kij,kj->ki", self.carried[images], fits.residual)
+        fits = self.free_poses(sigma)
+        carried = self.carried[images]
+        twists = np.einsum("kij,kj->ki", carried, fits.residual)
         by_twist = self.local[:, :, :6]
         return self.value - np.einsum("ncl,nl->cn", by_twist, twists[image])
 
 
 def _padded(table: np.ndarray, counts: np.ndarray, height: int = 0) -> np.ndarray:
-    """Return corner rows (N, 2, w) as one block per image (images, height, w), padded with zeros.
+    """Return the rows of all corners as a block per image, (images, height, w), filled up with zero rows.
 
     Args:
-        table: (N, 2, w) rows, ordered by image.
-        counts: (images,) corners per image.
-        height: height of a block, twice the corners it has space for; 0 for the image with the most corners.
+        table: (N, 2, w) two rows per corner, ordered by image.
+        counts: (images,) number of corners of each image.
+        height: number of rows of a block; 0: as many as the image with the most corners needs.
     """
     width = table.shape[2]
     max_corners = height // 2
     if not max_corners:
-        max_corners = max(int(counts.max(initial=0)), (width + 1) // 2)
+        most = int(counts.max(initial=0))
+        max_corners = max(most, (width + 1) // 2)
     image = np.repeat(np.arange(len(counts)), counts)
     first = np.repeat(np.cumsum(counts) - counts, counts)
     padded = np.zeros((len(counts), max_corners, 2, width))
@@ -300,11 +343,13 @@ def _padded(table: np.ndarray, counts: np.ndarray, height: int = 0) -> np.ndarra
 
 def _whitened(rows: np.ndarray, shared: np.ndarray) -> np.ndarray:
     """Return (I + G Gᵀ)^(-1/2) A for A (images, h, w) and G (images, h, 6), by the eigenvectors of Gᵀ G."""
-    values, vectors = np.linalg.eigh(shared.transpose(0, 2, 1) @ shared)
+    gram = shared.transpose(0, 2, 1) @ shared
+    values, vectors = np.linalg.eigh(gram)
     values = np.maximum(values, 0.0)
     axes = shared @ vectors
     # U (1 - 1/sqrt(1 + s²)) Uᵀ with U = G V / s
-    factor = (1.0 - 1.0 / np.sqrt(1.0 + values)) / np.maximum(values, 1e-300)
+    reduction = 1.0 - 1.0 / np.sqrt(1.0 + values)
+    factor = reduction / np.maximum(values, 1e-300)
     along = axes.transpose(0, 2, 1) @ rows
     return rows - axes @ (factor[:, :, None] * along)
 
@@ -314,25 +359,28 @@ def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Residual
     """Return the corner residuals r = y - π(point) of a block of images, with their Jacobians."""
     view = seen.view
     if view is None:
-        refuse_data(measured.file, "the camera of these images is unknown")
+        refuse_data(measured.file, "the camera of these images is unknown: give its lens (camera.yaml)")
     in_hand = measured.mounting == IN_HAND
     count = len(measured)
     lens_count = len(view.in_view)
     image, corner = np.nonzero(measured.seen)
 
     # the board in the camera's frame: (m, 3, 3) and (m, 3); columns are the target's axes
-    turn = np.moveaxis(seen.rotation, 0, -1).transpose(1, 0, 2)
+    axes_last = np.moveaxis(seen.rotation, 0, -1)
+    turn = axes_last.transpose(1, 0, 2)
     origin = seen.point.T
     if in_hand:
         # the target is the camera, in the board's frame
         turn = turn.transpose(0, 2, 1)
         origin = -np.einsum("mij,mj->mi", turn, origin)
-    points, bend = shape_slopes(measured.board, view.shape, corners(measured.board))
+    nominal = corners(measured.board)
+    points, bend = shape_slopes(measured.board, view.shape, nominal)
     turned = np.einsum("nij,nj->ni", turn[image], points[corner])
     point = turned + origin[image]
-    # of a wild guess, behind the camera
-    aside = np.maximum(np.linalg.norm(point[:, :2], axis=1), 1e-3)
-    point[:, 2] = np.maximum(point[:, 2], aside / STEEPEST[view.lens.model])
+    # A poor first guess may put corners beside or behind the camera, where no lens model applies.
+    off_axis = np.linalg.norm(point[:, :2], axis=1)
+    min_depth = np.maximum(off_axis, 1e-3) / STEEPEST[view.lens.model]
+    point[:, 2] = np.maximum(point[:, 2], min_depth)
 
     pixel, by_point, by_lens = view.lens.project_with_slopes(point)
     local = np.empty((len(image), 2, 6 + lens_count))
@@ -346,18 +394,22 @@ def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Residual
         local[:, :, 6:] = by_optics[:, :, view.in_view]
 
     shared = np.zeros((len(jacobian), 6 + lens_count, count))
-    shared[:, :6] = _twist_of_board(jacobian, turn, origin) if in_hand else jacobian
+    board_twist = jacobian
+    if in_hand:
+        board_twist = _twist_of_board(jacobian, turn, origin)
+    shared[:, :6] = board_twist
     shared[view.in_free, 6 + np.arange(lens_count)] = 1.0
     value = (measured.pixel[image, corner] - pixel).T
     sigma = None
     if measured.sigma is not None:
         sigma = np.broadcast_to(measured.sigma[image, corner], value.shape)
-    focal = np.sqrt(np.abs(np.prod(view.lens.values[:2])))
+    focal_product = np.prod(view.lens.values[:2])
+    focal = np.sqrt(np.abs(focal_product))
     depth = focal / point[:, 2]
     carried = np.tile(np.eye(6), (count, 1, 1))
     axes = np.tile(np.eye(3), (count, 1, 1))
     if in_hand:
-        # ω × (o - c): the camera turns about itself, and the board's origin swings
+        # ω × (o - c): when the camera turns about its centre c, the board's origin o moves in its frame
         carried[:, :3, 3:] = np.cross(origin[:, None], np.eye(3))
         axes = -turn.transpose(0, 2, 1)
     return [PixelPart("pixel", value, shared, sigma, 0, image, local, corner, depth, axes, carried)]

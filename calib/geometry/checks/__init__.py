@@ -1,1 +1,1 @@
-"""Checks of measurements by the residuals of a rigid arm: changes while measuring, invalid readings, wrong rows."""
+"""Checks of measurements by the residuals of a rigid arm: changes of the set-up, invalid readings, wrong rows."""

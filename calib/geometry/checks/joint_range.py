@@ -1,7 +1,9 @@
-"""Joint range in which a fit is valid: measured range of the joints, and σ of the target over their whole range.
+"""Joint range in which a fit is valid: measured range of the joints, and σ of the target over the whole joint range.
 
-A fit to poses of one region determines the parameters that move the target in that region; elsewhere other combinations
-of parameters matter. The uncertainty that remains after the data and the prior of making is the posterior,
+A fit to poses of one region determines the parameters that move the target in that region. In other regions, other
+combinations of parameters matter. The uncertainty given the data and the prior of making
+(`calib.geometry.fit.PLAUSIBLE`, the plausible deviations of a manufactured arm from nominal) is the posterior
+covariance
 
     C = (Wᵀ W + Λ)⁻¹,   σ² = tr(J C Jᵀ),
 
@@ -24,25 +26,25 @@ from calib.geometry.observation import layout, pose_sigmas, positions, prepare, 
 from calib.geometry.weighing import GeometricFit
 from calib.robot.chain import random_joints
 
-# random postures by which a fit is judged over the whole range
+# number of random postures by which a fit is judged over the whole joint range
 POSTURES = 300
-# [rad, m]: a joint that moved by less stood; the others are drawn with it where it stood
+# a joint that moved by less was at rest [rad, m]; in random postures it keeps its measured value
 STILL = 1e-3
-# of the largest one: placements have no prior
+# smallest precision relative to the largest one, for placements, which have no prior
 MIN_PRECISION = 1e-12
 
 
 @dataclass(frozen=True)
 class JointRange:
-    """Range of the joints in which a fit was made, and its expected error over their whole range.
+    """Range of the joints in which a fit was made, and its expected error over the whole joint range.
 
     Attributes:
         joints, units: (n,) names of the joints, and ``rad`` or ``m``.
-        lower, upper: (n,) measured range [rad or m].
-        shares: (n,) measured range divided by the joint's whole range (one turn at most).
+        lower, upper: (n,) smallest and largest measured joint values [rad or m].
+        shares: (n,) measured range divided by the joint's whole range (at most one turn).
         sigma: rms over the whole range of σ of the target's position [m]; None where no positions were measured.
-        nominal: rms error of the nominal arm over the whole range, the calibrated arm taken as true [m]; None as for
-            `sigma`.
+        nominal: rms error of the nominal arm over the whole range, if the calibrated arm is true [m]; None where no
+            positions were measured.
         left: rms residual of the rigid arm at the fitted poses [m].
     """
 
@@ -57,7 +59,7 @@ class JointRange:
 
     @property
     def moved(self) -> list[int]:
-        """Indices of the joints that moved while measuring."""
+        """Indices of the joints that moved during the measurement."""
         return [j for j, (low, high) in enumerate(zip(self.lower, self.upper)) if high - low > STILL]
 
 
@@ -100,8 +102,14 @@ def joint_range(fit: GeometricFit, nominal: Installation) -> JointRange:
 def sigma_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> np.ndarray:
     """Return σ of the first target's position (m,) [m] at postures q (m, n), in its station's frame.
 
-    It follows from the fit's covariance where all rigid parameters were candidates, else from the posterior of its data
-    and the prior of making (`calib.geometry.fit.PLAUSIBLE`).
+    If all rigid parameters were candidates of the fit, σ is computed from the fit's covariance. Otherwise it is
+    computed from the posterior covariance given the fit's data and the prior of making
+    (`calib.geometry.fit.PLAUSIBLE`).
+
+    Args:
+        cell: installation of the arm whose target is predicted: the calibrated or the nominal one.
+        fit: the rigid fit, with its data and its covariance.
+        q: (m, n) joint values [rad or m].
     """
     table = layout(cell)
     columns = table.rigid_index
@@ -116,7 +124,15 @@ def sigma_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> np.ndarray
 
 
 def _posterior(cell: Installation, fit: GeometricFit, columns: np.ndarray) -> np.ndarray:
-    """Return the covariance (c, c) of the parameters `columns` (c,), from the data of a fit and the prior of making."""
+    """Return the posterior covariance (c, c) of the parameters `columns` (c,).
+
+    It follows from the data of the fit and the prior of making.
+
+    Args:
+        cell: the installation at which the derivatives are computed.
+        fit: the fit whose measurements are the data.
+        columns: (c,) indices in the full parameter vector (`calib.geometry.observation`).
+    """
     square = np.zeros((len(columns), len(columns)))
     for number, block in enumerate(fit.blocks):
         pieces = [piece for piece in fit.pieces if piece.block == number]
@@ -131,7 +147,15 @@ def _posterior(cell: Installation, fit: GeometricFit, columns: np.ndarray) -> np
 
 
 def _positions_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> Positions:
-    """Return measurements of the first target as an installation predicts them at postures (m, n) [rad or m]."""
+    """Return positions of the first target as an installation predicts them at postures q (m, n) [rad or m].
+
+    They have the form of measurements, so that functions on measurements can be applied to them.
+
+    Args:
+        cell: the installation.
+        fit: the fit, whose first block of positions provides the names of target and station.
+        q: (m, n) joint values [rad or m].
+    """
     measured = next(block.measured for block in fit.blocks if isinstance(block.measured, Positions))
     block = Positions(
         q,
@@ -145,7 +169,15 @@ def _positions_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> Posit
 
 
 def _nominal_error(fit: GeometricFit, nominal: Installation, q: np.ndarray) -> float | None:
-    """Return the nominal arm's rms error [m] at postures (m, n) if the calibrated arm is true; or None."""
+    """Return the nominal arm's rms error [m] at postures q (m, n), if the calibrated arm is true.
+
+    None where this error cannot be computed.
+
+    Args:
+        fit: the fit of the calibrated arm.
+        nominal: the nominal arm; its base and tool placement are fitted to the calibrated arm's positions.
+        q: (m, n) joint values [rad or m].
+    """
     block = _positions_at(fit.cell, fit, q)
     with suppress(CalibError):
         placed = polish_frames(nominal, [block]).cell

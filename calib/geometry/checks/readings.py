@@ -1,4 +1,7 @@
-"""Invalid readings: one value repeated at several postures (a lost beam, a placeholder), copies of another target."""
+"""Search for invalid readings: one value repeated at several postures, or the readings of one target in another.
+
+A value is repeated where, for example, the instrument lost the target or wrote a placeholder.
+"""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -11,16 +14,16 @@ from calib.errors import Finding, finding
 from calib.geometry.installation import Installation
 from calib.geometry.observation import positions, prepare
 
-# [m]: readings that differ by no more are one number; instruments have noise (our choice)
+# largest difference of readings [m] that are treated as equal; readings of an instrument have noise (our choice)
 SAME = 1e-8
-# [m] between predicted targets from which on one reading cannot be both (our choice)
+# distance between predicted targets [m] above which equal readings are impossible (our choice)
 MIN_APART = 1e-3
-# poses at which a target has the numbers of another (our choice)
+# smallest number of poses at which a copied target has the readings of another (our choice)
 MIN_COPIES = 3
 
 
 def repeated_readings(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> list[Finding]:
-    """Return findings on rows that repeat one reading at several postures, and on targets with the readings of another.
+    """Return findings on readings repeated at several postures, and on targets with the readings of another target.
 
     Args:
         nominal: the nominal arm, with stations and tools placed.
@@ -37,14 +40,22 @@ def repeated_readings(nominal: Installation, blocks: Sequence[PoseMeasurements])
 
 
 def _readings(block: Positions) -> np.ndarray:
-    """Return a number (m,) for each row's reading; rows with equal readings have equal numbers."""
+    """Return a number (m,) for each row's reading, equal for equal readings.
+
+    Args:
+        block: measured positions or poses; equal readings have equal coordinates.
+    """
     rounded = np.round(block.position / SAME)
     _, number = np.unique(rounded, axis=0, return_inverse=True)
     return number.reshape(-1)
 
 
 def _copied_targets(block: Positions) -> list[Finding]:
-    """Return findings on targets whose readings equal another target's in all poses at which both were measured."""
+    """Return findings on targets whose readings equal those of another target at all poses where both were measured.
+
+    Args:
+        block: measured positions of several targets.
+    """
     readings = _readings(block)
     # per target: its readings by row number
     reading_of_row = []
@@ -76,12 +87,12 @@ def _copied_targets(block: Positions) -> list[Finding]:
 
 
 def _stale(nominal: Installation, block: Positions, copied: set[str]) -> list[Finding]:
-    """Return findings on readings of a target that stay constant while the joints move the target.
+    """Return findings on readings that stay constant while the joints move the target.
 
     Args:
         nominal: the nominal arm, with stations and tools placed.
         block: measured positions.
-        copied: names of targets known to be copies, which are skipped.
+        copied: names of targets whose readings are copies of another target's; they are skipped.
     """
     (prepared,) = prepare(nominal, [block])
     predicted = positions(nominal, prepared).T

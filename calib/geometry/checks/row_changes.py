@@ -1,19 +1,20 @@
-"""Changes of the set-up while measuring: a table of hypotheses, each tested on the residuals of the rigid fit.
+"""Changes of the set-up during the measurement: each possible change is tested on the residuals of the rigid fit.
 
-Row order is time. A hypothesis says that a placement, a target, the zero of a joint or the instrument's scale changed
-in steps or drifted, so that r = W x + s(row) H d + noise: W the observation matrix of all rigid parameters with a prior
-of making, H the columns of the changed parameters, s(row) a step behind one row or a ramp over all rows. By the score
-test (Rao 1948) a change lowers the penalised sum of squares by
+The order of rows is taken as time. A hypothesis is that a placement, a target, the zero of a joint or the instrument's
+scale changed in one step or drifted. The residuals are then r = W x + s(row) H d + noise. W is the observation matrix
+of all rigid parameters x, which have a prior of making (plausible deviations from nominal). H are the columns of the
+changed parameters, and d is the size of the change. s(row) is a step after one row or a ramp over all rows. By the
+score test (Rao 1948) a change lowers the penalised sum of squares by
 
     gain = gᵀ S⁻¹ g,   g = Σ s Hᵀ e,   S = Σ s² HᵀH - (Σ s HᵀQ)(Σ s HᵀQ)ᵀ,   Q = W (WᵀW + Λ)^(-1/2)
 
-with e the residuals after fitting x. The sums over the rows behind a cut are cumulative sums, so that every cut is
-tried.
+with e the residuals after fitting x and Λ the precision of the prior. The sums over the rows after a step are
+cumulative sums, so that a step after every row can be tried.
 
-A change is found where it explains the residuals: by Fisher's test with the number of hypotheses (Bonferroni), by the
-share of the residuals that remains, on held-out rows, and if it explains them much better than the same change over
-rows ordered by a joint's values or the target's coordinates does (which an effect missing in the arm's model would
-cause).
+A change is reported if all of these conditions are met: it is significant by Fisher's test, corrected for the number of
+hypotheses (Bonferroni); it leaves only a small share of the residuals; it also reduces the residuals of held-out rows;
+and changes over rows ordered by a joint's values or the target's coordinates explain the residuals much less. An effect
+that is missing in the arm's model would violate the last condition.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,31 +32,32 @@ from calib.geometry.observation import Block, layout, observe, parameter_values,
 from calib.geometry.weighing import GeometricFit
 from calib.records import evenly
 
-# of a block, and of its rows before and after a step the third part (our choice)
+# smallest number of rows of a block; a third of it is the smallest number before and after a step (our choice)
 MIN_ROWS = 20
-# of a block that are looked at (our choice)
+# largest number of rows of a block that are used (our choice)
 MAX_ROWS = 1500
-# that noise explains as much by one of the hypotheses: residuals are not quite white (our choice)
+# largest probability that noise has such a gain for any hypothesis; small, since residuals are not quite white
+# (our choice)
 MAX_CHANCE = 1e-6
-# of the rms that remains without the change (our choice)
+# largest rms with the change, as a share of the rms without it (our choice)
 MAX_LEFT = 0.75
-# the same on rows that did not determine the change (our choice)
+# the same share on held-out rows (our choice)
 MAX_LEFT_UNSEEN = 0.85
-# gain of the best change over another order, of that over the rows (our choice)
+# largest gain of a change over rows in another order, as a share of the gain in the order of the file (our choice)
 MAX_RIVAL = 0.5
-# that are searched for in one block
+# largest number of changes that are searched for in one block
 MAX_CHANGES = 3
-# times the median residual: rows that are measured wrongly, not of another set-up (our choice)
+# rows with residuals above this multiple of the median are outliers, not rows of another set-up (our choice)
 GROSS = 10.0
-# [m, rad] no instrument has less
+# smallest standard deviation of a reading [m, rad]
 MIN_NOISE = 1e-6
-# [m, rad] width of the prior of placements
+# prior standard deviation of placements [m, rad]
 FREE = 10.0
-# [m, rad] width of the prior of what changed while measuring
+# prior standard deviation of a change during the measurement [m, rad]
 CHANGED = 0.1
-# passes until no gross row leaves; more are seldom needed
+# largest number of passes that remove outliers
 GROSS_PASSES = 5
-# parts of the rows by which a change is tested on rows that did not determine it
+# number of parts of the rows, each of which is held out once to test a change
 FOLDS = 5
 STEPS = {"station": "station-changed", "target": "target-changed", "zero": "zero-changed", "scale": "scale-changed"}
 DRIFTS = {"station": "station-drifts", "target": "target-wanders", "zero": "zero-drifts", "scale": "scale-drifts"}
@@ -67,11 +69,11 @@ class WhitenedRows:
 
     Attributes:
         block: the measurements.
-        residual: (m, d) residuals of d measured numbers per row, in sigmas.
-        matrix: (m, d, f) derivatives by all f rigid parameters, in sigmas per unit.
-        precision: (f,) precision of the parameters' prior.
-        pull: (f,) precision times the distance of the prior's mean from the present value.
-        metres: (m,) standard deviation that whitened each row's position [m].
+        residual: (m, d) residuals of the d measured numbers of each row, in sigmas.
+        matrix: (m, d, f) derivatives of the predictions by all f rigid parameters, in sigmas per unit.
+        precision: (f,) precision (1/σ²) of the parameters' prior.
+        pull: (f,) precision times (mean of the prior minus present value).
+        metres: (m,) standard deviation by which each row's position was divided [m].
     """
 
     block: Block
@@ -88,7 +90,10 @@ class WhitenedRows:
         return WhitenedRows(block, self.residual[rows], self.matrix[rows], self.precision, self.pull, self.metres[rows])
 
     def with_columns(self, columns: np.ndarray) -> "WhitenedRows":
-        """Return the rows with the columns (m, d, k) of changed parameters appended to `matrix`, without a prior."""
+        """Return the rows with the columns (m, d, k) of k changed parameters appended to `matrix`.
+
+        The appended parameters have a prior so wide that it has no effect.
+        """
         count = columns.shape[2]
         matrix = np.concatenate([self.matrix, columns], axis=2)
         precision = np.append(self.precision, np.full(count, CHANGED**-2.0))
@@ -104,7 +109,7 @@ class WhitenedRows:
         return square + np.diag(self.precision + rounding)
 
     def residuals(self, estimate: np.ndarray) -> np.ndarray:
-        """Return the residuals (m, d) that remain with parameter changes `estimate` (f,), in sigmas."""
+        """Return the residuals (m, d) after the parameters changed by `estimate` (f,), in sigmas."""
         return self.residual - self.matrix @ estimate
 
     def solve(self) -> np.ndarray:
@@ -114,24 +119,26 @@ class WhitenedRows:
         return scipy.linalg.solve(self.normal(), right, assume_a="pos")
 
     def position_rms(self, residuals: np.ndarray) -> float:
-        """Return the rms norm of the position residuals [m], from whitened residuals (m, d)."""
+        """Return the rms of the position residuals' norms [m], from whitened residuals (m, d)."""
         squares = np.sum(residuals[:, :3] ** 2, axis=1)
         return float(np.sqrt(np.mean(squares * self.metres**2)))
 
     def resting(self) -> float:
-        """Return the effective number of parameters determined by their prior instead of the rows."""
+        """Return the effective number of parameters that are determined by their prior rather than by the rows."""
         variances = np.diag(scipy.linalg.inv(self.normal()))
         return float(np.sum(self.precision * variances))
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A part of the set-up that may have changed while measuring: station, scale, target or joint zero.
+    """A part of the set-up that may have changed during the measurement.
+
+    It is a station, a target, the zero of a joint, or the scale of an instrument.
 
     Attributes:
-        code: key of its findings in `STEPS` and `DRIFTS`.
+        code: key of the part's findings in `STEPS` and `DRIFTS`.
         name: name of the station, target or joint; for the instrument's scale, name of its station.
-        columns: (m, d, k) whitened derivatives of the rows by the subject's k parameters.
+        columns: (m, d, k) whitened derivatives of the rows by the k parameters of this part.
     """
 
     code: str
@@ -140,18 +147,18 @@ class Subject:
 
     @property
     def count(self) -> int:
-        """Number k of the subject's parameters."""
+        """Number k of parameters of this part."""
         return self.columns.shape[2]
 
 
 @dataclass(frozen=True, eq=False)
 class RowChange:
-    """A step or drift of one subject over the rows in some order.
+    """A step or drift of one part of the set-up, over the rows in some order.
 
     Attributes:
-        subject: what changed.
-        shape: (m,) factor of the change at each row: 0 and 1, or a ramp.
-        between: the ordering values just before and behind the step; None for a drift.
+        subject: the part that changed.
+        shape: (m,) factor of the change at each row: 0 and 1 for a step, a ramp for a drift.
+        between: for a step, the values of the ordering quantity just before and just after it; None for a drift.
         gain: reduction of the penalised sum of squares.
     """
 
@@ -162,12 +169,12 @@ class RowChange:
 
     @property
     def columns(self) -> np.ndarray:
-        """Columns (m, d, k) that the change adds to the whitened matrix: the subject's times `shape`."""
+        """Columns (m, d, k) that the change adds to the whitened matrix: the columns of `subject` times `shape`."""
         return self.shape[:, None, None] * self.subject.columns
 
 
 def row_changes(fit: GeometricFit) -> list[Finding]:
-    """Return findings on the parts of the set-up that changed while the rows of each block were measured.
+    """Return findings on the parts of the set-up that changed while the rows of a block were measured.
 
     Args:
         fit: a fit without joint corrections.
@@ -188,7 +195,7 @@ def row_changes(fit: GeometricFit) -> list[Finding]:
 
 
 def _rows_of(fit: GeometricFit, number: int) -> WhitenedRows:
-    """Return the rows of block `number` of a fit, whitened, with the columns of all rigid parameters."""
+    """Return the whitened rows of the block with index `number` in a fit, with the columns of all rigid parameters."""
     measured = fit.blocks[number].measured
     (block,) = prepare(fit.cell, [take(measured, evenly(len(measured), MAX_ROWS))])
     table = layout(fit.cell)
@@ -210,7 +217,7 @@ def _rows_of(fit: GeometricFit, number: int) -> WhitenedRows:
 
 
 def _without_gross(rows: WhitenedRows) -> WhitenedRows:
-    """Return the rows without gross outliers of the rigid fit, which would hide every smaller change."""
+    """Return the rows without gross outliers of the rigid fit. Outliers would hide smaller changes."""
     for _ in range(GROSS_PASSES):
         size = np.linalg.norm(rows.residuals(rows.solve()), axis=1)
         fine = size <= GROSS * np.median(size)
@@ -221,7 +228,12 @@ def _without_gross(rows: WhitenedRows) -> WhitenedRows:
 
 
 def _subjects(fit: GeometricFit, rows: WhitenedRows) -> list[Subject]:
-    """Return the parts that may have changed: station, instrument's scale, each target, the zero of each joint."""
+    """Return the parts of the set-up that may have changed: station, instrument scale, targets, zeros of the joints.
+
+    Args:
+        fit: a fit without joint corrections.
+        rows: the whitened rows of one of its blocks.
+    """
     cell = fit.cell
     table = layout(cell)
     column = {table.names[k]: number for number, k in enumerate(table.index("arm", "station", "tool"))}
@@ -247,7 +259,14 @@ def _subjects(fit: GeometricFit, rows: WhitenedRows) -> list[Subject]:
 
 
 def _best_change(rows: WhitenedRows, subjects: Sequence[Subject]) -> RowChange | None:
-    """Return the change over time (row order) that explains the residuals best; None if none does significantly."""
+    """Return the change over time (row order) that explains the residuals best; None if no change meets all conditions.
+
+    The conditions are those of the module's docstring.
+
+    Args:
+        rows: the whitened rows of one block.
+        subjects: the parts that may have changed.
+    """
     residuals = rows.residuals(rows.solve())
     cost = float(np.sum(residuals**2))
     count = residuals.size
@@ -271,7 +290,13 @@ def _best_change(rows: WhitenedRows, subjects: Sequence[Subject]) -> RowChange |
 
 
 def _information(cost: float, count: int, parameters: int) -> float:
-    """Return Schwarz's criterion (BIC) of a fit: `cost` its sum of squares, `count` numbers, `parameters` unknowns."""
+    """Return Schwarz's criterion (BIC) of a fit.
+
+    Args:
+        cost: sum of squared residuals of the fit, in sigmas.
+        count: number of measured numbers.
+        parameters: number of unknowns.
+    """
     return count * np.log(max(cost, 1e-300)) + parameters * np.log(count)
 
 
@@ -298,13 +323,13 @@ def _significant(change: RowChange, cost: float, dof: float, hypotheses: int) ->
 def _changes(
     rows: WhitenedRows, residuals: np.ndarray, subjects: Sequence[Subject], order: np.ndarray
 ) -> Iterator[RowChange]:
-    """Yield the best step and the drift of each subject over an order (m,) of the rows.
+    """Yield, for each part of the set-up, its best step and its drift over an order (m,) of the rows.
 
     Args:
         rows: the whitened rows.
         residuals: (m, d) whitened residuals without a change.
         subjects: the parts that may have changed.
-        order: (m,) values that order the rows; no step divides rows of equal value.
+        order: (m,) values that order the rows; a step never separates rows of equal value.
     """
     count = len(residuals)
     flat = rows.matrix.reshape(-1, rows.matrix.shape[2])
@@ -342,11 +367,11 @@ def _changes(
 
 
 def _sums_behind(terms: np.ndarray, rank: np.ndarray, cuts: np.ndarray) -> np.ndarray:
-    """Return the sums (c, …) of `terms` (m, …) over the rows behind each of c cuts.
+    """Return the sums (c, …) of `terms` (m, …) over all rows after each of c cuts.
 
     Args:
         terms: one array per row.
-        rank: (m,) row numbers in the order in which they are cut.
+        rank: (m,) row numbers in the order in which the rows are cut.
         cuts: (c,) positions in that order.
     """
     from_last = np.cumsum(terms[rank[::-1]], axis=0)
@@ -354,7 +379,15 @@ def _sums_behind(terms: np.ndarray, rank: np.ndarray, cuts: np.ndarray) -> np.nd
 
 
 def _gains(score: np.ndarray, square: np.ndarray, shared: np.ndarray) -> np.ndarray:
-    """Return the gains gᵀ S⁻¹ g (c,) of c changes from sums over rows: g (c, k), Σ HᵀH (c, k, k), Σ HᵀQ (c, k, f)."""
+    """Return the gains gᵀ S⁻¹ g (c,) of c changes, from their sums over rows.
+
+    Args:
+        score: (c, k) g, the score Σ Hᵀr of each change: H are the derivatives of the rows by the change's k parameters,
+            r the residuals without a change.
+        square: (c, k, k) Σ HᵀH over the rows; S is Σ HᵀH less the part that the other parameters explain, plus the
+            prior precision of a change.
+        shared: (c, k, f) Σ HᵀQ, with Q orthonormal columns for the other f parameters.
+    """
     prior = CHANGED**-2.0 * np.eye(score.shape[1])
     matrix = square - shared @ shared.transpose(0, 2, 1) + prior
     solution = np.linalg.solve(matrix, score[:, :, None])
@@ -362,7 +395,13 @@ def _gains(score: np.ndarray, square: np.ndarray, shared: np.ndarray) -> np.ndar
 
 
 def _gains_over_other_orders(rows: WhitenedRows, residuals: np.ndarray, subjects: Sequence[Subject]) -> Iterator[float]:
-    """Yield the gains of changes over rows ordered by joint values and target coordinates instead of time."""
+    """Yield the gains of changes over rows ordered by each joint's values and target coordinate instead of time.
+
+    Args:
+        rows: the whitened rows of one block of positions.
+        residuals: (m, d) whitened residuals without a change.
+        subjects: the parts that may have changed.
+    """
     measured = rows.block.measured
     assert isinstance(measured, Positions)
     for order in (*measured.q.T, *measured.position.T):
@@ -371,7 +410,12 @@ def _gains_over_other_orders(rows: WhitenedRows, residuals: np.ndarray, subjects
 
 
 def _holds_on_held_out(rows: WhitenedRows, change: RowChange) -> bool:
-    """Return whether the change also reduces the residuals of held-out rows."""
+    """Return whether the change also reduces the residuals of held-out rows, every k-th row being held out in turn.
+
+    Args:
+        rows: the whitened rows of one block.
+        change: the change, whose columns are added.
+    """
     changed = rows.with_columns(change.columns)
     count = len(rows.residual)
     squares = changed_squares = 0.0
@@ -384,13 +428,23 @@ def _holds_on_held_out(rows: WhitenedRows, change: RowChange) -> bool:
 
 
 def _squares_on(rows: WhitenedRows, held_out: np.ndarray, fitted: np.ndarray) -> float:
-    """Return the sum of squares of the rows `held_out` with the estimate from the rows `fitted`."""
+    """Return the sum of squares of the rows `held_out`, predicted with the estimate from the rows `fitted`.
+
+    Args:
+        rows: the whitened rows of one block.
+        held_out, fitted: row numbers.
+    """
     residuals = rows.some(held_out).residuals(rows.some(fitted).solve())
     return float(np.sum(residuals**2))
 
 
 def _described(rows: WhitenedRows, change: RowChange) -> Finding:
-    """Return the finding on a change, with the estimated size of the change and its σ."""
+    """Return the finding on a change, with the estimated size of the change and its standard deviation.
+
+    Args:
+        rows: the whitened rows of one block.
+        change: the change to describe.
+    """
     extended = rows.with_columns(change.columns)
     estimate = extended.solve()
     count = change.subject.count

@@ -1,7 +1,8 @@
-"""Rows that do not match their file: paired with the joint values of other rows, or measured on two targets.
+"""Search for rows paired with the joint values of other rows, and for files with rows of two targets.
 
-Both are judged by the least error of the arm over all placements. Positions y = B (R p + t) + b, with R, t the tip's
-pose from the joints and B, b, p the placements, are linear in B ⊗ p, B and b: 13 numbers per axis of y.
+Both hypotheses are tested by the least error of the arm over all placements of base and tool. Predicted positions are y
+= B (R p + t) + b, with R, t the tip's pose at the joint values, B, b the base's placement and p the target's position
+on the tool. They are linear in B ⊗ p, B and b: 13 numbers per axis of y.
 """
 
 from collections.abc import Sequence
@@ -16,23 +17,28 @@ from calib.geometry.installation import Installation
 from calib.records import evenly
 from calib.robot.kinematics import forward
 
-# rows between a measurement and its joints: a lost point, a line of the header
+# shifts in rows between measurements and joint values that are tried, as by a lost point or a header line
 SHIFTS = (1, -1, 2, -2)
-# rows that are shifted at least (our choice)
+# smallest number of shifted rows (our choice)
 MIN_SHIFTED = 8
-# share of the rows whose shifted joints are there, not held out (our choice)
+# smallest share of the shifted rows whose joint values are available, not held out (our choice)
 MIN_PAIRED = 0.5
-# first rows of a shift that are tried at once; then those between (our choice)
+# number of first rows of a shift that are tried at once, before the rows between the best ones (our choice)
 MAX_CUTS = 120
-# rows in which two targets are looked for (our choice)
+# smallest number of rows in which two targets are searched (our choice)
 MIN_MIXED = 24
-# of sorting rows by target; a few are needed
+# largest number of iterations of the assignment of rows to targets; a few are needed
 MAX_ROUNDS = 50
 Blocks = Sequence[PoseMeasurements]
 
 
 def least_error(nominal: Installation, blocks: Blocks) -> np.ndarray:
-    """Return the least mean squared error [m²] (1,) over all base and tool placements; 0 without enough positions."""
+    """Return the least mean squared error [m²] (1,) over all placements of base and tool; 0 for too few positions.
+
+    Args:
+        nominal: the nominal arm.
+        blocks: measured positions; with a block of another kind, 0 is returned.
+    """
     squares = 0.0
     count = 0
     for block in blocks:
@@ -48,24 +54,36 @@ def least_error(nominal: Installation, blocks: Blocks) -> np.ndarray:
 
 
 def _columns(nominal: Installation, block: Positions) -> np.ndarray:
-    """Return the columns (m, 13) of the linear position model for a block's rows: from R, t of the tip, and 1."""
+    """Return the columns (m, 13) of the linear position model: the nine entries of R, the three of t, and 1.
+
+    Args:
+        nominal: the nominal arm, which provides the tip's pose R, t in each row.
+        block: measured positions of m rows.
+    """
     tip = forward(nominal.chain, block.q)
     rotation = tip[:, :3, :3].reshape(-1, 9)
     return np.column_stack([rotation, tip[:, :3, 3], np.ones(len(tip))])
 
 
 def _unexplained(columns: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return the residual (m, 3) of the linear fit of positions by columns."""
+    """Return the residual (m, 3) of the linear least-squares fit of positions by columns.
+
+    Args:
+        columns: (m, 13) columns of the linear position model, computed by `_columns`.
+        position: (m, 3) measured positions [m].
+    """
     return position - columns @ np.linalg.lstsq(columns, position)[0]
 
 
 def row_shifts(nominal: Installation, blocks: Blocks, max_left: float) -> list[Change]:
-    """Return hypotheses that, from some row on, pair measurements with the joint values of rows further down or up.
+    """Return possible changes to the blocks: from some row on, measurements are paired with joint values of other rows.
+
+    The other rows are a fixed number of rows further down or up.
 
     Args:
         nominal: the nominal arm.
-        blocks: the measurements; rows missing in their numbering were held out.
-        max_left: largest share of the error that may remain with such a shift.
+        blocks: the measurements; row numbers missing in a block are rows that were held out.
+        max_left: largest mean squared error with such a shift, as a share of that without it.
     """
     changes = []
     for number, block in enumerate(blocks):
@@ -83,7 +101,13 @@ def row_shifts(nominal: Installation, blocks: Blocks, max_left: float) -> list[C
 
 
 def _best_first(nominal: Installation, block: Positions, shift: int) -> int | None:
-    """Return the row from which on a shift by `shift` rows explains the positions best; None for too few rows."""
+    """Return the row from which on a shift by `shift` rows explains the positions best; None where rows are too few.
+
+    Args:
+        nominal: the nominal arm.
+        block: measured positions.
+        shift: number of rows by which the joint values are shifted down; negative for up.
+    """
     numbers = np.unique(block.rows)[: -MIN_SHIFTED - abs(shift)]
     if len(numbers) < MIN_SHIFTED or len(_shifted(block, 0, shift)) < MIN_PAIRED * len(block):
         return None
@@ -98,14 +122,27 @@ def _best_first(nominal: Installation, block: Positions, shift: int) -> int | No
 
 
 def _shifted_block(number: int, first: int, shift: int, blocks: Blocks) -> Blocks:
-    """Return the blocks with block `number` shifted (see `_shifted`)."""
+    """Return the blocks with the joint values of block `number` shifted as by `_shifted`.
+
+    Args:
+        number: index of the block.
+        first: row number in the file from which on joint values are shifted.
+        shift: number of rows by which they are shifted.
+        blocks: the measurements.
+    """
     block = blocks[number]
     assert isinstance(block, Positions)
     return [*blocks[:number], _shifted(block, first, shift), *blocks[number + 1 :]]
 
 
 def _shifted(block: Positions, first: int, shift: int) -> Positions:
-    """Return a block whose rows from number `first` on take their joint values from the row `shift` further down."""
+    """Return a block whose rows from number `first` on have the joint values of the row `shift` rows further down.
+
+    Args:
+        block: measured positions.
+        first: row number in the file.
+        shift: number of rows; negative: rows further up.
+    """
     numbers, index = np.unique(block.rows, return_index=True)
     source = np.where(block.rows >= first, block.rows + shift, block.rows)
     position = np.minimum(np.searchsorted(numbers, source), len(numbers) - 1)
@@ -115,10 +152,10 @@ def _shifted(block: Positions, first: int, shift: int) -> Positions:
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """Rows of one block sorted by target.
+    """Rows of one block, assigned to two targets.
 
     Attributes:
-        second: (m,) whether a row was measured on the second target.
+        second: (m,) whether a row is assigned to the second target.
         distance: distance between the two targets [m].
         squares: sum of squared residuals after the fit with two targets [m²].
     """
@@ -129,12 +166,12 @@ class Mixture:
 
 
 def two_targets(nominal: Installation, blocks: Blocks, max_left: float) -> list[Change]:
-    """Return hypotheses that the rows of one block were measured on two targets.
+    """Return possible changes to the blocks: the rows of one block were measured on two targets.
 
     Args:
         nominal: the nominal arm.
         blocks: the measurements.
-        max_left: largest share of the error that may remain with two targets.
+        max_left: largest mean squared error with two targets, as a share of that with one.
     """
     changes = []
     for number, block in enumerate(blocks):
@@ -159,7 +196,7 @@ def two_targets(nominal: Installation, blocks: Blocks, max_left: float) -> list[
 
 
 def _divided(number: int, second: frozenset[int], blocks: Blocks) -> Blocks:
-    """Return the blocks with the rows `second` of block `number` assigned to a second target."""
+    """Return the blocks with the rows `second` of the block with index `number` assigned to a second target."""
     block = blocks[number]
     tool = np.isin(block.rows, list(second)).astype(int)
     name = block.tool_names[0]
@@ -168,13 +205,13 @@ def _divided(number: int, second: frozenset[int], blocks: Blocks) -> Blocks:
 
 
 def _sorted_by_target(columns: np.ndarray, position: np.ndarray) -> Mixture:
-    """Return the rows sorted by target: assign each row to the target that fits it better, fit again, until none
-    changes.
+    """Return the rows assigned to two targets: assign each row to the target that fits it better, fit again, repeat.
 
-    The first assignment is the sign of the residuals, in the tip's frame, along their first principal axis.
+    The iteration ends when no assignment changes. The first assignment is by the sign of the residuals, in the tip's
+    frame, along their first principal axis.
 
     Args:
-        columns: (m, 13) columns of the linear position model, see `_columns`.
+        columns: (m, 13) columns of the linear position model, computed by `_columns`.
         position: (m, 3) measured positions [m].
     """
     rotations = columns[:, :9].reshape(-1, 3, 3)
@@ -189,7 +226,13 @@ def _sorted_by_target(columns: np.ndarray, position: np.ndarray) -> Mixture:
 
 
 def _settled(columns: np.ndarray, position: np.ndarray, second: np.ndarray) -> Mixture:
-    """Return the rows sorted by target, starting from a first assignment `second` (m,)."""
+    """Return the rows assigned to two targets, iterated from a first assignment `second` (m,) until none changes.
+
+    Args:
+        columns: (m, 13) columns of the linear position model, computed by `_columns`.
+        position: (m, 3) measured positions [m].
+        second: whether a row is assigned to the second target.
+    """
     distance = 0.0
     squares = np.inf
     for _ in range(MAX_ROUNDS):

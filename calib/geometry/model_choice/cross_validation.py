@@ -1,8 +1,8 @@
-"""Cross-validation errors from sufficient statistics, cheap for every fold and every subset of terms.
+"""Cross-validation errors from sufficient statistics, fast for every fold and every subset of correction terms.
 
-The model is linear in its terms and, near its optimum, in the geometry: per fold the statistics WᵀW, Wᵀr of the
-training rows give the estimate, those of the held-out rows its error. Nothing is fitted to held-out rows but the
-placement of a held-out station (projected out).
+The model is linear in the coefficients of its terms and, near its optimum, in the geometry. For each fold, the
+statistics WᵀW, Wᵀr of the training rows give the estimate, and the statistics of the held-out rows its error. Nothing
+is fitted to held-out rows except the placement of a station all of whose rows are held out (it is projected out).
 """
 
 from __future__ import annotations
@@ -25,31 +25,32 @@ from calib.geometry.weighing import GeometricFit
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 
-# poses that models are judged by (our choice)
+# largest number of poses by which models are compared (our choice)
 JUDGED_POSES = 20_000
-# labels of residual parts that count in metres
+# labels of the residual parts whose errors are evaluated in metres
 METRES = ("position", "consistency", "distance", "plane", "pixel")
 HARMONIC = ("cos", "sin")
-# first guess of a coefficient's magnitude, of harmonics that of the first order (our choice)
+# first guess of a coefficient's magnitude; for harmonics, that of the first order (our choice)
 FIRST_SIZE = 1e-4
-# rounds of the search for the ridges of a fold, and of all rows
+# largest number of iterations of the search for the ridges, of a fold and of all rows
 FOLD_ROUNDS = 8
 TOTAL_ROUNDS = 15
-# prior of a parameter without one [m, rad] (our choice)
+# prior standard deviation of a parameter without prior [m, rad] (our choice)
 UNKNOWN_SIGMA = 10.0
-# how far a frame may be from where it is [m, rad] (our choice)
+# prior standard deviation of a placement about its estimate [m, rad] (our choice)
 FRAME_SIGMA = 1.0
-# error by covariance alone over the nominal residuals: beyond, a fold says nothing (our choice)
+# largest ratio of the error by covariance to the nominal residuals, for a fold that can be predicted (our choice)
 MAX_BLIND_ERROR = 3.0
-# poses observed at once
+# number of poses evaluated at once
 CHUNK = 1000
 
 
 def term_groups(terms: tuple[Term, ...]) -> np.ndarray:
-    """Return the ridge index of each term (E,): harmonics of one joint on one element share one, others have their own.
+    """Return the ridge group of each term (E,): terms of one group have prior standard deviations in a fixed ratio.
 
-    With a ridge per order the evidence switches most orders off and makes the rest too large, which shows only on
-    distant rows; see `term_sizes` for the decrease with the order.
+    Harmonics of one joint on one element are one group; every other term is a group of its own. With a ridge for each
+    order, the evidence would switch most orders off and make the others too large, which is seen only on distant rows.
+    `term_sizes` gives the decrease of the prior with the order.
     """
     numbers: dict[tuple, int] = {}
     result = []
@@ -62,9 +63,13 @@ def term_groups(terms: tuple[Term, ...]) -> np.ndarray:
 
 
 def term_sizes(terms: tuple[Term, ...]) -> np.ndarray:
-    """Return the first guess of each coefficient's magnitude (E,), for harmonics inverse to their order.
+    """Return the first guess of each coefficient's magnitude (E,); for harmonics it is inverse to their order.
 
-    Our choice among constant, 1 / √order and 1 / order: the last predicts held-out regions of a UR5 and a Motoman best.
+    This is our choice among constant, 1 / √order and 1 / order: the last predicts held-out regions of a UR5 and a
+    Motoman best.
+
+    Args:
+        terms: the E terms.
     """
     sizes = []
     for term in terms:
@@ -79,7 +84,7 @@ class UnseenErrors:
 
     Attributes:
         squares: (folds,) sum of squared errors [m²].
-        rows: (folds,) rows, each counted by its robust weight.
+        rows: (folds,) number of rows, each weighted by its robust weight.
     """
 
     squares: np.ndarray
@@ -92,26 +97,26 @@ class UnseenErrors:
         return float(np.sqrt(mean_square))
 
     def wins(self, errors: UnseenErrors) -> bool:
-        """Return whether the error is smaller than `errors` in at least half of the folds."""
+        """Return whether the error is smaller than the other error `errors` in at least half of the folds."""
         return bool(np.sum(self.squares < errors.squares) * 2 >= len(self.squares))
 
 
 @dataclass(frozen=True, eq=False)
 class FoldStatistics:
-    """Least-squares statistics of every fold, for the columns of free geometry and deflection terms.
+    """Least-squares statistics of every fold, for the columns of the fitted geometry and of deflection terms.
 
     Attributes:
-        rigid: number of geometry columns, which come first.
-        identified: how many of their combinations the rows identify.
+        rigid: number of geometry columns, which are the first columns.
+        identified: number of geometry parameters or combinations that the rows identify.
         groups: (E,) ridge group of each term.
-        sizes: (E,) first guess of each coefficient.
-        coordinates: of geometry and terms, in which the statistics are.
+        sizes: (E,) first guess of each coefficient's magnitude.
+        coordinates: coordinates of geometry and terms in which the statistics are expressed.
         plausible: (rigid,) wide prior on the geometry, which keeps parameters that a fold does not identify at the
             optimum.
-        training: per fold, statistics of the other folds' rows, whitened.
-        held_out: per fold, statistics of its rows [m], and how many.
-        rows: per fold.
-        total: statistics of all rows, whitened.
+        training: for each fold, whitened statistics of the rows of all other folds.
+        held_out: for each fold, statistics of its rows [m].
+        rows: (folds,) number of held-out rows, each weighted by its robust weight.
+        total: whitened statistics of all rows.
     """
 
     rigid: int
@@ -127,7 +132,10 @@ class FoldStatistics:
     _widths_of_terms: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
     def error(self, terms: np.ndarray) -> UnseenErrors:
-        """Return the errors on held-out rows of a model with the geometry and `terms` (whole groups)."""
+        """Return the errors on held-out rows of a model with the geometry and the terms numbered `terms`.
+
+        If a term of a group is included, all terms of the group are.
+        """
         index = self._columns(terms)
         widths = self._widths(terms)
         start = np.where(widths > 0.0, widths, self.coordinates.sizes[index])
@@ -139,7 +147,9 @@ class FoldStatistics:
         return UnseenErrors(np.array(squares), self.rows)
 
     def ridges(self, terms: np.ndarray) -> np.ndarray:
-        """Return the most probable prior standard deviation of each term from all rows; 0 if the data drop the term."""
+        """Return the most probable prior standard deviation of each term, from all rows; 0 for a term that is
+        switched off.
+        """
         columns = self._columns(terms)
         factors = self._widths(terms) / self.coordinates.sizes[columns]
         factor_of_group = np.ones(int(self.groups.max(initial=-1)) + 1)
@@ -151,7 +161,7 @@ class FoldStatistics:
         return np.flatnonzero(np.isin(self.coordinates.groups, [-1, *self.groups[terms]]))
 
     def _widths(self, terms: np.ndarray) -> np.ndarray:
-        """Return the most probable prior standard deviation of each geometry and term coordinate, from all rows."""
+        """Return the most probable prior standard deviation of each coordinate of geometry and terms, from all rows."""
         key = terms.tobytes()
         if key not in self._widths_of_terms:
             index = self._columns(terms)
@@ -160,7 +170,14 @@ class FoldStatistics:
         return self._widths_of_terms[key]
 
     def _search(self, data: Gram, index: np.ndarray, start: np.ndarray, iterations: int) -> Relevance:
-        """Return the estimate of some coordinates; `start`: their prior standard deviations to begin with."""
+        """Return the estimate of the coordinates `index`, with the most probable prior standard deviations.
+
+        Args:
+            data: sufficient statistics of the rows, in all coordinates.
+            index: indices of the coordinates to estimate.
+            start: initial prior standard deviations.
+            iterations: largest number of iterations.
+        """
         square = data.square.take(index, 0).take(index, 1)
         rigid = np.arange(self.rigid)
         square[rigid, rigid] += 1.0 / self.plausible**2
@@ -174,13 +191,13 @@ class FoldStatistics:
 def fold_statistics(
     fit: GeometricFit, measured: Sequence[PoseMeasurements], terms: tuple[Term, ...], reference: Chain, folds: Folds
 ) -> FoldStatistics:
-    """Return the statistics of every fold at a fitted model, for its free parameters and `terms`.
+    """Return the statistics of every fold at a fitted model, for its fitted parameters and `terms`.
 
     Args:
         fit: the model, fitted to all rows.
-        measured: the blocks it was fitted to.
-        terms: E deflection terms on offer.
-        reference: chain on which the terms' bases are evaluated.
+        measured: the blocks to which it was fitted.
+        terms: E deflection terms that the model selection may choose from.
+        reference: chain on which the terms' basis functions are evaluated.
         folds: partition of the rows.
     """
     cell = replace(fit.cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
@@ -250,7 +267,14 @@ def fold_statistics(
 
 
 def _placed_anew(measured: Sequence[PoseMeasurements], held_out: Sequence[np.ndarray]) -> list[bool]:
-    """Return for each block whether all rows of its station are held out, so that its placement is fitted to them."""
+    """Return, for each block, whether all rows of its station are held out.
+
+    The placement of such a station is fitted to the held-out rows.
+
+    Args:
+        measured: the blocks of measurements.
+        held_out: for each block, the numbers of its held-out rows.
+    """
     fitted_stations = set()
     for block, rows in zip(measured, held_out):
         if len(rows) < len(block):
@@ -259,14 +283,15 @@ def _placed_anew(measured: Sequence[PoseMeasurements], held_out: Sequence[np.nda
 
 
 def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], folds: Folds) -> np.ndarray:
-    """Return which folds cannot be predicted (folds,): the other rows do not determine the tool position in them.
+    """Return which folds cannot be predicted, (folds,) bool: the other rows do not determine the tool position in them.
 
-    There the error by the covariance of geometry and frames (nominal residuals as noise, `plausible_deviation` as
-    prior) exceeds `MAX_BLIND_ERROR` times those residuals.
+    The expected error of a fold follows from the covariance of geometry and placements, with the nominal arm's
+    residuals as noise and `plausible_deviation` as prior. A fold cannot be predicted where this error exceeds
+    `MAX_BLIND_ERROR` times the residuals.
 
     Args:
-        nominal: the nominal arm with its frames fitted to all rows.
-        measured: the blocks it was fitted to, positions or poses all.
+        nominal: the nominal arm with placements fitted to all rows.
+        measured: the blocks to which it was fitted; all must be positions or poses.
         folds: partition of the rows.
     """
     free = layout(nominal.cell).rigid_index
@@ -300,19 +325,22 @@ def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], fol
 
 @dataclass(frozen=True, eq=False)
 class Share:
-    """Statistics of some rows, and factors that whiten them and put them in metres; 0 where they do not count."""
+    """Statistics of some rows, and the factors that convert them to whitened statistics and to metres.
+
+    A factor is 0 where the rows are not included in statistics of that kind.
+    """
 
     gram: Gram
     whitening: float
     metric: float
 
     def condensed(self, coordinates: Condensed) -> Share:
-        """Return the statistics in other coordinates."""
+        """Return the statistics expressed in other coordinates."""
         return replace(self, gram=coordinates.gram(self.gram))
 
 
 def _sum(shares: Sequence[Share], in_metres: bool = False) -> Gram:
-    """Return the statistics of all shares, whitened or in metres."""
+    """Return the summed statistics of all shares: in metres if `in_metres`, else whitened."""
     scaled = []
     for share in shares:
         factor = share.metric if in_metres else share.whitening
@@ -335,9 +363,13 @@ class _FoldRows:
     def statistics(
         self, block_rows: Sequence[np.ndarray], placed_anew: Sequence[bool] | None = None
     ) -> tuple[list[Share], float]:
-        """Return the statistics of some rows, and the number of rows in metres.
+        """Return the statistics of some rows, and the number of rows in metres, weighted by their robust weights.
 
-        Of the blocks that are `placed_anew` the station's placement is projected out of the statistics in metres.
+        For blocks marked in `placed_anew`, the station's placement is projected out of the statistics in metres.
+
+        Args:
+            block_rows: for each block, the row numbers.
+            placed_anew: for each block, whether its station's placement is fitted to these rows; None for no block.
         """
         shares = list[Share]()
         count = 0.0
@@ -370,7 +402,12 @@ class _FoldRows:
         return shares, count
 
     def _separable_shares(self, number: int, rows: np.ndarray) -> list[Share]:
-        """Return the statistics of positions or poses, of which whitened rows and rows in metres differ by a factor."""
+        """Return the statistics of positions or poses; for these, whitened and metric rows differ only by a factor.
+
+        Args:
+            number: index of the block.
+            rows: row numbers in the block.
+        """
         block = prepare(self.cell, [take(self.measured[number], rows)])[0]
         divisors = repeat(1.0 / np.sqrt(self.weights[number][rows][None]))
         shares = []
@@ -382,7 +419,12 @@ class _FoldRows:
     def _observed_shares(
         self, number: int, rows: np.ndarray
     ) -> tuple[list[Share], list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
-        """Return the statistics of whitened rows; and residual, W and weights of rows in metres."""
+        """Return the statistics of whitened rows, and for rows in metres residual, Jacobian and weights of each part.
+
+        Args:
+            number: index of the block.
+            rows: row numbers in the block.
+        """
         block = prepare(self.cell, [take(self.measured[number], rows)])[0]
         weights = self.weights[number][rows]
         noise = self.noises[number]
@@ -403,7 +445,14 @@ class _FoldRows:
 
 
 def project_out(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Return columns (f, ...) with those at `frames` projected out, as if these were fitted to the rows."""
+    """Return the part of `columns` (f, ...) that is orthogonal to the columns at `frames`.
+
+    This has the same effect as a fit of the parameters at `frames` to the rows.
+
+    Args:
+        columns: (f, ...) statistics or Jacobian columns of f parameters.
+        frames: indices of the parameters to project out.
+    """
     flat = columns.reshape(len(columns), -1)
     basis, size, _ = np.linalg.svd(flat[frames].T, full_matrices=False)
     basis = basis[:, size > 1e-9 * size[0]]

@@ -1,7 +1,8 @@
 """Partitions of measurements for cross-validation: by station, file, fixture, or region of the joint space.
 
-A random split of grid data holds out neighbours of what was fitted and flatters every model; these folds ask for
-transfer.
+With a random split of poses on a grid, held-out poses have fitted neighbours, and every model seems better than it is.
+The folds of this module hold out whole groups of poses instead, so that the model must predict other parts of the
+workspace.
 """
 
 from collections.abc import Sequence
@@ -12,12 +13,12 @@ import numpy as np
 from calib.data.poses.measurements import Distances, PoseMeasurements, Sockets, take
 from calib.errors import UsageError, require
 
-# regions of the joint space, and folds that they are divided among (our choice)
+# number of regions of the joint space, and number of folds over which they are distributed (our choice)
 REGIONS = 20
 FOLDS = 5
-# parts of a fold that the other rows do not determine
+# number of random parts of a fold that the other rows do not determine
 SCATTERED_FOLDS = 3
-# poses of which each may be held out alone
+# largest number of poses for folds of one pose each
 MAX_SINGLE_POSES = 150
 NAMES = ("transfer", "regions", "random", "poses")
 
@@ -27,10 +28,11 @@ class Folds:
     """A partition of the rows of all blocks.
 
     Attributes:
-        kind: ``stations``, ``files``, ``fixtures`` or ``regions``; ``random`` or ``poses`` (leave-one-out) on request.
+        kind: ``stations``, ``files``, ``fixtures`` or ``regions``; on request ``random`` or ``poses`` (leave-one-out).
         count: number of folds.
-        members: per block, (m,) fold of each row.
-        blind: names of groups that are not held out as a whole, since the other rows do not determine their tool.
+        members: for each block, (m,) index of each row's fold, from 0.
+        blind: names of stations or files that are not held out as a whole, since the other rows do not determine their
+            tool.
     """
 
     kind: str
@@ -42,9 +44,14 @@ class Folds:
 def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds:
     """Return the most demanding folds that the measurements allow: by station, file, fixture or region.
 
-    Two or more stations: leave one station out (its placement is fitted anew on the held-out rows). Two or more files
-    without an instrument: leave one file out. Several fixtures (groups of linked sockets, planes): leave some out. Else
-    `REGIONS` regions of the joint space by k-means, in `FOLDS` folds, both fewer where there are few rows.
+    With two or more stations, each fold holds out one station, whose placement is fitted to the held-out rows. With two
+    or more files without an instrument, each fold holds out one file. With at least three fixtures (groups of linked
+    sockets, planes), each fold holds out some of them. Otherwise `REGIONS` regions of the joint space (k-means) are
+    distributed over `FOLDS` folds; both numbers are smaller where there are few rows.
+
+    Args:
+        measured: blocks of measurements.
+        seed: seed of the clusters of regions.
     """
     stations = {block.station for block in measured if block.has_instrument}
     if len(stations) >= 2 and all(block.has_instrument for block in measured):
@@ -60,7 +67,13 @@ def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds
 
 
 def _folds_of(kind: str, names: Sequence[str], measured: Sequence[PoseMeasurements]) -> Folds:
-    """Return folds that each hold out all blocks of one name; if there are too many names, some share a fold."""
+    """Return folds that each hold out all blocks of one name; with too many names, several names share a fold.
+
+    Args:
+        kind: kind of the folds, for `Folds.kind`.
+        names: name of each block's station or file.
+        measured: blocks of measurements.
+    """
     distinct = list(dict.fromkeys(names))
     count = min(len(distinct), 2 * FOLDS)
     members = []
@@ -72,14 +85,18 @@ def _folds_of(kind: str, names: Sequence[str], measured: Sequence[PoseMeasuremen
 def divide(
     folds: Folds, blind: np.ndarray, measured: Sequence[PoseMeasurements], seed: int = 0, scattered: bool = False
 ) -> Folds:
-    """Return the folds with those marked in `blind` (count,) split by region, one fold per region.
+    """Return the folds, where each fold marked in `blind` (count,) is split into several by regions of the joint space.
 
-    What is left out as a whole has to be predicted by the rest. Where the rest does not determine the tool (it holds
-    one orientation, say), errors there say nothing of any model; those on a part, the other part being fitted, do.
+    A fold that is held out as a whole is predicted from the other folds. If these do not determine the tool's placement
+    (because they contain only one orientation, for example), the error on this fold does not depend on the quality of
+    the model. If only a part of it is held out, and the remaining part is fitted, the error does.
 
     Args:
-        scattered: hold out every third row of a region instead of the region, if the other rows do not determine its
-            tool.
+        folds: the partition.
+        blind: (count,) mask of the folds to split.
+        measured: blocks of measurements.
+        seed: seed of the regions.
+        scattered: True splits at random into three parts, for folds whose regions cannot be predicted either.
     """
     members = [np.array(fold) for fold in folds.members]
     count = 0
@@ -106,7 +123,14 @@ def divide(
 def _divided(
     measured: Sequence[PoseMeasurements], fold_rows: Sequence[np.ndarray], seed: int, scattered: bool
 ) -> list[np.ndarray]:
-    """Return, for each block, the part of each row of a fold that is divided by region or at random."""
+    """Return, for each block, the part number of each of its rows in a fold that is split by region or at random.
+
+    Args:
+        measured: blocks of measurements.
+        fold_rows: for each block, the row numbers in the fold.
+        seed: seed of regions or random parts.
+        scattered: True splits at random, False by region.
+    """
     parts = [np.zeros(0, dtype=int) for _ in measured]
     numbers = [number for number, rows in enumerate(fold_rows) if len(rows)]
     blocks = [take(measured[number], fold_rows[number]) for number in numbers]
@@ -119,7 +143,16 @@ def _divided(
 def region_folds(
     measured: Sequence[PoseMeasurements], regions: int = REGIONS, folds: int = FOLDS, seed: int = 0
 ) -> Folds:
-    """Return folds made of regions of the joint space (k-means on joint values in units of their spread)."""
+    """Return folds that consist of regions of the joint space.
+
+    The regions are clusters by k-means on joint values divided by their standard deviations.
+
+    Args:
+        measured: blocks of measurements.
+        regions: number of regions.
+        folds: number of folds; each consists of several regions.
+        seed: seed of the clusters.
+    """
     from scipy.cluster.vq import kmeans2
 
     q = np.concatenate([block.q for block in measured])
@@ -140,10 +173,16 @@ def region_folds(
 
 
 def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds:
-    """Return folds by name: `transfer_folds`, `region_folds`, ten `random_folds`, or one fold per pose (``poses``).
+    """Return the folds of a given kind.
+
+    Args:
+        name: ``transfer`` (`transfer_folds`), ``regions`` (`region_folds`), ``random`` (ten `random_folds`) or
+            ``poses`` (one fold per pose).
+        measured: blocks of measurements.
+        seed: seed of random choices.
 
     Raises:
-        UsageError: for another name, or for leaving out each of more than `MAX_SINGLE_POSES` poses.
+        UsageError: an unknown name, or ``poses`` for more than `MAX_SINGLE_POSES` poses.
     """
     if name == "poses" and sum(len(block) for block in measured) > MAX_SINGLE_POSES:
         raise UsageError(f"folds 'poses' hold out each pose once: at most {MAX_SINGLE_POSES} rows; choose 'random'")
@@ -156,11 +195,16 @@ def folds_by_name(name: str, measured: Sequence[PoseMeasurements], seed: int = 0
 
 
 def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, seed: int = 0) -> Folds:
-    """Return random folds by seed: k-fold, or leave-one-out where `folds` is None.
+    """Return random folds: k folds, or leave-one-out where `folds` is None.
 
-    They ask for interpolation only: on a grid every held-out pose has neighbours among the fitted ones, so that errors
-    come out smaller than elsewhere in the workspace. Reflectors of one pose and the two rows of a distance stay
-    together.
+    These folds test interpolation only: on a grid of poses, every held-out pose has fitted neighbours, so that errors
+    are smaller than elsewhere in the workspace. All reflectors measured at one pose are in the same fold, and so are
+    the two rows of a distance.
+
+    Args:
+        measured: blocks of measurements.
+        folds: number k of folds; None for one fold per pose.
+        seed: seed of the draw.
     """
     members = []
     count = 0
@@ -176,7 +220,12 @@ def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, s
 
 
 def _together(block: PoseMeasurements, fold: np.ndarray) -> np.ndarray:
-    """Return the fold of each row, with both rows of a distance in one fold."""
+    """Return the fold number of each row, with both rows of a distance in the same fold.
+
+    Args:
+        block: the measurements.
+        fold: (m,) fold number of each row.
+    """
     if not isinstance(block, Distances):
         return fold
     _, first, pair = np.unique(block.group, return_index=True, return_inverse=True)
@@ -184,7 +233,13 @@ def _together(block: PoseMeasurements, fold: np.ndarray) -> np.ndarray:
 
 
 def _fixtures(block: Sockets) -> Folds | None:
-    """Return folds of whole fixtures (sockets with known distances form one fixture); None for fewer than three."""
+    """Return folds that hold out whole fixtures; None for fewer than three fixtures.
+
+    Sockets with known distances between them are one fixture.
+
+    Args:
+        block: measurements of sockets.
+    """
     groups = np.unique(block.group).tolist()
     fixture = dict(zip(groups, groups))
     for first, second, _ in block.links:

@@ -1,13 +1,13 @@
-"""Model selection: which joint corrections are added to the geometry, judged on rows that were not fitted.
+"""Model selection: which joint corrections are added to the geometry, decided by errors on rows that were not fitted.
 
     geometry → + one effect → + one more … (their names: `calib.data.poses.MODELS`)
 
-The rigid geometry is not selected: it is the most probable one under priors of making (`calib.geometry.fit`), or the
-frames or joint offsets alone where the user asks for these. Of the effects on top of it, the one that lowers the error
-on held-out rows (`calib.geometry.model_choice.folds`) most is taken up, then the one that pays most beside it, until
-none pays: sag may show only once gear errors are gone.
-
-The effects a ladder of models may add to the geometry, each a family of deflection terms.
+An effect is a family of deflection terms (joint corrections as functions of q), such as compliance or gear errors. The
+sequence of models is called the ladder. The rigid geometry is not selected: it is the most probable one under priors of
+making (`calib.geometry.fit`), or only the placements or joint offsets where the user asks for these. The effect that
+reduces the error on held-out rows (`calib.geometry.model_choice.folds`) most is added. Then the effect that reduces the
+remaining error most is added, until no effect reduces it enough. One effect may be visible only after another was
+added: compliance, for example, only after gear errors.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,14 +33,14 @@ from calib.geometry.weighing import GeometricFit, Settings
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 
-# an effect has to lower the error on held-out rows by this share (our choice)
+# smallest relative reduction of the error on held-out rows by an effect that is added (our choice)
 MIN_GAIN = 0.03
-# robust sigmas beyond which a row is not of this robot (our choice)
+# number of robust sigmas above which a row is a gross outlier (our choice)
 MAX_RESIDUAL = 8.0
-# highest orders of harmonics: of a joint's encoder and gear, and of its axis' wobble
+# highest orders of harmonics: for a joint's encoder and gear, and for the wobble of its axis
 MAX_ORDER = 60
 MAX_WOBBLE_ORDER = 2
-# harmonics of order k are offered to sets of at least this many poses times k (our choice)
+# harmonics of order k need at least this number of poses times k (our choice)
 POSES_PER_ORDER = 8
 RIGID_MODELS = ("frames", "offsets", "geometry")
 NONE = np.array([], dtype=int)
@@ -49,7 +49,14 @@ Progress = Callable[[int, int, str], None]
 
 
 def _stiffness(chain: Chain, torques_known: bool) -> list[Term]:
-    """Return the terms of joint deflection about the axis under gravity: by known torques, else fitted moments."""
+    """Return the terms for deflection of each joint about its axis under gravity.
+
+    They use the gravity torques if these are known, else fitted moments.
+
+    Args:
+        chain: the arm.
+        torques_known: whether gravity torques can be computed from known masses.
+    """
     terms: list[Term] = []
     for joint, element in enumerate(chain.moving):
         if torques_known and chain.joints[joint].kind == "revolute":
@@ -60,7 +67,12 @@ def _stiffness(chain: Chain, torques_known: bool) -> list[Term]:
 
 
 def _bending(chain: Chain, torques_known: bool) -> list[Term]:
-    """Return the terms for tilt of each joint's axis under gravity, due to compliant bearings and links."""
+    """Return the terms for the tilt of each joint's axis under gravity, due to compliant bearings and links.
+
+    Args:
+        chain: the arm.
+        torques_known: not used; the interface of all effects.
+    """
     terms: list[Term] = []
     for number in _fixed_elements(chain):
         if chain.elements[number].axis[0] == "r":
@@ -69,20 +81,31 @@ def _bending(chain: Chain, torques_known: bool) -> list[Term]:
 
 
 def _fixed_elements(chain: Chain) -> list[int]:
-    """Return the elements that no joint moves, without those behind the last joint."""
+    """Return the numbers of chain elements that no joint moves, without those after the last joint."""
     moving = set(chain.moving.tolist())
     return [k for k, element in enumerate(chain.elements) if k not in moving and element.owner < chain.n]
 
 
 def _sag(chain: Chain, number: int) -> list[Term]:
-    """Return the terms of an element that turns under the weight of the links it carries, by link and axis."""
+    """Return the terms for the rotation of an element under the weight of the links it carries, by link and axis.
+
+    Args:
+        chain: the arm.
+        number: index of the element.
+    """
     element = chain.elements[number]
     links = range(element.owner, chain.n)
     return [Term(element.name, "lever", link, axis) for link in links for axis in range(3)]
 
 
 def _coupling(chain: Chain, torques_known: bool) -> list[Term]:
-    """Return the terms that correct a joint by its reading and its neighbours': gear ratio, coupled gears."""
+    """Return the terms for gear ratios and coupled gears: corrections proportional to a joint's value or its
+    neighbours'.
+
+    Args:
+        chain: the arm.
+        torques_known: not used; the interface of all effects.
+    """
     terms: list[Term] = []
     for joint in range(chain.n):
         name = chain.names[chain.moving[joint]]
@@ -92,7 +115,12 @@ def _coupling(chain: Chain, torques_known: bool) -> list[Term]:
 
 
 def _harmonics(chain: Chain, torques_known: bool) -> list[Term]:
-    """Return the terms sin k q_j, cos k q_j of each revolute joint, k = 1 … `MAX_ORDER`: encoder and gear errors."""
+    """Return the terms sin k q_j, cos k q_j, k = 1 … `MAX_ORDER`, of each revolute joint: encoder and gear errors.
+
+    Args:
+        chain: the arm.
+        torques_known: not used; the interface of all effects.
+    """
     terms: list[Term] = []
     for joint, element in enumerate(chain.moving):
         terms += _turning(chain, chain.names[element], joint, MAX_ORDER)
@@ -100,7 +128,12 @@ def _harmonics(chain: Chain, torques_known: bool) -> list[Term]:
 
 
 def _wobble(chain: Chain, torques_known: bool) -> list[Term]:
-    """Return low harmonics of q_j on every other element of joint j: wobble of its axis."""
+    """Return the terms for wobble of each joint's axis: low harmonics of q_j on the other elements of joint j.
+
+    Args:
+        chain: the arm.
+        torques_known: not used; the interface of all effects.
+    """
     terms: list[Term] = []
     for number in _fixed_elements(chain):
         element = chain.elements[number]
@@ -109,7 +142,14 @@ def _wobble(chain: Chain, torques_known: bool) -> list[Term]:
 
 
 def _turning(chain: Chain, name: str, joint: int, max_order: int) -> list[Term]:
-    """Return the harmonic terms of an element in the angle of a revolute joint; none for a prismatic joint."""
+    """Return the terms of an element that are harmonics of a revolute joint's angle; empty for a prismatic joint.
+
+    Args:
+        chain: the arm.
+        name: name of the element that the terms move.
+        joint: index of the joint.
+        max_order: highest order k of sin k q and cos k q.
+    """
     if chain.joints[joint].kind != "revolute":
         return []
     return [Term(name, basis, joint, order) for order in range(1, max_order + 1) for basis in HARMONIC]
@@ -117,21 +157,21 @@ def _turning(chain: Chain, name: str, joint: int, max_order: int) -> list[Term]:
 
 MODELS = CHOICES[1:]
 FAMILIES = (_stiffness, _bending, _coupling, _harmonics, _wobble)
-# by name: from a chain, and whether gravity torques are known, to terms
+# effects by name: functions that return the terms for a chain, and for known or unknown gravity torques
 EFFECTS: dict[str, Callable[[Chain, bool], list[Term]]] = dict(zip(MODELS[3:], FAMILIES, strict=True))
 
 
 @dataclass(frozen=True)
 class ModelStep:
-    """One step of the ladder: a model that was tried.
+    """One model tried in the model selection.
 
     Attributes:
-        model: its name, e.g. ``geometry`` or ``+ harmonics``.
-        parameters: how many it fits.
-        cross_validated_mm: rms error on unseen rows; None in files of earlier versions.
-        kept: whether the next steps include it.
-        note: why, in words.
-        corrections: how many of the parameters are small joint corrections, shrunk by a ridge.
+        model: name of the model, e.g. ``geometry`` or ``+ harmonics``.
+        parameters: number of fitted parameters.
+        cross_validated_mm: rms error on held-out rows [mm]; None in files of earlier versions.
+        kept: True where the next models include this step.
+        note: reason for not using the effect, in words; empty for a step that is used.
+        corrections: number of the parameters that are joint corrections, regularised by a ridge.
     """
 
     model: str
@@ -143,7 +183,7 @@ class ModelStep:
 
     @property
     def cross_validated(self) -> float:
-        """Cross-validation error: rms on held-out rows [m]."""
+        """Cross-validation error: rms on held-out rows [m]; NaN where it is not known."""
         return np.nan if self.cross_validated_mm is None else 1e-3 * self.cross_validated_mm
 
 
@@ -153,16 +193,17 @@ class ModelSelection:
 
     Attributes:
         fit: the chosen model, fitted to all rows.
-        nominal: the nominal arm with its frames fitted to all rows.
-        nominal_step: the ladder's step of this nominal arm.
-        rigid: the best fit without effects, to all rows. The geometry in ``fit`` is valid only together with its
-            effects, with which it is correlated; use this one without effects (for a URDF).
+        nominal: the nominal arm with placements fitted to all rows.
+        nominal_step: the step of the nominal arm.
+        rigid: the best fit to all rows without effects. The geometry in ``fit`` is valid only together with its
+            effects, with which it is correlated; without effects (for a URDF), use ``rigid``.
         rungs: all models tried, in order.
         chosen: name of the chosen model, e.g. ``geometry + harmonics``.
-        folds: how the unseen rows were set aside.
-        loss: the loss that was used.
-        offered: all terms of the effects that were taken up; those in ``fit`` are the ones the data kept.
-        rigid_cross_validated: rms error of the best model without effects on held-out rows [m].
+        folds: partition of the rows by which rows were held out.
+        loss: the robust loss that was used.
+        offered: all terms of the chosen effects; ``fit`` contains those of them that the data did not switch off.
+        rigid_cross_validated: rms error of the best model without effects on held-out rows [m]; None if it is not
+            known.
     """
 
     fit: GeometricFit
@@ -178,7 +219,7 @@ class ModelSelection:
 
     @property
     def cross_validated(self) -> float:
-        """The error of the chosen model on held-out rows [m]: that of the last step kept."""
+        """Rms error of the chosen model on held-out rows [m], that of the last step used."""
         error = np.inf
         for rung in self.rungs:
             if rung.kept:
@@ -186,12 +227,14 @@ class ModelSelection:
         return error
 
     def rigid_fit(self, measured: Sequence[PoseMeasurements], settings: Settings, bare: Chain | None) -> GeometricFit:
-        """Return the best fit without any joint corrections (for a URDF), not even those of the robot as it came.
+        """Return the best fit without any joint corrections (for a URDF).
+
+        Corrections that the robot had before the fit are also left out.
 
         Args:
-            measured: the blocks that were fitted.
-            settings: of the fit.
-            bare: the geometry of the robot as it came that is valid without its corrections; None if it has none.
+            measured: the fitted blocks.
+            settings: settings of the fit.
+            bare: the geometry the robot had before the fit that is valid without its corrections; None if it had none.
         """
         if bare is None:
             return self.rigid
@@ -214,22 +257,24 @@ def select_model(
     folds: Folds | None = None,
     progress: Progress | None = None,
 ) -> ModelSelection:
-    """Return the model that the data support, or the one chosen by name, fitted to all rows.
+    """Return the model that the data support, or the model of a given name, fitted to all rows.
 
     Args:
-        cell: nominal arm, frames placed (`calib.geometry.first_guess.install`).
+        cell: nominal arm, with stations and tools placed (`calib.geometry.first_guess.install`).
         measured: blocks of measurements.
-        model: ``auto``, or one of `MODELS`: that step and all before it.
-        settings: of every fit. With loss ``auto``, rows beyond `MAX_RESIDUAL` robust sigmas of the rigid fit change it
-            to ``cauchy``, for fits and errors on unseen rows.
-        fixed: positions in the parameter vector that stay at their nominal.
-        prior: standard deviations of the parameter vector about its nominal; infinite without a prior.
-        seed: of the regions.
-        folds: how unseen rows are set aside; None for the most demanding way (`calib.geometry.model_choice.folds`).
-        progress: called with (done, total, task).
+        model: ``auto`` selects the model; one of `MODELS` takes that step and all before it.
+        settings: settings of every fit; None for the defaults. With loss ``auto``, rows beyond `MAX_RESIDUAL` robust
+            sigmas of the rigid fit change the loss to ``cauchy``, for the fits and for the errors on held-out rows.
+        fixed: indices of parameters that are not fitted; None for no such parameters.
+        prior: standard deviations of the parameter vector about its nominal values, infinite for no prior; None for no
+            prior at all.
+        seed: seed of the regions of the joint space that are held out.
+        folds: partition by which rows are held out; None for the most demanding one
+            (`calib.geometry.model_choice.folds`).
+        progress: called with (done, total, task): steps done, steps in all, name of the next step; None for no report.
 
     Raises:
-        UsageError: for a model that does not exist.
+        UsageError: the model does not exist.
     """
     one_of(model, ("auto", *MODELS), "model", UsageError)
     climber = _Climber(
@@ -252,24 +297,26 @@ def select_model(
 
 
 def _no_progress(done: int, total: int, task: str) -> None:
-    """Show nothing."""
+    """Do nothing; used where no progress report is requested."""
 
 
 @dataclass
 class _Climber:
-    """State of one model selection: the best model so far and the steps tried; see `select_model` for its fields.
+    """State of a model selection: the best model so far, and the steps tried.
 
     Attributes:
-        transfer: the partition of the rows that was asked for.
-        folds: that partition, with folds divided that the other rows do not determine.
-        nominal: the nominal arm with its frames fitted.
-        best: the best model so far, and `chosen` its name.
+        cell, measured, settings, fixed, prior, progress, seed: arguments of `select_model`.
+        transfer: the partition of the rows that was requested.
+        folds: that partition, with those folds split that the other rows do not determine.
+        nominal: the nominal arm with its placements fitted.
+        best, chosen: the best model so far, and its name.
         stiff: the best model without effects.
-        full: the fit of all rigid parameters, to which effects may be added; None without one.
+        full: the fit of all rigid parameters, to which effects may be added; None where the user asked for a smaller
+            model.
         error: rms error of the best rigid model on held-out rows [m].
-        rungs: steps tried; `nominal_step` the first of them.
-        offered: terms of the effects that were taken up.
-        ticks: calls of `progress` so far.
+        rungs, nominal_step: the steps tried, and the first of them.
+        offered: terms of the chosen effects.
+        ticks: number of calls of `progress` so far.
     """
 
     cell: Installation
@@ -296,7 +343,9 @@ class _Climber:
             self._divide_blind_folds()
 
     def _divide_blind_folds(self) -> None:
-        """Divide the stations that the others do not determine by regions, and regions still undetermined by rows."""
+        """Split folds that the other rows do not determine: first by regions and, if this does not suffice, by
+        single rows.
+        """
         for scattered in (False, True):
             blind = blind_folds(self.nominal, self.measured, self.folds)
             if not blind.any():
@@ -304,7 +353,12 @@ class _Climber:
             self.folds = divide(self.folds, blind, self.measured, self.seed, scattered)
 
     def rigid(self, model: str) -> None:
-        """Fit the rigid geometry, or the frames or joint offsets alone where the user asks for these."""
+        """Fit the rigid geometry, or only the placements or joint offsets where the user asks for these.
+
+        Args:
+            model: name of the requested model: ``frames`` (placements), ``offsets``, or any other for all rigid
+                parameters.
+        """
         rigid_model = model if model in RIGID_MODELS else "geometry"
         self.error = self._statistics(self.nominal, ()).error(NONE).rms
         self.nominal_step = ModelStep("frames", self.nominal.identified, 1e3 * self.error, rigid_model == "frames")
@@ -328,9 +382,12 @@ class _Climber:
             self.full = self.best
 
     def effects(self, model: str) -> None:
-        """Add effects to the geometry one by one; for an effect's name, use it and all before it.
+        """Add effects to the geometry one by one or, given the name of an effect, add this one and all before it.
 
-        Effects whose fit does not come to an end, though the user did not ask for them, are left out again.
+        Effects that the selection added are removed again if the fit with them does not converge.
+
+        Args:
+            model: name of an effect, or ``auto`` to select the effects.
         """
         if self.full is None:
             return
@@ -371,10 +428,11 @@ class _Climber:
         self.rungs[last] = replace(self.rungs[last], parameters=corrected.identified, corrections=corrections)
 
     def _greedy(self, statistics: FoldStatistics, columns: dict[str, np.ndarray]) -> list[str]:
-        """Return the effects that reduce the cross-validation error, best first (greedy selection).
+        """Return the names of the effects that reduce the cross-validation error, best first (greedy selection).
 
         Args:
-            columns: indices of each effect's terms among those of the statistics.
+            statistics: statistics of every fold.
+            columns: for each effect, the numbers of its terms among those of the statistics.
         """
         effects: list[str] = []
         index = NONE
@@ -403,7 +461,14 @@ class _Climber:
     def _final(
         self, rigid: GeometricFit, statistics: FoldStatistics, terms: Sequence[Term], index: np.ndarray
     ) -> GeometricFit:
-        """Return the fit of geometry and effects to all rows, each term with its most probable ridge."""
+        """Return the fit of geometry and effects to all rows, with the most probable ridge of each term.
+
+        Args:
+            rigid: the fit of the geometry.
+            statistics: statistics of every fold, from which the ridges follow.
+            terms: all terms to which the statistics refer.
+            index: numbers of the terms to fit; terms that the data switch off are omitted.
+        """
         reference = self.nominal.cell.chain
         ridges = statistics.ridges(index)
         alive = ridges > 0.0
@@ -435,7 +500,7 @@ class _Climber:
         self.ticks += 1
 
     def result(self) -> ModelSelection:
-        """Return the model selected."""
+        """Return the result of the model selection."""
         loss = self.settings.loss
         if loss == "auto":
             loss = "none"
@@ -458,7 +523,12 @@ class _Climber:
 
 
 def _declined(effect: UnseenErrors, error: UnseenErrors) -> str:
-    """Return why an effect is not used: by how much it changes the error on held-out rows, and in how many folds."""
+    """Return why an effect is not used: the change of the error on held-out rows, and the number of better folds.
+
+    Args:
+        effect: errors with the effect.
+        error: errors without it.
+    """
     gain = 1.0 - effect.rms / error.rms
     if gain <= 0.0:
         return "no better on held-out rows: not used"
@@ -468,7 +538,17 @@ def _declined(effect: UnseenErrors, error: UnseenErrors) -> str:
 
 
 def _rung(statistics: FoldStatistics, effect: str, index: np.ndarray, rms: float, note: str = "") -> ModelStep:
-    """Return the ladder step of an effect from its cross-validation error `rms` [m]; kept if `note` is empty."""
+    """Return the step of an effect, from its cross-validation error `rms` [m].
+
+    The effect is used in the next models if `note` is empty.
+
+    Args:
+        statistics: statistics of every fold.
+        effect: name of the effect.
+        index: numbers of the terms of the model.
+        rms: cross-validation error [m].
+        note: reason for not using the effect.
+    """
     # terms that the data do not switch off
     corrections = int(np.sum(statistics.ridges(index) > 0.0))
     return ModelStep(

@@ -1,18 +1,19 @@
-"""Test of gravity: is it the stated vector, another direction, or absent from the torques of some joints?
+"""Test of gravity: do the torques show the stated vector, another direction, or no gravity at some joints?
 
-For stated masses torque is linear in the gravity vector g, and for a stated g in the masses χ:
+Torque is linear in the gravity vector g for given masses χ, and linear in χ for a given g:
 
     τ = Y(q, v, a; 0) χ + Σ_k g_k Y_k(q) χ + drives,    k = x, y, z in the base frame.
 
-So each direction needs one least-squares fit of bodies with any masses, from products that are computed once. One
-further fit, with separate masses for each of x, y, z, bounds the residual of all directions. The magnitude remains the
-stated one, since only the ratio of masses to inertias identifies it (`recording_sizes.ClockRatio`). Masses that may be
-negative fit -g nearly as well as g in slow motion; in fast motion the first moments must also fit the inertial torques.
+So each tested direction needs one least-squares fit of bodies with any masses, from matrix products that are computed
+once. A further fit with separate masses for x, y and z gives a lower bound of the residual of all directions. The
+magnitude of g remains the stated one, since torques identify only the ratio of masses to inertias
+(`recording_sizes.ClockRatio`). If masses may be negative, -g fits nearly as well as g in slow motion; in fast motion
+the first moments must also fit the inertial torques, which decides the sign.
 
-Whether a joint's torque contains gravity at all is tested separately, since bodies without mass explain torques without
-gravity: the gravity torque of the robot's masses (without masses, of rods scaled by their inertias) is fitted to each
-joint, together with the torques of motion and drive. An arm whose joints all turn about the vertical identifies
-neither, and no statement is made.
+A separate test decides whether a joint's torque contains gravity at all, since bodies without mass also explain torques
+without gravity. The gravity torque of the robot's masses (if these are unknown, of rods scaled by the robot's inertias)
+is fitted to each joint's torque, together with the torques of motion and drive. For an arm whose joints all turn about
+the vertical neither test applies, and no result is reported.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -58,22 +59,18 @@ DIRECTIONS = 60
 """Directions of a half sphere that are tried first: some 20 degrees apart."""
 
 
-# residual with another hypothesis over that with gravity as stated, from which on it is reported; 0.95 and more on the
-# real recordings at hand (our choice)
-
-
 @dataclass(frozen=True, eq=False)
 class GravityHypotheses:
     """Gravity as identified from the torques of recorded motions, compared with the stated vector.
 
     Attributes:
         stated: (3,) stated gravity vector in the base frame [m/s²].
-        before: (n,) unexplained share of the joints' rms torque with the stated vector.
+        before: (n,) unexplained share of each joint's rms torque with the stated vector.
         direction: (3,) another vector of the same magnitude that explains the torques; None if there is none.
-        after: (n,) unexplained share with `direction`; equal to `before` if that is None.
-        ambiguous: whether the opposite of `direction`, or a third direction, explains as much.
+        after: (n,) unexplained share with `direction`; equal to `before` if `direction` is None.
+        ambiguous: whether the opposite of `direction`, or a third direction, explains the torques as well.
         absent: joints, from 0, whose torques contain no gravity.
-        factors: (n,) gravity torque over the expected one; NaN where the motion does not identify it.
+        factors: (n,) identified over expected gravity torque; NaN where the motion does not identify this factor.
         sigmas: (n,) standard deviations of `factors`.
     """
 
@@ -88,13 +85,13 @@ class GravityHypotheses:
 
     @property
     def factor(self) -> float:
-        """Ratio of rms residuals with the other direction and with the stated one, geometric mean over the joints."""
+        """Ratio of rms residuals with `direction` and with the stated gravity, geometric mean over the joints."""
         ratio = self.after / self.before
         return float(np.exp(np.mean(np.log(ratio))))
 
     @property
     def refuted(self) -> bool:
-        """Whether the torques refute gravity as stated."""
+        """Whether another direction explains the torques, or some joints' torques contain no gravity."""
         return self.direction is not None or bool(self.absent)
 
 
@@ -136,9 +133,9 @@ def _another_direction(sums: "_GravitySums", stated: np.ndarray, before: np.ndar
     """Return the gravity vector (3,) that explains the torques better than the stated one; None if there is none.
 
     Args:
-        sums: products of the motions.
-        stated: (3,) stated gravity vector; the returned one has its magnitude.
-        before: (n,) unexplained shares with the stated vector.
+        sums: regressor products of the motions.
+        stated: (3,) stated gravity vector, which gives the magnitude.
+        before: (n,) unexplained share of each joint's rms torque with the stated vector.
     """
     bound = sums.bound()
     if _mean(bound / before) > MAX_LEFT:
@@ -155,14 +152,14 @@ def _another_direction(sums: "_GravitySums", stated: np.ndarray, before: np.ndar
 def _without_gravity(
     sums: "_GravitySums", gravity: np.ndarray, unexplained: np.ndarray, candidates: Sequence[int]
 ) -> tuple[int, ...]:
-    """Return the joints whose torques contain no gravity: those better explained without it.
+    """Return the joints whose torques contain no gravity, i.e. that a model without gravity explains better.
 
     Args:
-        sums: products of the motions.
+        sums: regressor products of the motions.
         gravity: (3,) gravity vector.
-        unexplained: (n,) unexplained shares with gravity at all joints.
-        candidates: joints whose torques lack the gravity expected of the robot's masses; for these it suffices that the
-            fit without gravity is as good.
+        unexplained: (n,) unexplained share of each joint's rms torque with gravity at all joints.
+        candidates: joints whose torques do not contain the gravity torque of the robot's masses; for them it suffices
+            that the fit without gravity is as good.
     """
     absent: list[int] = []
     if candidates:
@@ -183,9 +180,10 @@ def _without_gravity(
 
 
 class _GravitySums:
-    """Products WᵀW by joint, summed over motions.
+    """Regressor products WᵀW of each joint, summed over motions.
 
-    The columns W are those of bodies in motion without gravity, of bodies under gravity along x, y, z, and of drives.
+    The columns of W describe bodies in motion without gravity, bodies at rest under gravity along x, y and z, and
+    drives; the last column is the torque.
     """
 
     def __init__(self, motions: Sequence[MotionSamples]) -> None:
@@ -197,11 +195,11 @@ class _GravitySums:
         self.power = np.maximum(self.squares[:, -1, -1], 1e-300)
 
     def unexplained(self, gravity: np.ndarray, without: Collection[int] = ()) -> np.ndarray:
-        """Return the unexplained share (n,) of the joints' rms torques under a gravity vector (3,).
+        """Return the unexplained share (n,) of each joint's rms torque under a gravity vector.
 
         Args:
             gravity: (3,) vector in the base frame [m/s²].
-            without: joints, from 0, whose torques contain no gravity.
+            without: joints, from 0, at which gravity is omitted.
         """
         squares = np.array(self.squares)
         for joint in without:
@@ -214,7 +212,11 @@ class _GravitySums:
         return self._unexplained(np.eye(self.squares.shape[1]), self.squares)
 
     def cost(self, unexplained: np.ndarray) -> Callable[[np.ndarray], float]:
-        """Return a function from a gravity vector (3,) to the sum of squares, weighted by unexplained shares (n,)."""
+        """Return a function that maps a gravity vector (3,) to the weighted sum of squared residuals of all joints.
+
+        Args:
+            unexplained: (n,) unexplained shares, by whose inverse squares the joints are weighted.
+        """
         weight = 1.0 / (unexplained**2 * self.power)
         total = np.tensordot(weight, self.squares, 1)
 
@@ -227,7 +229,7 @@ class _GravitySums:
         return squares
 
     def _under(self, gravity: np.ndarray) -> np.ndarray:
-        """Return the matrix (k, p + 1) that maps columns of bodies under a gravity vector (3,) to all k columns."""
+        """Return the matrix (k, p + 1) from the k columns to p columns under a gravity vector (3,), and the torque."""
         inertial = np.eye(10 * self.bodies)
         by_body = inertial.reshape(self.bodies, 10, -1)
         masses = by_body[:, MASSES].reshape(4 * self.bodies, -1)
@@ -239,7 +241,12 @@ class _GravitySums:
         return np.block([[bodies, beside_bodies], [beside_drives, drives]])
 
     def _unexplained(self, change: np.ndarray, squares: np.ndarray) -> np.ndarray:
-        """Return the unexplained shares (n,) with columns mapped by a matrix `change` (k, p + 1)."""
+        """Return the unexplained shares (n,) of a fit with the columns combined by a matrix `change` (k, p + 1).
+
+        Args:
+            change: matrix that combines the k columns into p columns and the torque.
+            squares: (n, k, k) WᵀW of each joint.
+        """
         residual = self.power
         for _ in range(ROUNDS):
             weight = 1.0 / np.maximum(residual, 1e-12 * self.power)
@@ -250,13 +257,24 @@ class _GravitySums:
 
 
 def _products(motion: MotionSamples) -> np.ndarray:
-    """Return WᵀW by joint (n, k, k) of the columns W = [bodies without gravity, in x, y, z, drives, torque]."""
+    """Return WᵀW of each joint (n, k, k) for the columns of `_columns`.
+
+    Args:
+        motion: samples of one recording.
+    """
     columns = _columns(motion).transpose(1, 0, 2)
     return np.asarray(columns.transpose(0, 2, 1) @ columns)
 
 
 def _columns(motion: MotionSamples) -> np.ndarray:
-    """Return the columns (m, n, 10 B + 3 · 4 B + 4 n + 1): bodies without gravity, in x, y, z, drives, and torque."""
+    """Return the columns (m, n, 10 B + 3 · 4 B + 4 n + 1) of m samples of n joints.
+
+    They describe bodies in motion without gravity, bodies at rest under gravity along x, y and z, and drives; the last
+    column is the torque.
+
+    Args:
+        motion: m samples of one recording of n joints and B bodies.
+    """
     m, n = motion.q.shape
     zero = np.zeros_like(motion.v)
     weightless = motion.bodies.with_gravity(np.zeros(3))
@@ -272,7 +290,7 @@ def _columns(motion: MotionSamples) -> np.ndarray:
 
 
 def _solved(square: np.ndarray) -> np.ndarray:
-    """Return the least-squares solution (p,) from [W y]ᵀ[W y] (p + 1, p + 1), zero in directions without data."""
+    """Return the least-squares solution (p,) from [W y]ᵀ[W y] (p + 1, p + 1); unidentified directions are zero."""
     size = np.sqrt(np.diag(square)[:-1])
     scale = np.where(size > 1e-9 * size.max(), size, np.inf)
     scaled = square[:-1, :-1] / (scale[:, None] * scale)
@@ -287,7 +305,7 @@ def _mean(ratios: np.ndarray) -> float:
 
 
 def _angle(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the angle between two vectors (3,) [rad]; a right angle if one of them is zero."""
+    """Return the angle between the vectors `first` and `second` (3,) [rad]; a right angle if one of them is zero."""
     size = float(np.linalg.norm(first) * np.linalg.norm(second))
     if not size > 0.0:
         return 0.5 * np.pi
@@ -295,10 +313,13 @@ def _angle(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _best_direction(sums: _GravitySums, magnitude: float, unexplained: np.ndarray) -> np.ndarray:
-    """Return the gravity vector (3,) of a magnitude [m/s²] with the smallest residual, of both signs.
+    """Return the gravity vector (3,) of the given magnitude with the smallest residual; both signs are tried.
 
-    Joints are weighted by their unexplained share (n,) with separate masses for each axis, then by that with the
-    direction.
+    Args:
+        sums: regressor products of the motions.
+        magnitude: length of the vector [m/s²].
+        unexplained: (n,) unexplained shares with separate masses for each axis, which weight the joints at first; later
+            the shares of the best direction do.
     """
     cost = sums.cost(unexplained)
     axis = min(magnitude * _half_sphere(DIRECTIONS), key=cost)
@@ -310,7 +331,12 @@ def _best_direction(sums: _GravitySums, magnitude: float, unexplained: np.ndarra
 
 
 def _refined(cost: Callable[[np.ndarray], float], start: np.ndarray) -> np.ndarray:
-    """Return the vector (3,) of least cost near `start`, of the same length."""
+    """Return the vector (3,) with the smallest cost near `start`, of equal length.
+
+    Args:
+        cost: function of a vector (3,).
+        start: first vector, whose length is kept.
+    """
     # Imported here because it is slow to load.
     from scipy.optimize import minimize
 
@@ -342,13 +368,20 @@ def _half_sphere(count: int) -> np.ndarray:
 def _gravity_factors(
     motions: Sequence[MotionSamples], chain: Chain, gravity: np.ndarray, newtons: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the joints' gravity torques over those expected under a gravity vector (3,), and their sigmas, (n,) each.
+    """Return identified over expected gravity torques of the joints, standard deviations of these factors, and a mask.
 
-    The third array is a mask (n,) of joints whose expected gravity torque varies more than the whole recorded torque.
+    The mask marks joints whose expected gravity torque varies more than the whole recorded torque. All three arrays are
+    (n,).
 
-    Each joint's torque is modelled as gravity of the robot's masses times a factor, motion of its inertias times a
-    factor, and the drive's torque. NaN where no gravity torque is expected, or motion and friction are not
-    distinguishable from it.
+    Each joint's torque is modelled as a factor times the gravity torque of the robot's masses, plus a factor times the
+    torque of its inertias in motion, plus the drive's torque. Factor and sigma are NaN if hardly any gravity torque is
+    expected, or if motion and friction cannot be distinguished from it.
+
+    Args:
+        motions: samples of the recordings.
+        chain: the arm; rods replace its masses if it has none.
+        gravity: (3,) gravity vector [m/s²].
+        newtons: whether torques are in N m.
     """
     n = chain.n
     factors = np.full(n, np.nan)
@@ -395,7 +428,12 @@ def _gravity_factors(
 
 
 def _inertia_factor(motions: Sequence[MotionSamples], reference: np.ndarray) -> float:
-    """Return ratio of the robot's inertias to those of bodies (10 B,), for any gravity; NaN where not identified."""
+    """Return the ratio of the robot's inertias to reference inertias, for any gravity; NaN if not identified.
+
+    Args:
+        motions: samples of the recordings.
+        reference: (10 B,) standard parameters of the reference bodies.
+    """
     moving = []
     free = []
     torque = []

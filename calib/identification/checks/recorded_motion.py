@@ -1,8 +1,8 @@
 """Checks of a recording against the designed motion and the robot's nominal masses.
 
-All comparisons use a coarse common time grid; `calib.trajectories.recall` finds the motion and its repetitions. This
-module also has what the quick checks of torques share: a few samples of a recording, and the share of its torques that
-columns explain.
+All comparisons use a common coarse time grid; `calib.trajectories.recall` finds the motion and its repetitions. This
+module also contains what the quick checks of torques have in common: a small sample of a recording, and the share of
+torques that a set of columns explains.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -53,7 +53,10 @@ Pair = tuple[np.ndarray, np.ndarray]
 
 
 class DesignedMotion(Protocol):
-    """A periodic motion of n joints: its period [s], and a function of times (N,) that returns q, v and a."""
+    """A periodic motion of n joints.
+
+    `period` is its period [s]; `orders` maps times (N,) [s] to q, v and a, (N, n) each.
+    """
 
     @property
     def period(self) -> float: ...
@@ -67,11 +70,10 @@ class LocatedMotion:
 
     Attributes:
         start, stop: start and end of the complete repetitions, with a short margin [s], in the recording's time.
-        began: start of the first repetition, where the positions match best [s]: later than commanded by the tracking
-            lag.
+        began: start of the first repetition according to the positions [s]; later than commanded, by the tracking lag.
         periods: number of complete repetitions.
         tracking: (n,) rms of recorded minus designed positions [rad or m].
-        likeness: smallest share of the motion's variance that a recorded period explains.
+        likeness: share of the motion's variance that the worst of the recorded periods explains.
         loosest: index of the joint with the largest tracking error relative to its travel.
     """
 
@@ -85,7 +87,12 @@ class LocatedMotion:
 
 
 def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None:
-    """Return the repetitions of a designed motion in a recording; None if it contains none."""
+    """Return the location of the repetitions of a designed motion in a recording; None if it contains none.
+
+    Args:
+        recording: recording of n joints.
+        motion: the designed motion, which may be repeated.
+    """
     grid, q = _on_grid(recording)
     reference = _one_period(motion)
     recalled = _recalled(q, reference)
@@ -116,12 +123,12 @@ def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None
 def another_motion(
     recording: Recording, motion: DesignedMotion, alternatives: Mapping[str, DesignedMotion]
 ) -> Change | None:
-    """Return the change of the designed motion that explains a recording, e.g. other units; None if none tested does.
+    """Return the change of the designed motion that explains a recording, e.g. other units; None if none does.
 
     Args:
         recording: recording of n joints.
-        motion: the motion that should have been played; it is tried at other `SPEEDS`, in other `UNITS`, with its
-            columns swapped and reversed, and with joints that count from the one before them.
+        motion: the motion that should have been played; it is tested at other `SPEEDS`, in other `UNITS`, with columns
+            swapped or reversed, and with joint positions that are relative to the previous joint.
         alternatives: designed motions by name, one of which may have been played instead.
     """
     _, q = _on_grid(recording)
@@ -153,13 +160,17 @@ def another_motion(
 
 
 def _on_grid(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times of the coarse grid (N,) and the positions at them (N, n)."""
+    """Return the times of the coarse grid (N,) and the positions at these times (N, n).
+
+    Args:
+        recording: recording of n joints.
+    """
     grid = _coarse(recording.t)
     return grid, _sampled(recording.t, recording.q, grid)
 
 
 def _coarse(t: np.ndarray) -> np.ndarray:
-    """Return a time grid with spacing `STEP` [s] over sample times (N,); longer gaps are cut to `MAX_GAP`."""
+    """Return a time grid with spacing `STEP` [s] over sample times (N,); longer gaps are shortened to `MAX_GAP`."""
     before_gap = np.flatnonzero(np.diff(t) > MAX_GAP)
     starts = t[np.append(0, before_gap + 1)]
     stops = np.append(t[before_gap] + MAX_GAP, t[-1])
@@ -168,19 +179,24 @@ def _coarse(t: np.ndarray) -> np.ndarray:
 
 
 def _sampled(t: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return values (N, n) at times (N,), interpolated at the times of a grid."""
+    """Return values (M, n), recorded at times `t` (M,), interpolated linearly at the times `grid` (N,), as (N, n)."""
     return np.column_stack([np.interp(grid, t, column) for column in values.T])
 
 
 def _one_period(motion: DesignedMotion, speed: float = 1.0) -> np.ndarray:
-    """Return positions (P, n) of one period of a motion at `speed` times its speed, sampled about every `STEP` [s]."""
+    """Return positions (P, n) over one period of a motion played at `speed` times its speed, about every `STEP` [s]."""
     count = round(motion.period / speed / STEP)
     q, _, _ = motion.orders(np.arange(count) * motion.period / count)
     return q
 
 
 def _recalled(q: np.ndarray, reference: np.ndarray) -> Recalled | None:
-    """Return the periods of a motion (P, n) found in positions (N, n); None if there are none."""
+    """Return the repetitions of one period (P, n) of a motion in positions (N, n); None if there are none.
+
+    Args:
+        q: (N, n) positions on the coarse grid [rad or m].
+        reference: (P, n) positions over one period on a grid of equal spacing.
+    """
     try:
         return find_periods(q, reference, likeness=MIN_LIKENESS)
     except BadInput:
@@ -188,7 +204,11 @@ def _recalled(q: np.ndarray, reference: np.ndarray) -> Recalled | None:
 
 
 def _unlike(data: Pair) -> np.ndarray:
-    """Return the share (1,) of variance that the worst recorded period leaves unexplained; 1 without periods."""
+    """Return the share (1,) of variance that is unexplained in the worst recorded period; 1 without periods.
+
+    Args:
+        data: recorded positions (N, n), and one period (P, n) of the designed motion.
+    """
     q, reference = data
     recalled = _recalled(q, reference)
     if recalled is None:
@@ -197,7 +217,12 @@ def _unlike(data: Pair) -> np.ndarray:
 
 
 def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return for each joint the recorded column (n,) and its sign (n,) that correlate best with the designed motion."""
+    """Return the recorded column (n,) and sign (n,) for each joint that correlate best with the designed motion.
+
+    Args:
+        q: (N, n) recorded positions on the coarse grid.
+        reference: (P, n) positions over one period of the designed motion.
+    """
     n = reference.shape[1]
     likeness = np.zeros((2, n, n))
     window = np.ones(len(reference))
@@ -221,21 +246,23 @@ def share_of_nominal(
     gravity: Sequence[float] | None = None,
     static: bool = False,
 ) -> np.ndarray:
-    """Return the ratios (n,) of recorded torques to those of the nominal masses, with the drives estimated as well.
+    """Return the ratios (n,) of recorded torques to the nominal masses' torques; drives are estimated as well.
 
-    Least squares of τ_j on [τ_nominal,j, a_j, v_j, tanh(v_j / v0), 1] on the coarse grid; a_j is the column of the
-    rotor's inertia, which would otherwise appear as mass. A joint is judged where its rigid-body torque is more than
-    `MIN_TORQUE` of its limit and the partial correlation of both torques is above `MIN_SIGN_CORRELATION`.
+    τ_j is fitted by least squares with τ_nominal,j, a_j, v_j, tanh(v_j / v0) and 1 on the coarse grid; a_j is the
+    column of the rotor's inertia, which would otherwise be attributed to the mass. A joint is judged only if its
+    rigid-body torque exceeds `MIN_TORQUE` of its limit and the partial correlation of both torques exceeds
+    `MIN_SIGN_CORRELATION`.
 
     Args:
         t: (N,) sample times [s].
-        q, effort: (N, n) positions [rad or m] and torques.
+        q, effort: (N, n) positions [rad or m] and torques [N m or N].
         chain: the arm with its nominal masses.
-        gravity: (3,) [m/s²]; None: the chain's own.
-        static: whether only gravity torques are compared, with the torques of motion free parameters like the drives'.
+        gravity: (3,) gravity vector [m/s²]; None: the chain's.
+        static: whether only gravity torques are compared; the torques of motion are then fitted with a free factor.
 
     Returns:
-        (n,) factors on τ_nominal: 1 for right masses, below 0 for a reversed sign; NaN for joints that are not judged.
+        (n,) factors of τ_nominal: 1 for correct masses, below 0 for a reversed sign; NaN for joints that are not
+            judged.
     """
     grid = _coarse(t)
     torque = _smooth(_sampled(t, effort, grid))
@@ -282,7 +309,10 @@ def bodies_under(chain: Chain, gravity: Sequence[float] | None) -> Bodies:
 
 
 def _smooth(values: np.ndarray, order: int = 0) -> np.ndarray:
-    """Return values (N, n) of the coarse grid, or their derivatives, smoothed by cubics over a moving window."""
+    """Return values (N, n) on the coarse grid, or their time derivatives, smoothed by cubics over a moving window.
+
+    `order` is the order of the derivative, 0 for the values themselves.
+    """
     # Imported here because it is slow to load.
     from scipy.signal import savgol_filter
 
@@ -293,12 +323,12 @@ def _smooth(values: np.ndarray, order: int = 0) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class MotionSamples:
-    """N samples of a recorded motion of n joints, with the regressors of its torques.
+    """N samples of a recorded motion of n joints, from which the regressors of the torques are computed.
 
     Attributes:
         index: (N,) indices of the samples in the motion.
         q, v, a: (N, n) [rad or m, per s, per s²].
-        effort, velocity: smoothed torques, and velocities, of the whole motion (all samples, n).
+        effort, velocity: (M, n) smoothed torques [N m or N], and velocities [per s], of all M samples of the motion.
         bodies: rigid bodies of the robot.
     """
 
@@ -312,7 +342,7 @@ class MotionSamples:
 
     @property
     def torque(self) -> np.ndarray:
-        """Torques (N, n), smoothed."""
+        """Smoothed torques (N, n) at the samples."""
         return self.effort[self.index]
 
     @cached_property
@@ -323,14 +353,14 @@ class MotionSamples:
 
     @cached_property
     def at_rest(self) -> np.ndarray:
-        """Regressor of the bodies at rest (N, n, 10 B): gravity alone."""
+        """Regressor of the bodies at zero velocity and acceleration (N, n, 10 B): gravity alone."""
         zero = np.zeros_like(self.v)
         columns = regressor(self.bodies, self.q, zero, zero)
         return columns.reshape(*self.q.shape, -1)
 
     @cached_property
     def drives(self) -> np.ndarray:
-        """Regressor of the drives (N, n, 4 n): Ia, Fv, Fc and off of each joint."""
+        """Regressor of the drives (N, n, 4 n): motor inertia, viscous and Coulomb friction, offset of each joint."""
         m, n = self.q.shape
         joints = np.arange(n)
         columns = np.zeros((m, n, n, 4))
@@ -339,7 +369,15 @@ class MotionSamples:
 
 
 def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None:
-    """Return about `count` samples of a recording of motor torques; None if too few are usable."""
+    """Return about `count` samples of a recording of motor torques; None if too few are usable.
+
+    Samples near the ends of a segment are omitted.
+
+    Args:
+        case: the recording.
+        bodies: rigid bodies of the robot.
+        count: number of samples.
+    """
     # Imported here because it is slow to load.
     from scipy.ndimage import uniform_filter1d
 
@@ -359,18 +397,22 @@ def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None
 
 
 def drive_columns(v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return the drive columns (..., 4) of velocities and accelerations (...): a, v, smoothed sign(v), and 1."""
+    """Return the drive columns (..., 4) for velocities and accelerations (...): a, v, smoothed sign(v), and 1."""
     sign = np.tanh(v / CREEP)
     return np.stack([a, v, sign, np.ones_like(v)], axis=-1)
 
 
 def basis(columns: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (N, k) of the column space of (N, p)."""
+    """Return an orthonormal basis (N, k) of the space that columns (N, p) span."""
     return np.asarray(columns @ spanning(columns.T @ columns))
 
 
 def spanning(square: np.ndarray) -> np.ndarray:
-    """Return the matrix (p, k) that maps columns W to an orthonormal basis of their space, from WᵀW (p, p)."""
+    """Return the matrix S (p, k) for which W S is an orthonormal basis of the column space of W, from WᵀW (p, p).
+
+    Args:
+        square: WᵀW of the columns W (N, p); k is their rank.
+    """
     size = np.sqrt(np.diag(square))
     nonzero = np.flatnonzero(size > 1e-9 * size.max())
     nonzero_size = size[nonzero]

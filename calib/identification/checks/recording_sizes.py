@@ -1,15 +1,16 @@
-"""Checks whether a recording belongs to a robot: masses, limits, joints' signs, order and zeros, and the clock.
+"""Checks whether a recording was made with the described robot: masses, limits, joints' signs, order, zeros, and clock.
 
-Only numbers are computed here; `calib.procedure.dynamic_stage.plausibility` turns them into findings. All checks use a
-few samples. All thresholds are our choice; on the real recordings at hand (Panda, KR300, LWR4+, TX40, TIAGo, 22 of a
-UR10e) none is reached.
+This module computes numbers only; `calib.procedure.dynamic_stage.plausibility` turns them into findings. All checks use
+a few samples. All thresholds are our choice; none is reached on the real recordings at hand (Panda, KR300, LWR4+, TX40,
+TIAGo, 22 of a UR10e).
 
-A clock that runs s times too slow makes accelerations s² times too small, so that inertias come out s² times too large
-while masses, which gravity identifies, stay as they are. The ratio of inertias to masses nearly follows from lengths
-alone: that of rods between the joints is right up to 17 % on every recording at hand that identifies it (Panda, LWR4+,
-TX40, 11 of a UR10e), whatever the masses and the unit of the torques are. All these have six joints or more; arms of
-two, whose last link has no known length, are not checked: one gave 45. A simulated TX40 gave 0.46; so where the
-description has masses, inertias are compared with these if they are nearer (0.9 to 1.2 on these recordings).
+If a clock runs s times too slow, accelerations appear s² times too small, so that inertias are identified s² times too
+large, while masses, which gravity identifies, are unaffected. The ratio of inertias to masses depends nearly on lengths
+alone. The ratio of rods between the joints is correct within 17 % on every recording at hand that identifies it (Panda,
+LWR4+, TX40, 11 of a UR10e), whatever the masses and the torques' unit are. All these arms have six joints or more. Arms
+of two joints, whose last link has no known length, are not checked (the ratio of one was 45). The ratio of a simulated
+TX40 was 0.46; therefore, if the description has masses, the ratio relative to the described bodies is used if it is
+nearer to 1 (0.9 to 1.2 on these recordings).
 """
 
 from collections.abc import Callable, Sequence
@@ -74,23 +75,33 @@ INDEPENDENT_ERRORS = 6
 
 @dataclass(frozen=True)
 class ClockRatio:
-    """Ratio of identified inertias to masses, divided by that of rods between the joints, and its relative sigma."""
+    """Ratio of inertias to masses of the recorded robot, divided by the ratio of reference bodies (rods).
+
+    Attributes:
+        ratio: the ratio, 1 for a correct clock.
+        relative_sigma: standard deviation of the ratio over the ratio.
+    """
 
     ratio: float
     relative_sigma: float
 
     @property
     def clock(self) -> float:
-        """Factor by which the time stamps are too large."""
+        """Factor by which the time stamps are too large: the square root of the ratio."""
         return float(np.sqrt(self.ratio))
 
 
 def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
-    """Return the ratio of inertias to masses; None if the motion or the arm does not identify both.
+    """Return the ratio of inertias to masses; None if motion or arm do not identify both.
 
-    Torques are modelled as τ = α τ_rods + free, twice: first α scales the rods' torques of motion, with any torque of
-    gravity free; then α scales their gravity torques, with any torque of motion free. Drives are free in both. Where
-    the description has masses, the ratio relative to these is returned if it is nearer to 1.
+    Torques τ are modelled as α τ_rods + free, twice: α is a factor of τ_rods, the torques of rods between the joints.
+    In the first fit α scales the rods' torques of motion, and any gravity torque is allowed; in the second, α scales
+    the rods' gravity torques, and any torque of motion is allowed. Both fits include free drives. If the description
+    has masses, the ratio relative to the described bodies is returned if it is nearer to 1.
+
+    Args:
+        samples: samples of a recording.
+        chain: the arm.
     """
     if chain.n < MIN_JOINTS:
         return None
@@ -108,7 +119,12 @@ def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
 
 
 def _ratio_to(robot: np.ndarray, samples: MotionSamples) -> ClockRatio | None:
-    """Return the ratio of inertias to masses, divided by that of bodies (10 B,); None where it is not identified."""
+    """Return the robot's ratio of inertias to masses over the reference bodies' ratio; None if not identified.
+
+    Args:
+        robot: (10 B,) standard parameters of the reference bodies.
+        samples: samples of a recording.
+    """
     of_gravity = samples.at_rest
     of_motion = samples.inertial - of_gravity
     beside_motion = np.concatenate([of_gravity, samples.drives], axis=2)
@@ -122,7 +138,13 @@ def _ratio_to(robot: np.ndarray, samples: MotionSamples) -> ClockRatio | None:
 
 
 def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> tuple[float, float]:
-    """Return α of torques τ (m, n) = α `common` + `free` x, and its sigma, each joint weighted by its residual."""
+    """Return α and its sigma for torques τ (m, n) = α `common` + `free` x, each joint weighted by its residual.
+
+    Args:
+        torque: (m, n) torques τ [N m or N].
+        common: (m, n) torques whose factor α all joints share, in the unit of τ.
+        free: (m, n, p) columns with free parameters x.
+    """
     m, n = torque.shape
     min_deviation = 1e-9 * max(float(torque.std()), 1e-300)
     weight = np.ones(n)
@@ -148,15 +170,19 @@ def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> t
 
 
 def _without(orthonormal: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return values (N,) without their projection onto an orthonormal basis (N, k)."""
+    """Return values (N,) minus their projection onto an orthonormal basis (N, k)."""
     return values - orthonormal @ (orthonormal.T @ values)
 
 
 def wrong_joints(samples: MotionSamples) -> Explanation | None:
-    """Return the joints with reversed or exchanged torques, or coupled positions; None if all joints are right.
+    """Return the joints with reversed or exchanged torques, or coupled positions; None if all joints are correct.
 
-    For each tested change one model of all joints is fitted: bodies and offsets of any size, non-negative Ia, Fv and Fc
-    of every drive. The robot's masses need not be known. Residuals are shares of the joints' torques.
+    For each tested change one model of all joints is fitted: bodies and offsets of any size, and non-negative motor
+    inertia, viscous and Coulomb friction of every drive. The robot's masses need not be known. Residuals are shares of
+    the joints' torque variances.
+
+    Args:
+        samples: samples of a recording of motor torques.
     """
     n = samples.q.shape[1]
     unexplained_shares = cache(_unexplained_function)
@@ -182,9 +208,12 @@ def wrong_joints(samples: MotionSamples) -> Explanation | None:
 
 
 def _unexplained_function(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function from a mixing of the torques to the unexplained share of each joint's variance (n,).
+    """Return a function that maps a mixing matrix of the torques to unexplained shares of the joints' variances (n,).
 
-    Its argument (n, n) mixes the recorded torque columns: the identity, with signs reversed or rows exchanged.
+    The matrix (n, n) multiplies the recorded torques: the identity, or one with signs reversed or rows exchanged.
+
+    Args:
+        samples: samples of a recording of n joints.
     """
     m, n = samples.q.shape
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
@@ -215,9 +244,13 @@ def _unexplained_function(samples: MotionSamples) -> Callable[[np.ndarray], np.n
 
 
 def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
-    """Return the exchange of two joints or zero offset of one joint that best explains the torques; None if none does.
+    """Return the exchange of two joints, or zero offset of a joint, that best explains the torques; None if none does.
 
-    The torques are predicted from the robot's masses; residuals are shares of the variance of each joint's torque.
+    The torques are predicted from the robot's masses. Residuals are shares of the variance of each joint's torque.
+
+    Args:
+        samples: samples of a recording of motor torques.
+        chain: the arm with its masses.
     """
     n = chain.n
     masses = standard_parameters(chain)
@@ -246,7 +279,12 @@ def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
 
 
 def _changed(samples: MotionSamples, matrix: np.ndarray) -> MotionSamples:
-    """Return samples with the joints' positions, velocities and accelerations multiplied by a matrix (n, n)."""
+    """Return the samples with joint positions, velocities and accelerations multiplied by a matrix (n, n).
+
+    Args:
+        samples: samples of a recording of n joints.
+        matrix: matrix that multiplies the joint values of each sample.
+    """
     q = np.ascontiguousarray(samples.q @ matrix.T)
     v = np.ascontiguousarray(samples.v @ matrix.T)
     a = np.ascontiguousarray(samples.a @ matrix.T)
@@ -256,8 +294,13 @@ def _changed(samples: MotionSamples, matrix: np.ndarray) -> MotionSamples:
 def _unexplained_by_masses(samples: MotionSamples, masses: np.ndarray) -> np.ndarray:
     """Return the share (n,) of each joint's torque variance that the robot's masses do not explain.
 
-    Each torque is modelled by gravity and motion of the robot's masses, each times a factor, by the joint's drive and
-    by those of the neighbouring joints: wrists are coupled by their gears, which could be mistaken for an exchange.
+    Each torque is modelled by four parts: a factor times the gravity torque of the robot's masses, a factor times their
+    torque of motion, the drive of the joint, and the drives of the neighbouring joints. The last part is needed because
+    wrists are coupled by their gears, which could be mistaken for an exchange of joints.
+
+    Args:
+        samples: samples of a recording.
+        masses: (10 B,) standard parameters of the robot.
     """
     q = samples.q
     v = samples.v
@@ -279,23 +322,23 @@ def _unexplained_by_masses(samples: MotionSamples, masses: np.ndarray) -> np.nda
 
 @dataclass(frozen=True)
 class RecordingSizes:
-    """Results of comparing a recording with the robot's description: masses, limits, velocities, lag and clock.
+    """Comparison of a recording with the robot's description: masses, limits, velocities, lag and clock.
 
     Attributes:
-        name: name of the case.
+        name: name of the recording.
         masses: (n,) recorded gravity torque over that of the nominal masses; NaN where it is not identified.
         limits: (n,) largest torque, ignoring the largest 1 %, over the joint's limit; NaN where no limit is known.
-        speed: (n,) measured velocities over the slopes of the positions; NaN without velocities or travel, or
-            where the two are not correlated.
-        speed_sigma: (n,) sigma of `speed`.
-        follows: (n,) correlation of the measured velocities' integrals with the positions; NaN without travel.
-        counted: whether the samples' times are computed from the measured velocities.
+        speed: (n,) measured velocities over the slopes of the positions; NaN without velocities or travel, or if the
+            two are not correlated.
+        speed_sigma: (n,) standard deviation of `speed`.
+        follows: (n,) correlation of the integrated measured velocities with the positions; NaN without travel.
+        counted: whether the samples' times were computed by counting samples, from the measured velocities.
         rate: sampling rate according to the time stamps [Hz].
-        lag: lag of the torques; None where the recording is too short to estimate it.
-        clock: ratio of inertias to masses; None where the motion does not identify it.
+        lag: lag of the torques; None if the recording is too short to estimate it.
+        clock: ratio of inertias to masses; None if the motion does not identify it.
         other: change of the columns with which the masses explain the torques better; None if no change does, or none
             was tested.
-        jumps: text on jumps of the positions.
+        jumps: texts on jumps of the positions.
     """
 
     name: str
@@ -320,7 +363,7 @@ def compare_sizes(
     Args:
         case: a recording.
         chain: the arm; its masses are used if it has any.
-        gravity: (3,) in the base frame [m/s²]; None: the robot's own.
+        gravity: (3,) gravity vector in the base frame [m/s²]; None: the chain's.
         newtons: whether the torques are in N m; torques from currents without known gains are not compared with masses.
     """
     motion = case.motion
@@ -370,7 +413,15 @@ def compare_sizes(
 
 
 def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -> Explanation | None:
-    """Return the joints of a recording with reversed torques or coupled positions; None if it is too short."""
+    """Return the joints of a recording with reversed or exchanged torques, or coupled positions.
+
+    The result is None if all joints are correct or the recording is too short.
+
+    Args:
+        case: a recording.
+        chain: the arm.
+        gravity: (3,) gravity vector in the base frame [m/s²]; None: the chain's.
+    """
     bodies = bodies_under(chain, gravity)
     samples = take_samples(case, bodies, MAX_SAMPLES)
     return None if samples is None else wrong_joints(samples)
@@ -379,11 +430,16 @@ def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -
 def _speed_ratio(
     t: np.ndarray, q: np.ndarray, v: np.ndarray, segment: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return ratios of measured velocities to differentiated positions, their sigmas, and correlations, (n,) each.
+    """Return measured velocities over differentiated positions, their standard deviations, and correlations, (n,) each.
 
-    The ratio is the regression of ∫v dt on q, both detrended, since slopes of q are noisy. Each segment (N,) is
-    integrated separately, since the velocity in a gap is unknown. The correlation is NaN for joints that hardly move,
-    the ratio also where velocities do not follow the positions.
+    The ratio is the regression coefficient of ∫v dt on q, both detrended, since slopes of q are noisy. Each segment is
+    integrated separately, since the velocity in a gap is unknown. The correlation is NaN for joints that hardly move;
+    the ratio is also NaN if the velocities do not follow the positions.
+
+    Args:
+        t: (N,) times [s].
+        q, v: (N, n) positions [rad or m] and measured velocities [rad/s or m/s].
+        segment: (N,) number of the gap-free segment of each sample.
     """
     position = np.array(q)
     integral = np.empty_like(q)

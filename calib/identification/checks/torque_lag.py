@@ -1,12 +1,12 @@
 """Lag of the recorded torques behind the positions of the same row: common to all joints, or of a single joint.
 
-At every lag that is tried, one model of all joints is fitted: bodies shared by the joints, a drive per joint, by least
-squares weighted by each joint's residual. (Separate bodies per joint would adapt to late torques: they give 148 ms
-where torques are 100 ms late.) Friction reverses later than the speed, as joints deflect before they slide, which would
-look like a lag of 20 ms (the Panda's wrist); so sign(v) is also allowed `FREE_TIME` earlier and later at each joint,
-and only masses and inertias give information on the lag. A parabola gives the minimum of the residual. For sigma each
-joint counts as one independent sample; a single joint's lag must agree in both halves of the recording. All of this and
-its thresholds are our choice.
+At every tested lag one model of all joints is fitted by least squares: bodies common to all joints and one drive per
+joint, each joint weighted by its residual. (Separate bodies per joint would adapt to late torques: they give 148 ms for
+torques that are 100 ms late.) Friction changes its sign later than the speed, since joints deflect before they slide;
+this would look like a lag of 20 ms (wrist of the Panda). Therefore sign(v) may also change `FREE_TIME` earlier or later
+at each joint, and only masses and inertias determine the lag. The minimum of the residual is interpolated by a
+parabola. For sigma each joint counts as one independent sample; the lag of a single joint must agree in both halves of
+the recording. Method and thresholds are our choice.
 """
 
 from collections.abc import Sequence
@@ -52,17 +52,19 @@ FREE_TIME = 0.03
 
 @dataclass(frozen=True)
 class Lag:
-    """Lag of the torques behind the positions of the same row [s], and how much correcting it reduces the residual.
+    """Lag of the torques behind the positions of the same row, and how much its correction reduces the residual.
 
     Attributes:
-        sigma: standard deviation of `seconds` [s]. before, after: rms share of the joints' torques unexplained by
-        bodies and friction, as recorded and after shifting.
+        seconds: the lag common to all joints [s]; positive for late torques.
+        sigma: standard deviation of `seconds` [s].
+        before, after: rms share of the joints' torques that bodies and friction do not explain, as recorded and after
+            shifting the torques by the lag.
         factor: residual as recorded over residual after shifting, each joint weighted by its residual.
         own: (n,) lags of the joints, each estimated separately [s].
         gains: (n,) residual of a joint at the common lag over that at its separate lag, with all other joints at their
             separate lags.
-        joint: the only joint, from 0, whose lag differs from the common one in both halves of the recording; None
-            without one.
+        joint: the only joint, from 0, whose lag differs from the common one in both halves of the recording; None if
+            there is none.
     """
 
     seconds: float
@@ -76,18 +78,18 @@ class Lag:
 
     @property
     def certain(self) -> bool:
-        """Whether the lag of all torques is significant and large enough to report."""
+        """Whether the common lag is significant and large enough to be reported."""
         min_lag = max(MIN_LAG, MIN_LAG_SIGMAS * self.sigma)
         significant = min_lag < abs(self.seconds) < LAGS - STEP
         return significant and self.factor > MIN_GAIN and self.after < MAX_UNEXPLAINED
 
 
 def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
-    """Return the lag of the torques; None where the motion is too short to estimate it.
+    """Return the lag of the torques; None if the motion is too short to estimate it.
 
     Args:
         samples: samples of the recording.
-        rate: sampling rate of its motion [Hz].
+        rate: sampling rate of the recording [Hz].
     """
     count = len(samples.index)
     if count * float(np.median(np.diff(samples.index))) < MIN_TIME * rate:
@@ -109,7 +111,12 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
 
 
 def _single_joint(lag: Lag, half_lags: Sequence[Lag]) -> int | None:
-    """Return the one joint whose lag differs from the common lag in both halves of the recording; None without one."""
+    """Return the joint whose lag alone differs from the common one, in both halves of the recording; else None.
+
+    Args:
+        lag: lags in the whole recording.
+        half_lags: lags in its first and in its second half.
+    """
     joint = int(lag.gains.argmax())
     gains = np.sort(lag.gains) - 1.0
     late = lag.own[joint] - lag.seconds
@@ -126,11 +133,11 @@ def _single_joint(lag: Lag, half_lags: Sequence[Lag]) -> int | None:
 
 @dataclass(frozen=True, eq=False)
 class _LagRows:
-    """Rows of a fit of n joints' torques at S lags, and their products by joint, which add up over parts of a motion.
+    """Rows of a fit of n joints' torques at S lags, with products per joint that can be added over parts of a motion.
 
     Attributes:
-        columns, torque: (n, m, p) regressor columns and (n, S, m) torques of m rows per joint.
-        square, cross, power: (n, p, p), (n, p, S) and (n, S): WᵀW, Wᵀτ and τᵀτ.
+        columns, torque: (n, m, p) regressor columns W and (n, S, m) torques τ of m rows per joint.
+        square, cross, power: WᵀW (n, p, p), Wᵀτ (n, p, S) and τᵀτ (n, S).
     """
 
     columns: np.ndarray
@@ -141,14 +148,19 @@ class _LagRows:
 
     @classmethod
     def of(cls, columns: np.ndarray, torque: np.ndarray) -> "_LagRows":
-        """Return the rows of columns and torques with their products."""
+        """Return the rows for columns (n, m, p) and torques (n, S, m), with the products WᵀW, Wᵀτ and τᵀτ."""
         across = columns.transpose(0, 2, 1)
         cross = across @ torque.transpose(0, 2, 1)
         return cls(columns, torque, across @ columns, cross, np.einsum("jsm,jsm->js", torque, torque))
 
 
 def _rows(samples: MotionSamples, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the columns (n, m, p) of all joints, and their torques (n, S, m) at the lags `SHIFTS`."""
+    """Return the regressor columns (n, m, p) of all joints, and the torques (n, S, m) shifted by all `SHIFTS`.
+
+    Args:
+        samples: samples of the recording.
+        rate: sampling rate of the recording [Hz].
+    """
     shifted = samples.index + SHIFTS[:, None] * rate
     times = np.arange(len(samples.effort))
     shifted_efforts = [np.interp(shifted, times, effort) for effort in samples.effort.T]
@@ -159,7 +171,7 @@ def _rows(samples: MotionSamples, rate: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _lag_in(rows: _LagRows) -> Lag:
-    """Return the least-squares lag of the rows, with its sigma from the spread between joints."""
+    """Return the least-squares lag of the rows; its sigma is computed from the differences between joints."""
     n = len(rows.torque)
     spread = rows.torque[:, RECORDED].std(axis=1)
     fit = _LagFit(rows, 1.0 / np.maximum(spread, 1e-12))
@@ -189,19 +201,24 @@ def _lag_in(rows: _LagRows) -> Lag:
 
 
 class _LagFit:
-    """Least squares of the joints' torques at any lags: projections at every lag are computed once.
+    """Least squares of the joints' torques for any combination of lags; projections for every lag are computed once.
 
     Attributes:
         rows: columns and torques.
         weight: (n,) weights of the joints.
         spanning: (p, k) matrix that maps the columns to an orthonormal basis of their space.
-        parts: (n, shifts, k) projections of the weighted torques onto the basis.
-        power: (n, shifts) squares of the weighted torques.
-        common: (shifts,) squared residual where all joints have the same lag.
+        parts: (n, shifts, k) projections of each joint's weighted torques onto the basis.
+        power: (n, shifts) sums of squares of the weighted torques.
+        common: (shifts,) sum of squared residuals if all joints have the same lag.
     """
 
     def __init__(self, rows: _LagRows, weight: np.ndarray) -> None:
-        """Project torques, weighted (n,), onto the columns of all joints."""
+        """Project the torques, multiplied by `weight` (n,), onto the columns of all joints.
+
+        Args:
+            rows: columns and torques of n joints at all lags.
+            weight: (n,) weights of the joints.
+        """
         self.rows = rows
         self.weight = weight
         squares = weight**2
@@ -214,24 +231,35 @@ class _LagFit:
         self.common = self.power.sum(axis=0) - explained
 
     def residual(self, lags: np.ndarray) -> np.ndarray:
-        """Return the residuals (n, m) of the weighted torques at the joints' lags (n,), indices of `SHIFTS`."""
+        """Return the residuals (n, m) of the weighted torques for joint lags (n,), given as indices of `SHIFTS`."""
         joints = np.arange(len(lags))
         projection = self.parts[joints, lags].sum(axis=0)
         return self._unexplained(self.rows.torque[joints, lags], projection)
 
     def _unexplained(self, torque: np.ndarray, parts: np.ndarray) -> np.ndarray:
-        """Return weighted torques (n, m) without their projections onto basis, whose coefficients are `parts` (k,)."""
+        """Return the weighted torques (n, m) minus their projections, with coefficients `parts` (k,) in the basis."""
         explained = self.rows.columns @ (self.spanning @ parts)
         return self.weight[:, None] * (torque - explained)
 
     def unexplained_share(self, lags: np.ndarray, spread: np.ndarray) -> float:
-        """Return the rms share of the torques, in units of their `spread` (n,), that is unexplained at lags (n,)."""
+        """Return the rms share of the joints' torques that is unexplained.
+
+        Args:
+            lags: (n,) lags of the joints, as indices of `SHIFTS`.
+            spread: (n,) standard deviations of the joints' torques over time [N m or N], to which residuals are
+                relative.
+        """
         deviation = self.residual(lags).std(axis=1) / self.weight
         relative = deviation / np.maximum(spread, 1e-12)
         return float(np.sqrt(np.mean(relative**2)))
 
     def along(self, lags: np.ndarray, joint: int) -> np.ndarray:
-        """Return the squared residual of all joints (shifts,) over one joint's lag, the other lags (n,) fixed."""
+        """Return the sum of squared residuals of all joints (shifts,) for every lag of one joint.
+
+        Args:
+            lags: (n,) lags of the other joints, as indices of `SHIFTS`.
+            joint: joint whose lag varies.
+        """
         fixed = np.flatnonzero(np.arange(len(lags)) != joint)
         fixed_part = self.parts[fixed, lags[fixed]].sum(axis=0)
         explained = ((fixed_part + self.parts[joint]) ** 2).sum(axis=1)
@@ -239,7 +267,10 @@ class _LagFit:
         return np.asarray(fixed_power + self.power[joint] - explained)
 
     def separate_lags(self, start: np.ndarray) -> np.ndarray:
-        """Return the separate least-squares lags of the joints (n,), starting from the given ones."""
+        """Return the joints' separate least-squares lags (n,), as indices of `SHIFTS`.
+
+        The search starts from the lags `start` (n,).
+        """
         lags = start.copy()
         for _ in range(MAX_SWEEPS):
             before = lags.copy()
@@ -250,14 +281,24 @@ class _LagFit:
         return lags
 
     def gain(self, lags: np.ndarray, joint: int, common: int) -> float:
-        """Return the ratio of a joint's residuals at the common lag and at its separate lag; `lags` (n,): all lags."""
+        """Return the ratio of a joint's residuals at the common lag and at its separate lag.
+
+        Args:
+            lags: (n,) separate lags of all joints, as indices of `SHIFTS`.
+            joint: joint, from 0.
+            common: common lag, as an index of `SHIFTS`.
+        """
         along = self.along(lags, joint)
         square = float((self.residual(lags)[joint] ** 2).sum())
         increase = max(along[common] - along[lags[joint]], 0.0)
         return float(np.sqrt(1.0 + increase / max(square, 1e-300)))
 
     def sigma(self, lag: int) -> float:
-        """Return the sigma of a common lag [s], an index of `SHIFTS`; each joint counts as one independent sample."""
+        """Return the standard deviation of a common lag [s]; each joint counts as one independent sample.
+
+        Args:
+            lag: the lag, as an index of `SHIFTS`.
+        """
         inner = int(np.clip(lag, 1, len(SHIFTS) - 2))
         torque, parts = self.rows.torque, self.parts
         torque_change = torque[:, inner + 1] - torque[:, inner - 1]
@@ -274,7 +315,12 @@ class _LagFit:
 
 
 def _turning(samples: MotionSamples, rate: float) -> list[np.ndarray]:
-    """Return two friction regressors (m, n, n) whose sign changes `FREE_TIME` too early and too late, respectively."""
+    """Return two friction regressors (m, n, n) whose sign changes `FREE_TIME` too early and too late, respectively.
+
+    Args:
+        samples: m samples of a recording of n joints.
+        rate: sampling rate of the recording [Hz].
+    """
     times = np.arange(len(samples.velocity))
     regressors = []
     for early in (-FREE_TIME, FREE_TIME):
@@ -287,7 +333,10 @@ def _turning(samples: MotionSamples, rate: float) -> list[np.ndarray]:
 
 
 def _parabola_minimum(values: np.ndarray, index: int) -> float:
-    """Return the minimum of a parabola through three points about an index, as an offset in indices."""
+    """Return where the parabola through values[index] and its two neighbours is smallest, as an offset from `index`.
+
+    The result is 0 at the ends of the array, or if the parabola has no minimum.
+    """
     if not 0 < index < len(values) - 1:
         return 0.0
     before, middle, after = values[index - 1 : index + 2]

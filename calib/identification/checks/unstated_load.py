@@ -1,9 +1,9 @@
-"""A payload in one of several recordings that no options state: a free body at the tip in this recording alone.
+"""Detection of a payload that the options do not state: a free body at the tip in one of several recordings.
 
-Recordings of one robot are fitted together with common bodies of any masses, and with friction and offsets per
-recording, since these change with temperature. A recording is found to carry a load where a body on its last link
-explains the torques far better than other gains of its torques do, and about as well as separate masses in every
-recording do.
+Recordings of one robot are fitted together, with the same bodies of any masses, but with friction and offsets per
+recording, since these change with temperature. A recording is reported to carry a load if a body on its last link
+explains the torques far better than changed torque gains do, and about as well as separate masses in every recording
+do.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,10 +43,6 @@ MASS = 9
 FIRST_MOMENT = slice(6, 9)
 
 
-# rms residual with the load over that with other gains of the joints' torques: 0.59 to 0.88 for real loads of a UR10e
-# (16 pairs of recordings), 0.99 and more where one recording's torques were scaled instead
-
-
 @dataclass(frozen=True)
 class UnstatedLoad:
     """A load that explains a recording's torques.
@@ -67,10 +63,10 @@ class UnstatedLoad:
 
 
 def unstated_load(samples: Mapping[str, MotionSamples]) -> UnstatedLoad | None:
-    """Return the load found in one of two or more recordings stated to carry the same; None if there is none.
+    """Return the unstated load of one of two or more recordings; None if there is none.
 
     Args:
-        samples: name of each recording → its samples.
+        samples: samples of each recording by name; all are stated to carry the same load.
     """
     if len(samples) < 2:
         return None
@@ -103,7 +99,14 @@ def unstated_load(samples: Mapping[str, MotionSamples]) -> UnstatedLoad | None:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Residuals (m, n) by recording, values of bodies and rotors (p,) and of a load (10,), and load mass's sigma."""
+    """Result of fitting several recordings together.
+
+    Attributes:
+        residuals: (m, n) residuals of each recording.
+        bodies: (p,) parameters of bodies and rotors.
+        values: (10,) standard parameters of the load.
+        sigma: standard deviation of the load's mass; infinite if it is not identified.
+    """
 
     residuals: list[np.ndarray]
     bodies: np.ndarray
@@ -112,7 +115,13 @@ class _Fit:
 
 
 def _rows(motion: MotionSamples) -> np.ndarray:
-    """Return columns (m, n, 10 B + n + 1): bodies, rotors' inertias and torques, without friction and offsets."""
+    """Return the columns (m, n, 10 B + n + 1) of bodies and rotor inertias, and the torque, of m samples.
+
+    Each is reduced by its projection onto friction and offsets, which are thereby free parameters of the recording.
+
+    Args:
+        motion: m samples of one recording.
+    """
     m, n = motion.q.shape
     drives = motion.drives.reshape(m, n, n, 4)
     target = motion.torque[:, :, None]
@@ -124,7 +133,12 @@ def _rows(motion: MotionSamples) -> np.ndarray:
 
 
 def _fit(rows: Sequence[np.ndarray], loaded: int | None) -> _Fit:
-    """Return the fit of recordings with the same bodies, and a load on the last one of recording `loaded`."""
+    """Return the fit of recordings with common bodies, and with a load on the last body in one of them.
+
+    Args:
+        rows: columns of each recording, from `_rows`.
+        loaded: index of the recording with the load; None: no recording has one.
+    """
     n = rows[0].shape[1]
     size = rows[0].shape[2] - 1
     last_body = slice(size - n - BODY, size - n)
@@ -160,7 +174,12 @@ def _fit(rows: Sequence[np.ndarray], loaded: int | None) -> _Fit:
 
 
 def _scaled(rows: Sequence[np.ndarray], recording: int) -> list[np.ndarray]:
-    """Return the residuals of a fit without load, with the torques of one recording scaled by joint."""
+    """Return the residuals of a fit without load, with a free factor per joint on the torques of one recording.
+
+    Args:
+        rows: columns of each recording, from `_rows`.
+        recording: index of the recording whose torques are scaled.
+    """
     before = rows[:recording]
     part = rows[recording]
     after = rows[recording + 1 :]
@@ -181,7 +200,11 @@ def _scaled(rows: Sequence[np.ndarray], recording: int) -> list[np.ndarray]:
 
 
 def _inverse(square: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse (p, p) of WᵀW, computed with columns scaled to unit norm."""
+    """Return the pseudo-inverse (p, p) of WᵀW, computed with columns scaled to unit norm.
+
+    Args:
+        square: WᵀW (p, p).
+    """
     size = np.sqrt(np.diag(square))
     scale = np.where(size > 1e-9 * size.max(), size, np.inf)
     scales = np.outer(scale, scale)
@@ -189,12 +212,12 @@ def _inverse(square: np.ndarray) -> np.ndarray:
 
 
 def _mean_squares(residuals: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the mean squares (n,) of residuals (m, n) of all recordings."""
+    """Return the mean squares (n,) of the residuals (m, n) of all recordings together."""
     return np.mean(np.concatenate(residuals) ** 2, axis=0)
 
 
 def _size(residuals: Sequence[np.ndarray]) -> float:
-    """Return the geometric mean over the joints of the rms of residuals (m, n) of all recordings."""
+    """Return the rms of the residuals (m, n) of all recordings, as geometric mean over the joints."""
     squares = np.maximum(_mean_squares(residuals), 1e-300)
     mean_log = np.mean(np.log(squares))
     return float(np.exp(0.5 * mean_log))

@@ -1,4 +1,4 @@
-"""Simulation of recordings' closed loops: controllers, instrumental variables, test of least squares for bias.
+"""Simulation of the closed loop of recordings: controllers, instrumental variables, test of least squares for bias.
 
-Settings and results: `calib.identification.loop`.
+Settings and results are in `calib.identification.loop`.
 """

@@ -2,9 +2,10 @@
 
     tau = clip(kp e + kd (share v_r - v_m) + ki ∫ e + ahead),    e = q_r - q_m,
 
-v_m the backward difference of measured positions at the control rate (BIRDy's choice), through a first-order low-pass
-where one is given. A cascade P-PI is this law with other gains. Computed torque applies a model to the law's output:
-tau = M(q_m) (a_r + kp e + …) + c(q_m, v_m) + g(q_m) + ahead, so its gains are 1/s² and 1/s.
+where v_m is the backward difference of measured positions at the control rate (as in BIRDy), through a first-order
+low-pass if one is set; share is the share of the reference velocity v_r that is used, and ahead the feedforward torque.
+A cascade P-PI is this law with other gains. Computed torque applies a model to the law's output: tau = M(q_m) (a_r + kp
+e + …) + c(q_m, v_m) + g(q_m) + ahead, so that its gains are in 1/s² and 1/s.
 """
 
 from dataclasses import dataclass
@@ -44,12 +45,16 @@ class Reference:
 
     @property
     def period(self) -> float:
-        """The control period [s]."""
+        """Control period [s]."""
         seconds = float(self.t[-1] - self.t[0])
         return seconds / (len(self.t) - 1)
 
     def sampled(self, ahead: np.ndarray | None) -> np.ndarray:
-        """Return position, velocity, feedforward `ahead` (N, n) and acceleration as one array (4, N, n)."""
+        """Return position, velocity, feedforward torque and acceleration as one array (4, N, n).
+
+        Args:
+            ahead: (N, n) feedforward torques [N m or N]; None: zero.
+        """
         if ahead is None:
             torque = np.zeros_like(self.q)
         else:
@@ -57,7 +62,7 @@ class Reference:
         return np.array([self.q, self.v, torque, self.a])
 
     def at(self, tick: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q, v, a (M, n) at control periods `tick` (M,), interpolated by cubic splines between integers."""
+        """Return q, v, a (M, n) at times `tick` (M,) in control periods; cubic splines interpolate between integers."""
         index = tick.astype(int)
         if np.all(tick == index):
             return self.q[index], self.v[index], self.a[index]
@@ -72,7 +77,13 @@ class Reference:
 def pd(
     kp: np.ndarray, kd: np.ndarray, limit: np.ndarray | float = np.inf, ki: np.ndarray | float = 0.0
 ) -> LoopController:
-    """Return a PD (or PID) controller with gains (n,), torque limit (n,) and, for a PID, integral gains ki."""
+    """Return a PD or PID controller.
+
+    Args:
+        kp, kd: (n,) gains of position error [N m/rad] and velocity error [N m s/rad]; N and m for a prismatic joint.
+        limit: (n,) torque limit [N m or N], or one number.
+        ki: (n,) integral gains, or one number; 0 for a PD controller.
+    """
     share = np.asarray(1.0)
     windup = np.asarray(np.inf)
     return LoopController(kp, kd, np.asarray(ki), share, np.asarray(limit), windup)
@@ -85,15 +96,20 @@ def cascade(
     limit: np.ndarray | float = np.inf,
     share: float = 1.0,
 ) -> LoopController:
-    """Return a cascade P-PI: v_c = share v_r + P e, tau = K [(v_c - v) + ∫ (v_c - v) / Ti], as a single law.
+    """Return a cascade P-PI controller as a PID: v_c = share v_r + P e, tau = K [(v_c - v) + ∫ (v_c - v) / Ti].
 
-    Up to its initial value, ∫ (v_c - v) = share q_r - q + P ∫ e. With share = 1 the gains are therefore kp = K (P +
-    1/Ti), kd = K, ki = K P / Ti; another share with an integral part cannot be written in this form.
+    Up to its initial value, ∫ (v_c - v) = share q_r - q + P ∫ e. For share = 1 the gains are therefore kp = K (P +
+    1/Ti), kd = K, ki = K P / Ti; with an integral part, another share cannot be written in this form.
 
     Args:
         position: P (n,), gain of the position loop [1/s].
         velocity: K (n,), gain of the velocity loop [N m s/rad].
-        reset: Ti (n,), reset time [s]; infinite for a plain P-P cascade.
+        reset: Ti (n,), reset time [s]; infinite for a P-P cascade.
+        limit: (n,) torque limit [N m or N], or one number.
+        share: share of the reference velocity in the velocity loop, 0 to 1.
+
+    Raises:
+        CalibError: for a share other than 1 with an integral part.
     """
     if share != 1.0 and np.isfinite(reset).any():
         raise CalibError("a cascade with integral action needs the full reference velocity: set share = 1")
@@ -108,11 +124,17 @@ def cascade(
 def computed_torque(
     model: np.ndarray, frequency: float, damping: float, n: int, limit: np.ndarray | float = np.inf
 ) -> LoopController:
-    """Return a computed-torque controller with error dynamics ë + 2 ζ ω ė + ω² e = 0 for an exact model.
+    """Return a computed-torque controller with error dynamics ë + 2 ζ ω ė + ω² e = 0 if its model is exact.
+
+    e is the position error.
 
     Args:
-        model: (10 B,) standard parameters of the controller's model; the drives' inertias and friction are the plant's.
+        model: (10 B,) standard parameters of the controller's model of B bodies; inertias and friction of the drives
+            are not in it.
         frequency: ω of the error dynamics [rad/s].
+        damping: damping ratio ζ.
+        n: number of joints.
+        limit: (n,) torque limit [N m or N], or one number.
     """
     kp = np.full(n, frequency**2)
     kd = np.full(n, 2 * damping * frequency)
@@ -123,7 +145,13 @@ def computed_torque(
 
 
 def completed(controller: LoopController, loop: LoopSettings, n: int) -> LoopController:
-    """Return the controller with the saturation, delay and velocity filter given in the settings."""
+    """Return a controller of n joints with the limits, delay and velocity filter of the settings.
+
+    Args:
+        controller: the controller with its gains.
+        loop: settings of the loop.
+        n: number of joints.
+    """
     share = np.full(n, loop.share)
     limit = loop.per_joint("limit", n)
     windup = loop.per_joint("windup", n)
@@ -135,8 +163,12 @@ def completed(controller: LoopController, loop: LoopSettings, n: int) -> LoopCon
 def stated_controller(loop: LoopSettings, n: int) -> LoopController:
     """Return the controller of n joints that the table [loop] describes.
 
+    Args:
+        loop: the table [loop], in which a list has one value or n.
+        n: number of joints.
+
     Raises:
-        UsageError: where the length of a list is not the number of joints.
+        UsageError: if the length of a list is not the number of joints.
     """
     if loop.controller == "cascade":
         first = loop.per_joint("position", n)
@@ -161,9 +193,9 @@ class IdentifiedController:
     """A controller identified from a log.
 
     Attributes:
-        controller: PD or PID with the identified gains.
-        explained: (n,) share of the low-passed torque that the feedback explains, 100 (1 - ‖tau - τ̂‖ / ‖tau - mean‖)
-            [%].
+        controller: PD or PID controller with the identified gains.
+        explained: (n,) share of each joint's low-passed torque that the feedback explains, 100 (1 - ‖tau - τ̂‖ / ‖tau -
+            mean‖) [%].
     """
 
     controller: LoopController
@@ -181,16 +213,19 @@ def identify_controller(
 ) -> IdentifiedController:
     """Return a PD or PID controller identified from logged positions, torques and their reference.
 
+    An ARX model from position error to torque is estimated with instruments that are functions of the reference; the
+    gains are then fitted to its frequency response.
+
     Args:
         reference: reference at any multiple of the log's rate; it starts with the log's first sample.
-        measured, tau: (N, n) positions and torques as logged.
+        measured, tau: (N, n) logged positions [rad or m] and torques [N m or N].
         rate: sampling rate of the log [Hz].
         band: cut-off of the low-pass, and highest frequency at which the gains are fitted [Hz].
-        orders: na, nb of the ARX model.
-        integral: whether to identify ki, too.
+        orders: na, nb: numbers of past torques and of past position errors in the ARX model.
+        integral: whether to identify the integral gains, too.
 
     Raises:
-        MeasurementError: where reference and log do not fit together, or the error is zero.
+        MeasurementError: if reference and log have different lengths or rates, or the error is zero.
     """
     error = _error(reference, measured, rate)
     shape = np.shape(measured)
@@ -227,7 +262,13 @@ def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarra
 
 
 def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
-    """Return the times (count,) of a log's samples in control periods; if whole within 0.1 %, they are rounded."""
+    """Return the times (count,) of a log's samples in control periods, as integers where these are within 0.1 %.
+
+    Args:
+        reference: reference at the controller's rate.
+        rate: sampling rate of the log [Hz].
+        count: number of the log's samples.
+    """
     every = 1.0 / (rate * reference.period)
     if abs(every / max(round(every), 1) - 1.0) < 1e-3:
         every = round(every)
@@ -235,7 +276,14 @@ def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
 
 
 def _instruments(reference: Reference, count: int, rate: float, band: float) -> np.ndarray:
-    """Return the instruments (count, k), functions of the reference: friction, inertia and gravity, low-passed."""
+    """Return low-passed instruments (count, k): functions of the reference like friction, inertia and gravity.
+
+    Args:
+        reference: reference at the controller's rate.
+        count: number of the log's samples.
+        rate: sampling rate of the log [Hz].
+        band: cut-off of the low-pass [Hz].
+    """
     q, v, a = reference.at(_ticks(reference, rate, count))
     jerk = np.gradient(a, 1.0 / rate, axis=0)
     peak = np.abs(v).max(axis=0, initial=1e-9)
@@ -250,7 +298,13 @@ def _instruments(reference: Reference, count: int, rate: float, band: float) -> 
 def _joint(
     error: np.ndarray, tau: np.ndarray, basis: np.ndarray, orders: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the ARX coefficients a, b of one joint by two-stage least squares with an orthonormal instrument basis."""
+    """Return the ARX coefficients a (na,), b (nb + 1,) of one joint, by two-stage least squares.
+
+    Args:
+        error, tau: (N,) low-passed position error [rad or m] and torque [N m or N].
+        basis: (N, k) orthonormal basis of the instruments.
+        orders: na, nb of the ARX model.
+    """
     if not np.ptp(error) > 0.0:
         raise MeasurementError("the position error is zero throughout: log measured positions, not the reference")
     na, nb = orders
@@ -271,7 +325,16 @@ def _joint(
 
 
 def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integral: bool) -> np.ndarray:
-    """Return the kp, kd, ki (3,) that fit the ARX model's frequency response best, from 1/40 to 1/2 of the band."""
+    """Return the gains kp, kd, ki (3,) that best fit the frequency response of an ARX model.
+
+    The fit uses frequencies from 1/40 to 1/2 of the band.
+
+    Args:
+        past, errors: ARX coefficients a (na,), b (nb + 1,).
+        rate: sampling rate [Hz].
+        band: highest frequency of the identification [Hz].
+        integral: whether to fit ki; otherwise it is 0.
+    """
     omega = 2.0 * np.pi * np.geomspace(band / 40.0, band / 2.0, 60)
     shift = np.exp(-1j * omega / rate)
     numerator = np.polyval(errors[::-1], shift)
@@ -289,7 +352,14 @@ def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integr
 
 
 def _explained(error: np.ndarray, tau: np.ndarray, gains: np.ndarray, rate: float, band: float) -> float:
-    """Return the share of the low-passed torque explained by the gains (n,) [%]."""
+    """Return the share [%] of a joint's low-passed torque (N,) that the gains kp, kd, ki (3,) explain.
+
+    Args:
+        error, tau: (N,) low-passed position error [rad or m] and torque [N m or N] of the joint.
+        gains: (3,) kp, kd, ki.
+        rate: sampling rate [Hz].
+        band: cut-off of the low-pass [Hz].
+    """
     kp, kd, ki = gains
     rate_of_error = np.gradient(error, 1.0 / rate)
     integral = np.cumsum(error)

@@ -1,15 +1,16 @@
-"""IDIM-IV: instruments from a closed-loop simulation with the last estimate, repeated until both converge.
+"""IDIM-IV: instruments from a closed-loop simulation with the last estimate; both steps are repeated to convergence.
 
-    simulate with x_k → Z = W(q_s, v_s, a_s), filtered and thinned like W → x_{k+1} = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y
+    simulate with x_k → Z = W(q_s, v_s, a_s), filtered and decimated like W → x_{k+1} = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y
 
 (Janot, Vandanjon & Gautier 2014). The simulation has the recording's reference and controller but no noise, so Z is
 uncorrelated with the noise that the feedback brings into W. The iteration starts from a regular robot: inertia diag(J),
 no gravity, no friction. DIDIM (Gautier, Janot & Vandanjon 2013) estimates from the simulated W alone, x_{k+1} = W_s⁺ y.
-Where the noise of the measured speed exceeds the smoothing of a Coulomb sign, the error of this column is not additive
-noise, and instruments do not help: its column of W is replaced by the simulated sign, or, where the simulation does not
-follow the motion (e.g. a wrong controller), by the sign of the measured speed in half the band (our choice).
-Constraints on base parameters, min ½ ‖P_Z (y - W x)‖² in every round, make it PC-IDIM-IV
-(`calib.identification.methods.parameter_constraints`); they do not cure a bias.
+
+Noise shifts the mean of the column of a Coulomb sign, and instruments do not remove such a bias. It is removed by
+`sign_noise`, which simulates the noise in the loop or in the log alone, wherever the torques show it to be.
+
+With constraints on base parameters, every round minimises ½ ‖P_Z (y - W x)‖² under them; this is PC-IDIM-IV
+(`calib.identification.methods.parameter_constraints`). Constraints do not remove a bias.
 """
 
 from __future__ import annotations
@@ -17,12 +18,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property, partial
 
 import numpy as np
 
-from calib.data.signals.filtering import Decimator, low_pass, slope
-from calib.data.signals.motion import Motion
+from calib.data.signals.filtering import Decimator
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
@@ -34,6 +34,7 @@ from calib.estimation.whiteness import inflation
 from calib.identification.closed_loop import instrumental_variables
 from calib.identification.closed_loop.instrumental_variables import Instruments, InstrumentStrength
 from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
+from calib.identification.closed_loop.sign_noise import PositionNoise, mean_signs, position_noise
 from calib.identification.closed_loop.simulated_runs import (
     MAX_GAIN_RATIO,
     MAX_RETREATS,
@@ -54,19 +55,19 @@ from calib.records import frozen
 
 # iterations; 3 to 6 are usual
 MAX_ROUNDS = 10
-# times the speed's noise, by which the simulated motion may be off the measured one (our choice)
-MAX_FOLLOWING = 1.25
 
 
 @dataclass(frozen=True)
 class _RoundEstimator:
-    """Estimator of one iteration, from the R factors of [Z W y].
+    """Estimator that one iteration uses, from the R factors of [Z W y].
 
     Attributes:
         name: name in options and files.
-        fit: function of triangles, standard deviations of the groups (g,), and inflation that returns the estimate.
-        triangle: function of triangles and std (g,) that returns the minimised [R z; 0 ρ], to which constraints apply.
-        measured: whether the estimate uses W of the measured motion.
+        fit: function of R factors, standard deviations of the groups (g,) and variance inflation that returns the
+            estimate.
+        triangle: function of R factors and standard deviations (g,) that returns the R factor [R z; 0 ρ] of the
+            criterion, which is minimised under constraints.
+        measured: whether the estimate uses the regressor W of the measured motion.
     """
 
     name: str
@@ -80,10 +81,10 @@ class Round:
     """Convergence of one iteration.
 
     Attributes:
-        change: largest |Δx_j| / max(|x_j|, 8 σ_j), 8 = 0.2 / 2.5 %, see
+        change: largest |Δx_j| / max(|x_j|, 8 σ_j) of a parameter; 8 = 0.2 / 2.5 %, from the criterion of
             `calib.identification.closed_loop.instrumental_variables.settled`.
         residual: standard deviation of the weighted residuals.
-        retreats: number of step halvings until the parameters could be simulated.
+        retreats: number of times the step was halved until the parameters could be simulated.
     """
 
     change: float
@@ -98,19 +99,20 @@ class Instrumental:
     Attributes:
         fit: the estimate.
         ordinary: weighted least squares of the same rows, for comparison.
-        plant: the simulated robot, with the estimated parameters.
+        plant: the simulated robot with the estimated parameters.
         rounds: history of the iterations.
-        strength: strength of the instruments, their correlation with W.
-        verdict: whether least squares is biased (Durbin, Wu, Hausman).
-        std, inflation: standard deviation of each torque row (rows,), variance inflation of all rows together.
-        distance: (n,) 100 ‖q - q_s‖ / ‖q - mean q‖ [%] of filtered measured and simulated positions: large where the
+        strength: strength of the instruments, i.e. their correlation with W.
+        verdict: test whether least squares is biased (Durbin, Wu, Hausman).
+        std, inflation: standard deviation of each torque row (rows,), and variance inflation of all rows together.
+        distance: (n,) 100 ‖q - q_s‖ / ‖q - mean q‖ [%] of filtered measured and simulated positions; large if the
             stated controller is not the robot's.
-        stray: (n,) tracking error of the recorded robot over that of the simulated one, the factor by which stated
-            gains are wrong; NaN where it is below the noise.
-        constrained: the constrained estimate, if constraints are set; `fit` has its values and covariance.
-        problem: triangles of [Z W y], one group per torque row.
+        stray: (n,) tracking error of the recorded robot over that of the simulated robot, the factor by which stated
+            gains are wrong; NaN if the tracking error is below the noise.
+        constrained: the constrained estimate; None without constraints. `fit` has its values and covariance.
+        problem: R factors of [Z W y], one group per torque row.
         estimator: estimator used in each iteration.
-        rows: for each recording, the case whose motion W describes, its rows, and Z.
+        rows: for each recording, the case whose motion W describes, its rows, and its instruments Z.
+        noise: for each recording, its position noise in the loop and in the log alone.
     """
 
     fit: LinearFit
@@ -127,6 +129,7 @@ class Instrumental:
     problem: Instruments
     estimator: _RoundEstimator
     rows: tuple[tuple[Case, ObservationRows, np.ndarray], ...]
+    noise: tuple[PositionNoise, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -135,23 +138,23 @@ class Instrumental:
 
     @property
     def direct(self) -> np.ndarray:
-        """Relative error of the simulated motion's torque (n,): 100 ‖y - Z x‖ / ‖y‖ [%]."""
+        """Relative torque error (n,) of the estimate on the simulated motion: 100 ‖y - Z x‖ / ‖y‖ [%]."""
         return self.simulated_error(self.fit.estimate.values)
 
     def simulated_error(self, values: np.ndarray) -> np.ndarray:
-        """Return the torque errors (n,) of parameters (p,) on the simulated motion: 100 ‖y - Z x‖ / ‖y‖ [%]."""
+        """Return the torque errors (n,) of parameters (p,) on the simulated motion, 100 ‖y - Z x‖ / ‖y‖ [%]."""
         with_instruments = np.concatenate([values, np.zeros(len(self.names))])
         return self.problem.data.relative_errors(with_instruments)
 
     @property
     def own(self) -> np.ndarray:
-        """Relative error of the measured motion's torque (n,): 100 ‖y - W x‖ / ‖y‖ [%]."""
+        """Relative torque error (n,) of the estimate on the measured motion: 100 ‖y - W x‖ / ‖y‖ [%]."""
         by_measured = np.concatenate([np.zeros(len(self.names)), self.fit.estimate.values])
         return self.problem.data.relative_errors(by_measured)
 
     @property
     def off(self) -> np.ndarray:
-        """Joints (from 0) whose given gains are wrong: recorded and simulated tracking errors differ."""
+        """Joints (from 0) whose stated gains are wrong, because recorded and simulated tracking errors differ."""
         estimate = self.fit.estimate
         simulated = self.problem.data.factors[:, :, : len(self.names)]
         explained = np.sum((simulated @ estimate.values) ** 2, axis=1)
@@ -169,21 +172,21 @@ class Instrumental:
 
     @property
     def unexplained(self) -> np.ndarray:
-        """Torque rows (from 0) that the simulated motion fits much worse than the measured motion does."""
+        """Torque rows (from 0) that the estimate fits much worse on the simulated than on the measured motion."""
         # of the torque simulated, times the model's own error: beyond, the loop is another (our choice)
         max_loop_error = 2.0
         return np.flatnonzero(self.direct >= max_loop_error * self.own)
 
     @property
     def explains(self) -> bool:
-        """Whether torques of the simulated motion fit the recording as well as those of the measured motion."""
+        """Whether the simulation explains the recording: no gains are wrong, and no torque row fits much worse."""
         return not len(self.off) and not len(self.unexplained)
 
     @property
     def shift(self) -> np.ndarray:
-        """Difference of the least-squares estimate from this estimate (p,), in standard deviations.
+        """|Least-squares estimate - IV estimate| of each parameter (p,), in standard deviations.
 
-        The test finds any bias that the data can detect; this difference shows whether the bias matters.
+        The test in `verdict` finds any bias that the data can detect; this difference shows whether the bias matters.
         """
         estimate = self.fit.estimate
         difference = np.abs(self.ordinary.estimate.values - estimate.values)
@@ -192,9 +195,10 @@ class Instrumental:
 
     @property
     def apart(self) -> np.ndarray:
-        """Distance of constrained IV from the estimate with free instruments alone (p,), in σ of the free fit.
+        """Distance (p,) of the constrained IV estimate from the one of `by_free_instruments`, in sigmas.
 
-        Zero where no constraint binds, and for didim; see `instrumental_variables.by_free_instruments`.
+        The sigmas are the standard deviations of the unconstrained fit. The distance is zero if no constraint is
+        binding, and for didim.
         """
         constrained = self.constrained
         values = self.fit.estimate.values
@@ -205,7 +209,7 @@ class Instrumental:
 
     @property
     def valid(self) -> bool:
-        """Whether the instruments are valid: full rank, not weak, and the simulated robot follows the recorded one."""
+        """Whether the instruments are not weak, and simulated positions differ by less than 10 % from recorded ones."""
         return not self.strength.weak and bool(np.all(self.distance < 10.0))
 
 
@@ -221,29 +225,31 @@ def identify_instrumental(
     constraints: Constraints | None = None,
     terms: Sequence[DriveTerm] = (),
     limit: int = MAX_ROUNDS,
+    say: Callable[[str], None] | None = None,
 ) -> Instrumental:
     """Return the estimate of the base parameters with instruments from simulation.
 
     Args:
         model: model of motor torques, joint torque sensors, or both. With sensors alone the motor side is not
             identified: the simulated robot keeps its initial motor inertia and has no friction.
-        base: its base columns.
-        cases: recordings, each with the loop in which it was made.
-        decimator: the parallel filter of W, Z and y.
+        base: base parameters of the model.
+        cases: recordings, each with the closed loop in which it was made.
+        decimator: filter and decimation of W, Z and y.
         method: ``iv`` or ``didim``.
-        inertia: (n,) inertia of the regular robot at the start [kg m²]; None: kd² / (2 kp), at which the first
-            recording's controller has a damping of 0.7.
+        inertia: (n,) inertia of the regular robot at the start [kg m²]; None: kd² / (2 kp), with which the first
+            recording's controller has a damping ratio of 0.7.
         positive: names of base parameters that must not be negative (PC-IDIM-IV).
-        constraints: on the base parameters that are estimated; None: only those of `positive`.
-        terms: richer friction, estimated after the base parameters; the loads that it depends on are computed by least
-            squares.
+        constraints: constraints on the estimated base parameters; None: only those of `positive`.
+        terms: additional friction terms, estimated after the base parameters; the loads on which they depend are
+            computed by least squares.
         limit: largest number of iterations.
+        say: called with a short text after each iteration; None: not called.
 
     Raises:
-        Unidentifiable: where the instruments do not identify the parameters separately.
-        NotConverged: with the last `LinearFit`, after `limit` iterations; `Diverged` where the iterations diverged.
-        CannotSimulate: where the loop is unstable with the initial robot, or with an estimate and all smaller steps to
-            it.
+        UsageError: for an unknown method, or torque rows that cannot be simulated.
+        Unidentifiable: if the instruments do not identify the parameters separately.
+        NotConverged: with the last `LinearFit`, after `limit` iterations; `Diverged` if the iterations diverged.
+        CannotSimulate: if the loop is unstable with the initial robot, or with an estimate and all smaller steps to it.
     """
     one_of(method, ROUNDS, "method", UsageError)
     rows = model.torque_rows
@@ -259,7 +265,6 @@ def identify_instrumental(
         settings = ConstraintSettings(signs=False, inertia=0, bounds=bounds)
         constraints = make_constraints(settings, model, base, base.names, [None] * base.b)
     estimator = ROUNDS[method]
-    task = _Fixed(model, base, cases, decimator, observed, estimator, constraints, friction)
     ordinary = wls(data, settled_std(data, 1e-3))
     loop = cases[0][1]
     plant = regular_plant(model, friction.terms, loop, inertia)
@@ -268,18 +273,23 @@ def identify_instrumental(
     rounds: list[Round] = []
     try:
         runs = simulated_runs(plant, cases)
+        noise = [position_noise(plant, case, loop) for case, loop in cases]
         retreats = 0
         tau = 1.0
     except NotConverged as error:
         raise CannotSimulate(str(error), error.last) from error
+    task = _Fixed(model, base, cases, decimator, observed, estimator, constraints, friction, noise)
     # of the last step, and how often it was halved afterwards
     start, returns = plant, 0
     while True:
-        estimate = _estimate_round(task, runs, std, tau)
+        estimate = _estimate_round(task, plant, runs, std, tau)
         task = task.after(estimate)
         residual_std = estimate.fit.estimate.residual_std
         iteration = Round(_change(before, estimate.fit), residual_std, retreats)
         rounds.append(iteration)
+        if say is not None:
+            change = f": parameters change by {100 * iteration.change:.3g} %" if before is not None else ""
+            say(f"{method}, round {len(rounds)}{change}")
         if before is not None and retreats == 0 and instrumental_variables.settled(before, estimate.fit):
             return _result(task, estimate, ordinary, task.plant(plant, estimate), rounds, std, runs)
         try:
@@ -300,7 +310,8 @@ def identify_instrumental(
     change_percent = 100 * rounds[-1].change
     message = (
         f"instruments from simulation: parameters still change by {change_percent:.3g} % after {limit} "
-        f"iterations; estimate fewer (essential ones), or check the controller's gains{_if_weak(task, estimate, std)}"
+        "iterations; estimate fewer parameters (essential ones), or check the controller's "
+        f"gains{_if_weak(task, estimate, std)}"
     )
     if len(rounds) > 2 and rounds[-1].change > rounds[1].change:
         raise Diverged(message, before)
@@ -314,7 +325,10 @@ def _observed_with_friction(
     decimator: Decimator,
     terms: Sequence[DriveTerm],
 ) -> tuple[list[ObservationRows], _Friction]:
-    """Return the rows of all cases and the richer friction, whose loads come from least squares without it."""
+    """Return the rows of all cases, with columns of the additional friction terms, and these terms with their loads.
+
+    The loads are computed with a least-squares estimate without these terms.
+    """
     observed = []
     for case, _ in cases:
         rows = observe(model, base.kept, case, decimator)
@@ -332,7 +346,14 @@ def _observed_with_friction(
 
 @dataclass(frozen=True, eq=False)
 class _Friction:
-    """Richer friction of a model: its terms, and the standard parameters (p,) from which joint loads are computed."""
+    """Additional friction terms of a model, which may depend on the joints' loads.
+
+    Attributes:
+        terms: drive terms.
+        model: model without these terms.
+        decimator: filter and decimation of the rows.
+        loads: (p,) standard parameters from which the joint loads are computed; None without terms.
+    """
 
     terms: tuple[DriveTerm, ...]
     model: IdentificationModel
@@ -340,18 +361,31 @@ class _Friction:
     loads: np.ndarray | None
 
     def added(self, rows: ObservationRows, case: Case) -> ObservationRows:
-        """Return the rows of a case with a column for each term."""
+        """Return the rows of a case with one more column for each term."""
         if self.loads is None:
             return rows
+        return rows.extend(self.terms, self.columns(case))
+
+    def columns(self, case: Case) -> np.ndarray:
+        """Return the columns (M, rows, k) of the terms on a case's motion."""
         motion = case.motion
         load = self.model.transmitted(self.loads, motion.q, motion.v, motion.a, case.carried)
-        columns = observe_terms(self.terms, case, self.decimator, load, self.model.torque_rows)
-        return rows.extend(self.terms, columns)
+        return observe_terms(self.terms, case, self.decimator, load, self.model.torque_rows)
 
 
 @dataclass(frozen=True, eq=False)
 class _Fixed:
-    """Data and settings that are the same in all iterations."""
+    """Data and settings that are the same in all iterations.
+
+    Attributes:
+        model, base: the model and its base parameters.
+        cases: recordings with their loops.
+        decimator: filter and decimation of the rows.
+        observed: measured rows of each recording.
+        estimator: estimator of each iteration.
+        constraints: constraints on the parameters; None without.
+        friction: additional friction terms.
+    """
 
     model: IdentificationModel
     base: Base
@@ -361,16 +395,29 @@ class _Fixed:
     estimator: _RoundEstimator
     constraints: Constraints | None
     friction: _Friction
+    noise: Sequence[PositionNoise]
+
+    @cached_property
+    def signs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Masks of base columns (b,) and of richer terms (k,) whose value jumps with the sign of the speed."""
+        base_signs = np.zeros(len(self.base.kept), dtype=bool)
+        for position, k in enumerate(self.base.kept - self.model.inertial):
+            base_signs[position] = k >= 0 and self.model.columns[k].form.undecided_at_rest
+        richer_signs = [term.form.undecided_at_rest for term in self.friction.terms]
+        return base_signs, np.array(richer_signs, dtype=bool)
 
     def after(self, estimate: _Found) -> _Fixed:
-        """Return the settings of the next iteration, whose constraints start with the postures that are binding now."""
+        """Return the settings of the next iteration; its constraints start with the postures binding in `estimate`."""
         if self.constraints is None or estimate.bound is None:
             return self
         constraints = replace(self.constraints, likely=estimate.bound.tight)
         return replace(self, constraints=constraints)
 
     def plant(self, old: Plant, estimate: _Found) -> Plant:
-        """Return the simulated robot with an estimate; without motor torques, its motor inertias J are unchanged."""
+        """Return the simulated robot with the estimated parameters.
+
+        If the rows contain no motor torques, it keeps the motor inertias of the robot `old`.
+        """
         estimated = estimate.fit.estimate.values
         b = self.base.b
         standard = self.base.to_standard(estimated[:b])
@@ -381,7 +428,16 @@ class _Fixed:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """Data of one iteration: rows, instruments, R factors, estimate, and variance inflation of the residuals."""
+    """Data of one iteration.
+
+    Attributes:
+        observed: rows of each recording.
+        simulated: (M, rows, p) instruments Z of each recording.
+        problem: R factors of [Z W y].
+        fit: the estimate.
+        tau: variance inflation of the residuals.
+        bound: the constrained estimate; None without constraints.
+    """
 
     observed: Sequence[ObservationRows]
     simulated: Sequence[np.ndarray]
@@ -391,73 +447,46 @@ class _Found:
     bound: Held | None
 
 
-def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _Found:
-    """Return the estimate with instruments from simulated runs; `tau` is the variance inflation of the last round."""
+def _estimate_round(task: _Fixed, plant: Plant, runs: Runs, std: np.ndarray, tau: float) -> _Found:
+    """Return the estimate with instruments from simulated runs.
+
+    Args:
+        task: data and settings of all iterations.
+        plant: the simulated robot.
+        runs: its simulated motions of all recordings.
+        std: (rows,) standard deviations of the torque rows.
+        tau: variance inflation of the last iteration.
+    """
     columns = task.base.kept
     observed: list[ObservationRows] = []
     simulated: list[np.ndarray] = []
-    for ((case, loop), run), rows, (recorded_case, _) in zip(runs, task.observed, task.cases):
+    for ((case, loop), run), rows, noise in zip(runs, task.observed, task.noise):
         replayed = simulated_case(case, run, loop)
         simulated_rows = observe(task.model, columns, replayed, task.decimator)
         matrix = task.friction.added(simulated_rows, replayed).matrix
+        signs = np.concatenate(task.signs)
+        if signs.any():
+            true, recorded = mean_signs(partial(_sign_columns, task), plant, case, loop, run, noise)
+            corrected = rows.matrix.copy()
+            corrected[:, :, signs] += true - recorded
+            rows = replace(rows, matrix=corrected)
+            if not task.estimator.measured:
+                matrix = matrix.copy()
+                matrix[:, :, signs] = true
         simulated.append(matrix)
-        observed.append(_with_signs(task, columns, rows, matrix, recorded_case, replayed))
+        observed.append(rows)
     problem = _stack(observed, simulated, task.estimator.measured)
     fit, bound = _held_fit(task, problem, std, tau)
     return _Found(observed, simulated, problem, fit, _inflation(observed, fit), bound)
 
 
-def _with_signs(
-    task: _Fixed, columns: np.ndarray, rows: ObservationRows, simulated: np.ndarray, case: Case, simulated_case: Case
-) -> ObservationRows:
-    """Return the rows with columns of Coulomb signs replaced where velocity noise exceeds their smoothing.
-
-    Args:
-        simulated: (M, rows, p) columns of `simulated_case`, the case with its simulated motion.
-    """
-    signs = _drowned_signs(task.model, columns, case)
-    drowned = np.append(signs, np.zeros(len(task.friction.terms), dtype=bool))
-    if not drowned.any():
-        return rows
-    motion = case.motion
-    band = 0.5 * case.motion.band
-    values = low_pass(case.motion.q, motion.rate, band)
-    measured = slope(values, motion.rate)
-    expected = slope(low_pass(simulated_case.motion.q, motion.rate, band), motion.rate)
-    away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
-    followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
-    if not followed.all():
-        speed = np.where(followed | np.isnan(measured), simulated_case.motion.v, measured)
-        case_at_speed = replace(case, motion=replace(motion, v=speed))
-        sign_rows = observe(task.model, columns[signs], case_at_speed, task.decimator)
-        simulated = simulated.copy()
-        simulated[:, :, drowned] = sign_rows.matrix
-    matrix = np.where(drowned, simulated, rows.matrix)
-    return replace(rows, matrix=matrix)
-
-
-def sign_noise(model: Any, motion: Motion) -> np.ndarray:
-    """Return the velocity noise (n,) of all joints on which a model's drive terms act, passive joints included."""
-    noise = motion.velocity_noise()
-    if hasattr(model, "joint_noise"):
-        return model.joint_noise(noise)
-    return noise
-
-
-def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) -> np.ndarray:
-    """Return the mask (p,) of Coulomb columns of joints whose velocity noise exceeds the sign's smoothing."""
-    noise = sign_noise(model, case.motion)
-    drowned = np.zeros(len(columns), dtype=bool)
-    for position, k in enumerate(columns - model.inertial):
-        if k < 0 or model.columns[k].shape != "sign":
-            continue
-        term = model.columns[k]
-        speeds = []
-        for _, motion in term.acts:
-            joint_noise = [weight * noise[joint] for joint, weight in motion]
-            speeds.append(float(np.hypot.reduce(joint_noise)))
-        drowned[position] = max(speeds) > term.settings[0]
-    return drowned
+def _sign_columns(task: _Fixed, case: Case) -> np.ndarray:
+    """Return the columns (M, rows, k) of a case's drive terms whose value jumps with the sign of the speed."""
+    base_signs, richer_signs = task.signs
+    matrix = observe(task.model, task.base.kept[base_signs], case, task.decimator).matrix
+    if not richer_signs.any():
+        return matrix
+    return np.concatenate([matrix, task.friction.columns(case)[:, :, richer_signs]], axis=2)
 
 
 def _result(
@@ -469,7 +498,10 @@ def _result(
     std: np.ndarray,
     runs: Runs,
 ) -> Instrumental:
-    """Return the result after the last iteration: σ with the variance inflation of its residuals, and the tests."""
+    """Return the result after the last iteration, with the tests of the instruments and of least squares.
+
+    Covariances include the variance inflation of the last residuals.
+    """
     if task.estimator.measured:
         problem = estimate.problem
     else:
@@ -500,6 +532,7 @@ def _result(
         problem,
         task.estimator,
         tuple(rows),
+        tuple(task.noise),
     )
 
 
@@ -508,8 +541,11 @@ def _simulate_new(
 ) -> tuple[_Fixed, _Found, Plant, Runs, int]:
     """Return the simulations with the new parameters or, if these fail, with smaller steps from the old ones.
 
-    Where M(q) is on its bound, that bound is raised first (our choice): a sampled controller cannot hold a robot with
-    almost no inertia.
+    If the constraint that the mass matrix M(q) is positive definite is binding, its bound is raised first (our choice):
+    a sampled controller cannot stabilise a robot with almost no inertia.
+
+    Returns:
+        settings, estimate, simulated robot, its simulated motions, and number of times the step was halved.
     """
     retreats = 0
     while True:
@@ -538,7 +574,7 @@ def _simulate_new(
 
 
 def _if_weak(task: _Fixed, estimate: _Found, std: np.ndarray) -> str:
-    """Return a text on weak instruments to append to the message of a failure; "" for strong instruments."""
+    """Return a text on weak instruments to append to a failure's message; empty for strong instruments."""
     if not task.estimator.measured:
         return ""
     strength = instrumental_variables.strength(estimate.problem, std)
@@ -549,7 +585,13 @@ def _if_weak(task: _Fixed, estimate: _Found, std: np.ndarray) -> str:
 
 
 def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray], measured: bool = True) -> Instruments:
-    """Return the R factors of [Z W y], one group per torque row; without `measured`, of [Z 0 y], which is cheaper."""
+    """Return the R factors of [Z W y], one group per torque row.
+
+    Args:
+        observed: measured rows (W and y) of each recording.
+        simulated: (M, rows, p) instruments Z of each recording.
+        measured: if false, W is replaced by zeros, which is cheaper.
+    """
     first = observed[0]
     count = observed[0].target.shape[1]
     problem = instrumental_variables.unseen(first.names, first.units, count)
@@ -576,7 +618,10 @@ def _simulated(problem: Instruments) -> Triangles:
 
 
 def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
-    """Return the variance inflation of the rows: mean over torque rows of the residuals' integrated autocorrelation."""
+    """Return the variance inflation of the longest recording's residuals, mean over the torque rows.
+
+    Variance inflation is the integrated autocorrelation.
+    """
     series = [rows.target - rows.matrix @ fit.estimate.values for rows in observed]
     longest = max(series, key=len)
     inflations = [inflation(row) for row in longest.T]
@@ -584,7 +629,7 @@ def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
 
 
 def _held_fit(task: _Fixed, problem: Instruments, std: np.ndarray, tau: float) -> tuple[LinearFit, Held | None]:
-    """Return the estimate of an iteration, with the constraints if any are set."""
+    """Return the estimate of an iteration under the constraints, and details of the constrained fit (None without)."""
     fit = task.estimator.fit(problem, std, tau)
     estimator = task.estimator
     if task.constraints is None:

@@ -1,11 +1,12 @@
-"""Instrumental variables: consistent estimates although the noise of y reaches W through the robot's feedback.
+"""Instrumental variables (IV): consistent estimates although the robot's feedback brings the noise of y into W.
 
-The instruments Z (r, p), one per column, are the observation matrix of a noise-free simulation. The R factor of [Z W y]
-contains all that IV needs, so that it is computed as in `triangles`:
+The instruments Z (r, p), one per column of W, are the observation matrix of a noise-free simulation. The R factor of [Z
+W y] contains all that IV needs; it is computed as in `triangles`:
 
-    [Z W y] = Q [Rz A b; 0 B c; 0 0 ρ],    Zᵀ W = Rzᵀ A,    P_Z W = Q1 A,
+    [Z W y] = Q [Rz A b; 0 B c; 0 0 ρ],    Zᵀ W = Rzᵀ A,    P_Z W = Q1 A.
 
-the IV estimate solves A x = b, the residual of W on Z is Q2 B, and no products such as ZᵀW are formed.
+The IV estimate solves A x = b, and the residual of the regression of W on Z is Q2 B. Products such as ZᵀW are not
+formed.
 """
 
 from collections.abc import Sequence
@@ -39,11 +40,10 @@ class InstrumentStrength:
 
     Attributes:
         names: names of the p columns of W.
-        correlations: (p,) canonical correlations between Z and W, descending; 1 where Z spans W, 0 where ZᵀW is
-            singular.
-        partial_r2: (p,) share of each column, after regression on the others, that Z explains (Shea 1997).
-        cragg_donald: F statistic of the weakest combination of columns, (r - p) λ² / (1 - λ²) / p with λ the least
-            correlation; above 10 the usual approximations hold (Staiger & Stock 1997).
+        correlations: (p,) canonical correlations between Z and W, descending; 1 if Z spans W, 0 if ZᵀW is singular.
+        partial_r2: (p,) share of each column, after regression on the other columns, that Z explains (Shea 1997).
+        cragg_donald: F statistic of the weakest combination of columns, (r - p) λ² / (1 - λ²) / p with λ the smallest
+            correlation; above 10 the usual approximations are valid (Staiger & Stock 1997).
         condition: condition number of Zᵀ W, with columns of Z and W scaled to unit norm.
     """
 
@@ -60,7 +60,11 @@ class InstrumentStrength:
 
 @dataclass(frozen=True, eq=False)
 class Instruments:
-    """R factors of [Z W y]; the first p columns are the instruments."""
+    """R factors of [Z W y], one per group of rows; the first p columns are the instruments Z.
+
+    Attributes:
+        data: the R factors.
+    """
 
     data: Triangles
 
@@ -69,19 +73,20 @@ class Instruments:
         return self.data.names[len(self.data.names) // 2 :]
 
     def least_squares(self) -> Triangles:
-        """Return the R factors of [W y] alone, for `linear.ols` and `linear.wls`."""
+        """Return the R factors of [W y] alone (observation matrix and torques), for `linear.ols` and `linear.wls`."""
         p = len(self.names)
         return self.data.select(np.arange(p, 2 * p))
 
     def testable(self, fit: LinearFit, std: np.ndarray | None = None) -> Triangles:
-        """Return one group's R factor [A b; 0 ‖ρ‖] with the IV estimate and its covariance as least-squares solution.
+        """Return one group's R factor [A b; 0 ‖ρ‖] whose least-squares solution is the IV estimate and covariance.
 
-        ρ = y - W x_IV, whitened. Tests of nested models on this factor are those of two-stage least squares (Wooldridge
-        2010, section 5.2.3): differences of ‖P_Z (y - W x)‖² against the variance of ρ.
+        W is the observation matrix, y are the torques; ρ = y - W x_IV is the whitened residual of the IV estimate x_IV.
+        Tests of nested models with this factor are those of two-stage least squares (Wooldridge 2010, section 5.2.3):
+        differences of ‖P_Z (y - W x)‖² against the variance of ρ.
 
         Args:
             fit: the result of `iv`.
-            std: as in `iv`.
+            std: (g,) noise standard deviations of the groups of rows that `iv` used, in units of y; None: equal.
         """
         p = len(self.names)
         sigma = np.ones(self.data.groups) if std is None else std
@@ -103,15 +108,15 @@ def instrument(
     units: Sequence[str] | None = None,
     before: Instruments | None = None,
 ) -> Instruments:
-    """Return the R factors of [Z W y], added to those of earlier rows if `before` is given.
+    """Return the R factors of [Z W y]; `before` is updated if it is given.
 
     Args:
-        instruments: Z (r, p), one column for each of W.
+        instruments: Z (r, p), one column for each column of W.
         matrix: W (r, p).
         target: y (r,).
-        group: as in `triangles.absorb`.
-        names, units: names and units of the columns of W; None: as in `triangles.collect`.
-        before: earlier rows of the same problem.
+        group: (r,) group index of each row, or one integer for all rows.
+        names, units: names and units of the columns of W; None: x1, x2, … without units.
+        before: R factors of earlier rows of the same problem; None: these are the first rows.
     """
     shape = (None, None)
     matrix = shaped(matrix, shape, "observation matrix W")
@@ -128,26 +133,37 @@ def instrument(
 
 
 def unseen(names: Sequence[str], units: Sequence[str], groups: int) -> Instruments:
-    """Return empty R factors of [Z W y], for columns of W with these names and units."""
+    """Return R factors of [Z W y] without rows, for columns of W with these names and units.
+
+    Z (r, p) are the instruments, W (r, p) is the observation matrix, y (r,) are the torques.
+
+    Args:
+        names, units: names and units of the p columns of W.
+        groups: number of groups of rows.
+    """
     data = empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups)
     return Instruments(data)
 
 
 def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> LinearFit:
-    """Estimate x = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y, covariance σ² (ZᵀΩ⁻¹W)⁻¹ (ZᵀΩ⁻¹Z) (WᵀΩ⁻¹Z)⁻¹, Ω = diag(σ_g² I).
+    """Estimate x = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y with Ω = diag(σ_g² I), by instrumental variables.
 
-    Janot, Vandanjon & Gautier (2014) write the covariance (ZᵀΩ⁻¹Z)⁻¹, which is equal where Z is W without its noise,
-    and too small where the simulation deviates. σ² is estimated, so a common factor of `std` has no effect. As there
-    are as many instruments as columns, two-stage least squares gives the same estimate.
+    Z (r, p) are the instruments, W (r, p) the observation matrix, y (r,) the torques, σ_g the standard deviation of the
+    rows of group g.
+
+    The covariance is σ² (ZᵀΩ⁻¹W)⁻¹ (ZᵀΩ⁻¹Z) (WᵀΩ⁻¹Z)⁻¹. Janot, Vandanjon & Gautier (2014) use (ZᵀΩ⁻¹Z)⁻¹, which is
+    equal if Z is W without its noise, and too small if the simulation deviates. σ² is estimated, so that a common
+    factor of `std` has no effect. Two-stage least squares gives the same estimate, since there are as many instruments
+    as columns.
 
     Args:
-        problem: triangles of [Z W y].
-        std: (g,) standard deviations of the groups; None: equal. Those of the weighted least squares of W are the usual
-            choice.
-        inflation: >= 1, see `linear`; one number for all groups.
+        problem: R factors of [Z W y].
+        std: (g,) noise standard deviations σ_g of the groups of rows, in units of y, usually those of the weighted
+            least squares of W; None: equal.
+        inflation: variance inflation >= 1 of all groups, explained in the module `linear`.
 
     Raises:
-        Unidentifiable: where Zᵀ W is singular, naming the columns concerned.
+        Unidentifiable: if Zᵀ W is singular (the message names the columns), or there are too few rows.
     """
     p = len(problem.names)
     if std is None:
@@ -173,9 +189,15 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
 def settled(before: LinearFit, after: LinearFit, change: float = 0.025, residual: float = 0.025) -> bool:
     """Return whether the outer loop (simulate, estimate) has converged in parameters and residual.
 
-    |Δx_j| < change · |x_j| for every parameter and |Δ‖ρ‖| < residual · ‖ρ‖ (Janot, Vandanjon & Gautier 2014; both
-    usually 1 … 5 %). A parameter that changes by less than a fifth of its standard deviation has converged, too (our
-    choice: one near zero never satisfies a relative criterion).
+    The criterion is |Δx_j| < change · |x_j| for every parameter x_j and |Δ‖ρ‖| < residual · ‖ρ‖ for the residuals ρ,
+    with Δ the difference of the two estimates (Janot, Vandanjon & Gautier 2014; both usually 1 … 5 %). A parameter that
+    changes by less than a fifth of its standard deviation has also converged (our choice: a parameter near zero never
+    satisfies a relative criterion).
+
+    Args:
+        before, after: the last two estimates.
+        change: largest relative change of a parameter.
+        residual: largest relative change of the residuals' standard deviation.
     """
     parameter_change = np.abs(after.estimate.values - before.estimate.values)
     by_value = change * np.abs(before.estimate.values)
@@ -188,9 +210,11 @@ def settled(before: LinearFit, after: LinearFit, change: float = 0.025, residual
 def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentStrength:
     """Return the strength of the instruments: how well they explain the columns of W.
 
+    W (r, p) is the observation matrix, Z (r, p) are the instruments.
+
     Args:
-        problem: triangles of [Z W y].
-        std: as in `iv`.
+        problem: R factors of [Z W y].
+        std: (g,) noise standard deviations of the groups of rows, in units of y; None: equal.
     """
     p = len(problem.names)
     rows = int(problem.data.rows.sum())
@@ -216,14 +240,21 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
 def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> ExogeneityTest:
     """Return the test that W is uncorrelated with the noise (Durbin, Wu, Hausman), by augmented regression and QR.
 
-    With V = W - P_Z W the part of the columns that the instruments do not explain, y = W x + V δ + e; the hypothesis is
-    δ = 0, F = [(RSS0 - RSS1) / k] / [RSS1 / (r - p - k)] (Janot, Vandanjon & Gautier 2016, after Hausman 1978). Only
-    the k independent columns of V count. The test assumes valid instruments: check `strength` first.
+    W (r, p) is the observation matrix, y (r,) are the torques. With V = W - P_Z W, the part of W's columns that the
+    instruments Z do not explain, the model is y = W x + V δ + e. The hypothesis is δ = 0, with F = [(RSS0 - RSS1) / k]
+    / [RSS1 / (r - p - k)] (Janot, Vandanjon & Gautier 2016, after Hausman 1978). k is the number of independent columns
+    of V. The test assumes valid instruments: check `strength` first.
 
     Args:
-        problem: triangles of [Z W y].
-        std: as in `iv`; groups of different noise with equal weights give false alarms.
-        inflation: variance inflation >= 1; at 1, autocorrelated residuals give false alarms.
+        problem: R factors of [Z W y].
+        std: (g,) noise standard deviations of the groups of rows, in units of y; None: equal, which gives false alarms
+            for groups of different noise.
+        inflation: variance inflation >= 1, the number of rows that count as one; at 1, autocorrelated residuals give
+            false alarms.
+
+    Raises:
+        CalibError: if the instruments equal the columns, or there are too few rows.
+        Unidentifiable: if columns of W are linearly dependent.
     """
     p = len(problem.names)
     rows = problem.data.rows.sum() / inflation
@@ -254,9 +285,15 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
 
 
 def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray:
-    """Return the R factor (p + 1, p + 1) of min ‖P_Z (y - W x)‖, two-stage least squares; its solution is `iv`.
+    """Return the R factor (p + 1, p + 1) of min ‖P_Z (y - W x)‖ (two-stage least squares), whose solution is `iv`.
+
+    P_Z is the projection onto the columns of Z.
 
     Constrained IV minimises with this factor: Q = Wᵀ P_Z W is positive definite, while Zᵀ W need not be.
+
+    Args:
+        problem: R factors of [Z W y].
+        std: (g,) noise standard deviations of the groups of rows, in units of y; None: equal.
     """
     return _projected(combine(problem.data, std), problem.names)
 
@@ -264,17 +301,20 @@ def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray
 def by_free_instruments(
     problem: Instruments, std: np.ndarray, constrained: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
-    """Return x (p,) with A x = A `constrained`, by the instruments Z_U of the free directions: Z_Uᵀ Ω⁻¹ (y - W x) = 0.
+    """Return the IV estimate x (p,) under equalities A x = A x_c that uses the instruments of the free directions only.
 
-    Janot's slides on the TX40 state the criterion ½ ‖P_Z (y - W x)‖² (`projected`), in which all instruments count, but
-    print for bounds x_C = d the relation x_U = x_U^IV + (Z_UᵀW_U)⁻¹ Z_UᵀW_C (x_C^IV - d), which is the one computed
-    here. Both are consistent where the constraint is true. On a simulated TX40 they are at most 0.011 σ apart
-    (`examples/tx40`), in planted problems with weak instruments 0.24 σ, and 2.4 σ where the bound is wrong by 6 σ:
-    there the estimate by free instruments errs less (`tests/identification/closed_loop/test_instruments.py`).
+    x satisfies Z_Uᵀ Ω⁻¹ (y - W x) = 0, where W (r, p) is the observation matrix, y (r,) are the torques with covariance
+    Ω = diag(std²), and Z_U are the instruments of the directions in the null space of A. Janot's slides on the TX40
+    give the criterion ½ ‖P_Z (y - W x)‖² (`projected`), in which all instruments count, but for bounds x_C = d the
+    relation x_U = x_U^IV + (Z_UᵀW_U)⁻¹ Z_UᵀW_C (x_C^IV - d), which is the one computed here. Both are consistent if the
+    constraint is true. On a simulated TX40 they differ by at most 0.011 σ (`examples/tx40`), in simulated problems with
+    weak instruments by 0.24 σ, and by 2.4 σ if the bound is wrong by 6 σ: there the estimate by free instruments has
+    the smaller error (`tests/identification/closed_loop/test_instruments.py`).
 
     Args:
-        std: as in `iv`.
-        constrained: (p,) a point that satisfies the constraints.
+        problem: R factors of [Z W y].
+        std: (g,) noise standard deviations of the groups of rows, in units of y.
+        constrained: (p,) a point x_c that satisfies the constraints.
         normals: A (k, p), normals of the constraints.
     """
     p = len(problem.names)
@@ -289,7 +329,15 @@ def by_free_instruments(
 
 
 def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Return the R factor of P_Z [W y]; Z and Zᵀ W must have full rank."""
+    """Return the R factor of P_Z [W y] from the R factor of [Z W y].
+
+    Args:
+        factor: R factor of [Z W y].
+        names: names of the columns of W, for messages.
+
+    Raises:
+        Unidentifiable: if Z or Zᵀ W do not have full rank.
+    """
     p = len(names)
     size = np.linalg.norm(factor[:p, :p], axis=0)
     normalised = factor[:p, :p] / np.where(size > 0.0, size, 1.0)
@@ -309,13 +357,18 @@ def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
 
 
 def _shea(explained: np.ndarray, total: np.ndarray) -> np.ndarray:
-    """Return diag((WᵀW)⁻¹) / diag((WᵀP_Z W)⁻¹) (Shea 1997 in the form of Godfrey 1999)."""
+    """Return Shea's partial R² (p,), diag((WᵀW)⁻¹) / diag((WᵀP_Z W)⁻¹) (Shea 1997 in the form of Godfrey 1999).
+
+    Args:
+        explained: R factor of P_Z W.
+        total: R factor of W.
+    """
     variances = [np.sum(np.linalg.pinv(part) ** 2, axis=1) for part in (total, explained)]
     return variances[0] / variances[1]
 
 
 def _rss(matrix: np.ndarray, target: np.ndarray) -> float:
-    """Return the residual sum of squares of the regression of target on the columns."""
+    """Return the residual sum of squares of the regression of `target` on the columns of `matrix`."""
     size = matrix.shape[1]
     stacked = np.column_stack([matrix, target])
     triangle = retriangulate(stacked)

@@ -1,23 +1,27 @@
 """Compiled closed loop (numba): a tree of rigid bodies with drives under a sampled controller, integrated by RK4.
 
-Forward dynamics all in the base's frame, about its origin: velocities, forces and composite inertias then add up along
-the tree without a transformation, which takes half the operations of body-fixed recursions (`calib.dynamics.kernels`;
-tests compare both). With S_i = [u_i; s_i] the twist of body i per unit rate,
+Forward dynamics are computed in the base frame, about its origin: velocities, forces and composite inertias then add up
+along the tree without transformations, in half the operations of body-fixed recursions (`calib.dynamics.kernels`; tests
+compare both). With S_i = [u_i; s_i] the twist of body i per unit rate of its joint,
 
     V_i = V_p + S_i v,   A_i = A_p + V_i × S_i v,   f_i = I_i A_i + V_i ×* I_i V_i,
     bias_c = Σ S_i · Σ_below f,   M_cd = Σ S_j · (Σ_below I) S_i      (Walker & Orin 1982; Featherstone 2008).
 
-Few arrays with many columns, and functions joined into their callers, because numba's reference counting of arrays
-passed between functions would take half of the time. For B bodies, n joints and T nonlinear friction terms ("acts"):
+There are few arrays with many columns, and functions are inlined into their callers, because numba's reference counting
+of arrays passed between functions would take half of the time. For B bodies, n joints and T nonlinear friction terms
+("acts"):
 
-    tree    (B, 3) whole numbers: parent (B for the base), kind, coordinate
+    tree    (B, 3) integers: parent (B for the base), kind, coordinate
     body    (B + 1, 23): placement (rotation by rows, origin) with each joint about or along z, ten standard parameters
-            in such a frame, scale; row B, columns 0 to 2: the base's acceleration against gravity
-    linear  (n, 2 n + 1): added inertia, viscous friction, offset kinds   (T, 2) torque row and code; acts (T, 8 + n):
-    amount, up to seven settings, weights of the joints' motions memory  (T, 2) of friction that depends on the past:
-    state of the stop operator, and the position at which it had this state loads   (n,) torques that the gears
-    transmitted at the last call, where friction depends on them work    (B + 1, 46): pose, velocity 12, acceleration
-    18, twist 24, force 30, inertia about the origin 36 …
+            in such a frame, scale; row B, columns 0 to 2: minus the gravity vector
+    linear  (n, 2 n + 1): added inertia (n columns), viscous friction (n), offset
+    kinds   (T, 2): torque row and shape code of each act
+    acts    (T, 8 + n): parameter value, up to seven settings, weights of the joints' motions
+    memory  (T, 2), for friction with hysteresis: state of the stop operator, and the position at which it had
+            this state
+    loads   (n,) torques that the gears transmitted at the last call, for load-dependent friction
+    work    (B + 1, 46), first columns: pose 0, velocity 12, acceleration 18, twist 24, force 30, inertia about
+            the origin 36
 """
 
 from math import cos, sin, sqrt
@@ -37,27 +41,48 @@ FINE, SINGULAR, STIFF, DIVERGED = -1, 1, 2, 3
 
 @njit(**JOINED)
 def twist_cross(w, v, u, s):
-    """Return the motion (w, v) × (u, s) of twists: angular and linear part."""
+    """Return the cross product of two twists, (w, v) × (u, s), as its angular and linear parts.
+
+    The first vector of a twist is its angular, the second its linear velocity.
+    """
     return cross(w, u), add(cross(w, s), cross(v, u))
 
 
 @njit(**JOINED)
 def inertia_of(work, i):
-    """Return the inertia of body i with all bodies it carries: inertia about the base's origin, first moments, mass."""
+    """Return the composite inertia of body i and all bodies behind it.
+
+    It is a tuple of the moments of inertia about the base's origin (6), first moments (3), and mass.
+
+    Args:
+        work: working array of the bodies, described in the module's docstring.
+        i: index of the body.
+    """
     J = work[i, 36], work[i, 37], work[i, 38], work[i, 39], work[i, 40], work[i, 41]
     return J, three(work, i, 42), work[i, 45]
 
 
 @njit(**JOINED)
 def momentum(inertia, w, v):
-    """Return the angular and linear momentum of a body with a twist (w, v)."""
+    """Return the angular and linear momentum of a body with `inertia` and twist (w, v).
+
+    Args:
+        inertia: moments of inertia (6), first moments (3), and mass, as `inertia_of` returns them.
+        w, v: angular and linear velocity (3,).
+    """
     J, h, mass = inertia
     return add(inertia_times(J, w), cross(h, v)), add(scaled(mass, v), cross(w, h))
 
 
 @njit(**JOINED)
 def wrench(inertia, w, v, e, a):
-    """Return moment and force I A + V ×* I V of a body, V = (w, v), A = (e, a), and its linear momentum."""
+    """Return moment and force I A + V ×* I V of a body with V = (w, v), A = (e, a), and its linear momentum.
+
+    Args:
+        inertia: moments of inertia (6), first moments (3), and mass, as `inertia_of` returns them.
+        w, v: angular and linear velocity (3,).
+        e, a: angular and linear acceleration (3,).
+    """
     angular, linear = momentum(inertia, w, v)
     n, f = momentum(inertia, e, a)
     return add(add(n, cross(w, angular)), cross(v, linear)), add(f, cross(w, linear)), linear
@@ -65,7 +90,15 @@ def wrench(inertia, w, v, e, a):
 
 @njit(**JOINED)
 def _body(tree, body, i, amount, rate, work):
-    """Write pose, velocity, twist and acceleration (at zero joint acceleration) of body i from those of its parent."""
+    """Write pose, velocity, twist and acceleration of body i into `work`, computed from its parent's.
+
+    The joint acceleration is taken as zero.
+
+    Args:
+        tree, body, work: arrays of the robot, described in the module's docstring.
+        i: index of the body.
+        amount, rate: joint position and velocity.
+    """
     p, kind, scale = tree[i, 0], tree[i, 1], body[i, 22]
     x, y, z, place = three(body, i, 0), three(body, i, 3), three(body, i, 6), three(body, i, 9)
     if kind == REVOLUTE:
@@ -93,7 +126,12 @@ def _body(tree, body, i, amount, rate, work):
 
 @njit(**JOINED)
 def _load(body, i, work):
-    """Write the inertial parameters of body i about the base's origin, and the wrench of its motion."""
+    """Write the inertia of body i about the base's origin, and the wrench of its motion, into `work`.
+
+    Args:
+        body, work: arrays of the robot, described in the module's docstring.
+        i: index of the body.
+    """
     x, y, z, t = three(work, i, 0), three(work, i, 3), three(work, i, 6), three(work, i, 9)
     own, mass = (body[i, 12], body[i, 13], body[i, 14], body[i, 15], body[i, 16], body[i, 17]), body[i, 21]
     g, a, b = turned(work, i, three(body, i, 18)), inertia_times(own, x), inertia_times(own, y)
@@ -121,7 +159,15 @@ def _load(body, i, work):
 
 @njit(**JOINED)
 def dynamics(tree, body, linear, q, v, work, matrix, out):
-    """Write M(q) + added (lower triangle with diagonal), and subtract c(q, v) + g(q) from out (n,)."""
+    """Write M(q) plus added inertia into `matrix` (lower triangle), and subtract c(q, v) + g(q) from `out` (n,).
+
+    Args:
+        tree, body, linear, work: arrays of the robot, described in the module's docstring; `linear` has the added
+            inertia.
+        q, v: (n,) joint positions and velocities.
+        matrix: (n, n) array to write.
+        out: (n,) array from which Coriolis, centrifugal and gravity torques are subtracted.
+    """
     count, n = tree.shape[0], q.shape[0]
     for j in range(n):
         for k in range(j + 1):
@@ -158,7 +204,10 @@ def dynamics(tree, body, linear, q, v, work, matrix, out):
 
 @njit(**JOINED)
 def factorise(matrix):
-    """Overwrite the lower triangle with L, the diagonal with 1 / D, M = L D Lᵀ; False where M is not definite."""
+    """Overwrite a matrix M by its factors M = L D Lᵀ: L below the diagonal, 1 / D on it.
+
+    Return False if M is not positive definite. Only the lower triangle of M is used.
+    """
     for i in range(matrix.shape[0]):
         for j in range(i):
             total = matrix[i, j]
@@ -178,7 +227,7 @@ def factorise(matrix):
 
 @njit(**JOINED)
 def substitute(matrix, vector):
-    """Overwrite vector (n,) with M⁻¹ vector; M is given factorised."""
+    """Overwrite `vector` (n,) by M⁻¹ vector, where `matrix` contains the factors of M (`factorise`)."""
     n = vector.shape[0]
     for i in range(n):
         total = vector[i]
@@ -194,7 +243,13 @@ def substitute(matrix, vector):
 
 @njit(**JOINED)
 def seen(acts, t, motion):
-    """Return the argument of friction term t: the weighted sum of a motion (n,) over the joints."""
+    """Return the sum of a motion (n,) over the joints, weighted as friction term t requires.
+
+    Args:
+        acts: array of friction terms, described in the module's docstring.
+        t: row of the term.
+        motion: (n,) positions or velocities of the joints.
+    """
     total = 0.0
     for k in range(motion.shape[0]):
         total += acts[t, 8 + k] * motion[k]
@@ -203,15 +258,29 @@ def seen(acts, t, motion):
 
 @njit(**JOINED)
 def _stop(memory, t, place, width):
-    """Return the stop operator's state at position `place`, from its last state and position in `memory`."""
+    """Return the state of friction term t's stop operator at a position, from state and position in `memory`.
+
+    Args:
+        memory: (T, 2) states and positions, described in the module's docstring.
+        t: row of the term.
+        place: present position, weighted over the joints as the term requires.
+        width: travel over which the state changes by 1.
+    """
     return min(1.0, max(-1.0, memory[t, 0] + (place - memory[t, 1]) / width))
 
 
 @njit(**JOINED)
 def act(code, acts, t, memory, q, v):
-    """Return friction term t's torque per unit parameter and its derivatives with respect to position and velocity.
+    """Return friction term t's torque per unit parameter, and its derivatives with respect to position and velocity.
 
-    Load dependence is ignored. The values are those of `calib.dynamics.shape_kernels.shape` at the term's arguments.
+    The factor of load-dependent terms (the load) is not included. The values are those of
+    `calib.dynamics.shape_kernels.shape`.
+
+    Args:
+        code: code of the term's shape.
+        acts, memory: arrays of friction terms, described in the module's docstring.
+        t: row of the term.
+        q, v: (n,) joint positions and velocities.
     """
     place = seen(acts, t, q)
     state = _stop(memory, t, place, acts[t, 1]) if code in (STOP, PRESLIDING) else 0.0
@@ -220,7 +289,15 @@ def act(code, acts, t, memory, q, v):
 
 @njit(**JOINED)
 def _friction(linear, kinds, acts, memory, q, v, out):
-    """Subtract friction and offsets from out (n,), except load-dependent terms; return whether there are such terms."""
+    """Subtract friction and offsets, without load-dependent terms, from `out` (n,).
+
+    Return whether there are load-dependent terms.
+
+    Args:
+        linear, kinds, acts, memory: arrays of drives and friction, described in the module's docstring.
+        q, v: (n,) joint positions and velocities.
+        out: (n,) torques.
+    """
     n, loaded = v.shape[0], False
     for j in range(n):
         total = linear[j, 2 * n]
@@ -240,10 +317,18 @@ def _friction(linear, kinds, acts, memory, q, v, out):
 
 @njit(**OPTIONS)
 def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
-    """Replace the accelerations out (n,) by those with load-dependent friction.
+    """Replace the accelerations `out` (n,) by those with load-dependent friction.
 
-    load = torque after friction - added inertia · a, while friction depends on the load: iterated until both agree, as
-    they do for coefficients below one. M is factorised. Returns False where the iteration does not converge.
+    The load is the torque after friction minus added inertia times acceleration; friction depends on the load. Both are
+    iterated until they agree, which they do if the friction coefficients are below one. Return False if the iteration
+    does not converge.
+
+    Args:
+        linear, kinds, acts, memory: arrays of drives and friction, described in the module's docstring.
+        q, v, tau: (n,) joint positions, velocities and drive torques.
+        matrix: factors of M.
+        loads: (n,) transmitted torques, from which the iteration starts and to which its result is written.
+        out: (n,) accelerations without load-dependent friction.
     """
     n = out.shape[0]
     plain, extra, change = out.copy(), np.zeros(n), np.empty(n)
@@ -276,11 +361,19 @@ def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
 
 @njit(**OPTIONS)
 def stiffness(kinds, acts, loads, v, matrix, unit):
-    """Return a bound [1/s] on the fastest decay rate that smoothed signs cause near standstill; M is factorised.
+    """Return an upper bound [1/s] of the fastest decay rate that friction causes near standstill.
 
-    The trace of M⁻¹ D, D the steepest slopes of the signs in reach (not the local ones: a step that enters the band
-    must not overshoot it): it is never below the largest eigenvalue. Springs of friction with memory count by four
-    times their natural frequency, so that no step is longer than half a radian of it.
+    The bound is the trace of M⁻¹ D, which is never below the largest eigenvalue. D contains the steepest slopes of all
+    smoothed signs whose steep range is near the current speed, not the local slopes, since a step into this range must
+    not overshoot. The stiffness of friction with hysteresis counts by four times its natural frequency, so that no step
+    is longer than half a radian of this oscillation.
+
+    Args:
+        kinds, acts: arrays of friction terms, described in the module's docstring.
+        loads: (n,) transmitted torques.
+        v: (n,) joint velocities.
+        matrix: factors of the inertia matrix M.
+        unit: (n,) working memory.
     """
     total, springs, n = 0.0, 0.0, unit.shape[0]
     for t in range(kinds.shape[0]):
@@ -304,7 +397,16 @@ def stiffness(kinds, acts, loads, v, matrix, unit):
 
 @njit(**OPTIONS)
 def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, matrix, out):
-    """Write the accelerations (n,) under the drive torques, and factorise M; return False where M is not definite."""
+    """Write the joint accelerations under drive torques tau (n,) into `out`, and factorise M into `matrix`.
+
+    Return False if M is not positive definite, or load-dependent friction does not converge.
+
+    Args:
+        tree, body, linear, kinds, acts, memory, loads, work: arrays of the robot, described in the module's docstring.
+        q, v, tau: (n,) joint positions, velocities and drive torques.
+        matrix: (n, n) array to write.
+        out: (n,) array to write.
+    """
     for j in range(q.shape[0]):
         out[j] = tau[j]
     dynamics(tree, body, linear, q, v, work, matrix, out)
@@ -319,14 +421,24 @@ def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, 
 
 @njit(**OPTIONS)
 def _unstressed(kinds, acts, q, memory):
-    """Reset the hysteresis state of friction to unstressed at positions q (n,)."""
+    """Reset the states of friction with hysteresis to zero at positions q (n,).
+
+    Args:
+        kinds, acts, memory: arrays of friction terms, described in the module's docstring.
+        q: (n,) joint positions.
+    """
     for t in range(kinds.shape[0]):
         memory[t, 0], memory[t, 1] = 0.0, seen(acts, t, q)
 
 
 @njit(**JOINED)
 def _remember(kinds, acts, q, memory):
-    """Update the hysteresis state of friction to positions q (n,)."""
+    """Update the states of friction with hysteresis to positions q (n,).
+
+    Args:
+        kinds, acts, memory: arrays of friction terms, described in the module's docstring.
+        q: (n,) joint positions.
+    """
     for t in range(kinds.shape[0]):
         if kinds[t, 1] == STOP or kinds[t, 1] == PRESLIDING:
             place = seen(acts, t, q)
@@ -335,10 +447,15 @@ def _remember(kinds, acts, q, memory):
 
 @njit(**OPTIONS)
 def set_parameters(values, order, entries, shares, owners, body, linear, acts):
-    """Write parameters (p,) into the arrays body, linear and acts (friction terms); keep all other entries.
+    """Write parameters (p,) into the arrays body, linear and acts; their other entries do not change.
 
-    order (B, 10): index of the standard parameter for each entry of a body; entries (E, 3): row and column of `linear`,
-    and index of the parameter; shares (E,): weights of these entries; owners (T,): index of the parameter of each act.
+    Args:
+        values: (p,) standard parameters of the bodies, then parameters of the drive terms.
+        order: (B, 10) index in `values` of each standard parameter of a body, relative to the body's first one.
+        entries: (E, 3) row and column of `linear`, and index of the parameter.
+        shares: (E,) weights of these entries.
+        owners: (T,) index of the parameter of each friction term.
+        body, linear, acts: arrays of the robot, described in the module's docstring.
     """
     for i in range(order.shape[0]):
         for k in range(10):
@@ -352,9 +469,14 @@ def set_parameters(values, order, entries, shares, owners, body, linear, acts):
 
 @njit(**OPTIONS)
 def forward_dynamics(tree, body, linear, kinds, acts, order, entries, shares, owners, values, q, v, tau, out):
-    """Write accelerations to out (N, n); return the first sample with an inertia not positive definite, or -1.
+    """Write accelerations to `out` (N, n); return the first sample whose accelerations cannot be computed, or -1.
 
-    values (N, p): parameters of each sample; with shape (0, p), those in body, linear and acts are used.
+    Args:
+        tree, body, linear, kinds, acts: arrays of the robot, described in the module's docstring.
+        order, entries, shares, owners: index arrays of `set_parameters`.
+        values: (N, p) parameters of each sample; of shape (0, p) if the parameters in body, linear and acts are used.
+        q, v, tau: (N, n) joint positions, velocities and drive torques.
+        out: (N, n) array to write.
     """
     n, count = q.shape[1], kinds.shape[0]
     work, matrix = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n))
@@ -370,12 +492,20 @@ def forward_dynamics(tree, body, linear, kinds, acts, order, entries, shares, ow
 
 @njit(**OPTIONS)
 def _advance(tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate):
-    """Advance q, v (n,) by one control period under constant torques (classical Runge-Kutta method).
+    """Advance q, v (n,) by one control period under constant torques (classical Runge-Kutta); return a status.
 
-    The number of steps follows from the stiffness of friction near standstill. On the negative axis the form's
-    stability function 1 + z + z²/2 + z³/6 + z⁴/24 is positive wherever it is stable: the velocity creeps into the band
-    of the smoothed sign and does not change sides from step to step, which would be chatter; abs(z) <= 2 here.
-    slopes[0] is known.
+    The number of steps follows from the stiffness of friction near standstill. On the negative real axis the method's
+    stability function 1 + z + z²/2 + z³/6 + z⁴/24 is positive wherever it is stable: the velocity decays into the range
+    of the smoothed sign without changing its sign from step to step (chatter). Here abs(z) <= 2.
+
+    Args:
+        tree, body, linear, kinds, acts, memory, loads, work: arrays of the robot, described in the module's docstring.
+        q, v: (n,) state, overwritten.
+        tau: (n,) drive torques.
+        period: duration [s].
+        slopes: (4, n) accelerations; row 0 must contain those at the start.
+        matrix: (n, n) working memory, with the factors of M at the start.
+        at, rate: (n,) working memory.
     """
     n = q.shape[0]
     pieces = int(0.5 * period * stiffness(kinds, acts, loads, v, matrix, at)) + 1
@@ -410,10 +540,17 @@ def _advance(tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, 
 def _advance_midpoint(
     tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate
 ):
-    """Advance q, v (n,) by one short period with the midpoint rule, at half the cost of `_advance`.
+    """Advance q, v (n,) by one short period with the midpoint rule, at half the cost of `_advance`; return a status.
 
-    Steps are at most `MIDPOINT_STEP` reciprocals of friction's fastest decay: the rule's stability function 1 + z +
-    z²/2 has no zero, so that the velocity does not change its sign; at this step it is 0.625.
+    A step is at most `MIDPOINT_STEP` over friction's fastest decay rate. The rule's stability function 1 + z + z²/2 has
+    no zero, so that the velocity does not change its sign; at the longest step it is 0.625.
+
+    Args:
+        tree, body, linear, kinds, acts, memory, loads, work: arrays of the robot, described in the module's docstring.
+        q, v: (n,) state, overwritten.
+        tau: (n,) drive torques.
+        period: duration [s].
+        slopes, matrix, at, rate: as in `_advance`.
     """
     n = q.shape[0]
     pieces = int(period * stiffness(kinds, acts, loads, v, matrix, at) / MIDPOINT_STEP) + 1
@@ -437,9 +574,18 @@ def _advance_midpoint(
 
 @njit(**OPTIONS)
 def advance_points(tree, body, linear, kinds, acts, order, entries, shares, owners, values, q, v, tau, period, gain):
-    """Advance states q, v (K, n), each with its parameters (K, p), by a period under the same torque (n,).
+    """Advance K states q, v (K, n), each with its own parameters (K, p), by a period under the same torque (n,).
 
-    Writes M⁻¹ of the first into gain (n, n); returns (status, point reached).
+    Return a status and the index of the last state reached.
+
+    Args:
+        tree, body, linear, kinds, acts: arrays of the robot, described in the module's docstring.
+        order, entries, shares, owners: index arrays of `set_parameters`.
+        values: (K, p) parameters of each state.
+        q, v: (K, n) states, overwritten.
+        tau: (n,) drive torques, held for the period.
+        period: duration [s].
+        gain: (n, n) array to which M⁻¹ of the first state is written.
     """
     n, count = q.shape[1], kinds.shape[0]
     work, matrix, slopes = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n)), np.empty((4, n))
@@ -468,7 +614,16 @@ def advance_points(tree, body, linear, kinds, acts, order, entries, shares, owne
 
 @njit(**OPTIONS)
 def command(gains, aim, speed, seen, rate, integral, period, wish):
-    """Write feedback command (n,) into `wish`, from reference and measurement; rows of `gains` as in `closed_loop`."""
+    """Write the controller's feedback command (n,) into `wish`, from reference and measurement.
+
+    Args:
+        gains: (6, n) controller values, as in `closed_loop`.
+        aim, speed: (n,) reference position and velocity.
+        seen, rate: (n,) measured position and velocity.
+        integral: (n,) integral of the position error, updated.
+        period: control period [s].
+        wish: (n,) array to write.
+    """
     for j in range(wish.shape[0]):
         error = aim[j] - seen[j]
         integral[j] = min(max(integral[j] + period * error, -gains[5, j]), gains[5, j])
@@ -477,7 +632,16 @@ def command(gains, aim, speed, seen, rate, integral, period, wish):
 
 @njit(**OPTIONS)
 def linearise_command(tree, model, linear, ahead, seen, rate, work, matrix, wish):
-    """Replace the commanded acceleration a (n,) by the model's torque M(q) (a + ahead) + c(q, v) + g(q)."""
+    """Replace the commanded acceleration a = `wish` (n,) by the model's torque M(q) (a + ahead) + c(q, v) + g(q).
+
+    Args:
+        tree, linear, work: arrays of the robot, described in the module's docstring.
+        model: array `body` of the controller's model.
+        ahead: (n,) feedforward acceleration.
+        seen, rate: (n,) measured position and velocity, q and v of the model.
+        matrix: (n, n) working memory.
+        wish: (n,) command, overwritten.
+    """
     n = wish.shape[0]
     wanted = wish + ahead
     for j in range(n):
@@ -492,7 +656,15 @@ def linearise_command(tree, model, linear, ahead, seen, rate, work, matrix, wish
 
 @njit(**JOINED)
 def _reading(place, encoder, quantum, k, j):
-    """Return the encoder reading of joint j for a position in period k, with noise and resolution."""
+    """Return the encoder reading of joint j in period k at a true position, with noise and resolution.
+
+    Args:
+        place: true position of the joint.
+        encoder: (N, n) noise of the measured positions; (0, n) for no noise.
+        quantum: (n,) resolution of the encoders; 0 for none.
+        k: index of the control period.
+        j: index of the joint.
+    """
     read = place + (encoder[k, j] if encoder.shape[0] else 0.0)
     return quantum[j] * np.floor(read / quantum[j] + 0.5) if quantum[j] > 0.0 else read
 
@@ -518,13 +690,26 @@ def closed_loop(
     v,
     out,
 ):
-    """Run the loop: measure, command, hold the torque for one period, integrate. Return (status, period reached).
+    """Run the control loop: measure, command, hold the torque for one period, integrate.
 
-    gains (6, n): kp, kd, ki, share of the reference's velocity, torque limit, limit of the integral. reference
-    (4, N, n): position, velocity, torque ahead, acceleration ahead (for the controller's `model`, with 0 rows for
-    none). encoder, push (N, n) or (0, n): noise of the measured position, unmodelled torque.
-    q, v (n,): the state, overwritten. `out` (5, M, n): true q, v, a, measured q, torque applied, every `every` periods,
-    which need not be an integer: sample m is at m · every periods, for which part of a period is integrated.
+    `every` need not be an integer: sample m is at m · every periods, for which a part of a period is integrated.
+
+    Args:
+        tree, body, linear, kinds, acts: arrays of the robot, described in the module's docstring.
+        model: array `body` of the controller's model; 0 rows if there is none.
+        gains: (6, n) kp, kd, ki, share of the reference's velocity, torque limit, limit of the integral.
+        reference: (4, N, n) position, velocity, feedforward torque, feedforward acceleration (for `model`).
+        encoder, push: (N, n) or (0, n), noise of the measured position, and torque that the model does not contain.
+        quantum: (n,) resolution of the encoders; 0 for none.
+        period: control period [s].
+        smoothing: weight of a new velocity sample in the controller's low-pass.
+        late: delay in control periods.
+        every: control periods per sample.
+        q, v: (n,) the state, which is overwritten.
+        out: (5, M, n) true q, v, a, measured q and applied torque at each sample.
+
+    Returns:
+        A status, and the index of the period reached.
     """
     count, n = reference.shape[1], q.shape[0]
     work, matrix, slopes = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n)), np.zeros((4, n))

@@ -1,8 +1,8 @@
-"""Closed loops of recordings: reference and controller of every part without gaps, ready for simulation.
+"""Closed loops of recordings: reference and controller of every gap-free part, ready for simulation.
 
-The simulation runs along a whole part and is compared without the ends of the filters (2 / f_q), and without
-`settling_time`, in which the effect of the simulated robot's start on the reference decays. The simulated motion is
-taken at the recorded instants, with the recording's low-pass.
+The simulation covers a whole part. It is compared with the recording without the filters' borders (2 / f_q) and without
+`settling_time`, in which the simulated robot's initial deviation from the true state decays. The simulated motion is
+sampled at the recorded times and low-passed like the recording.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,10 +39,11 @@ class Loop:
     Attributes:
         controller: controller as stated, identified from the log (`calib.identification.closed_loop.controllers`) or
             guessed (a third of the true bandwidth suffices).
-        reference: reference at the controller's rate, over the whole duration of the recording, in its time.
+        reference: reference at the controller's rate, over the whole duration of the recording, in the recording's
+            time.
         every: control periods per recorded sample, not necessarily an integer.
-        design: (n,) inertia for which the gains are stated [kg m²]; the simulated robot then gets gains times
-            J(x_k) / design, so that its bandwidth is constant (Gautier & Janot). None: gains as stated.
+        design: (n,) inertia for which the gains are stated [kg m²]; the simulated robot then gets gains times J(x_k) /
+            design, so that its bandwidth is constant (Gautier & Janot). None: the gains are used as stated.
     """
 
     controller: LoopController
@@ -53,12 +54,12 @@ class Loop:
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoops:
-    """Gap-free parts of recordings, each paired with its closed control loop (reference and controller).
+    """Gap-free parts of recordings, each with its closed control loop (reference and controller).
 
     Attributes:
         pairs: each part and its loop.
         controller: controller of all parts.
-        identified: result of identifying the controller from the logs; None where it was stated.
+        identified: result of identifying the controller from the logs; None if it was stated.
         notes: remarks for the user.
     """
 
@@ -71,16 +72,18 @@ class ClosedLoops:
 def close_loops(
     model: Any, cases: Sequence[Case], decimator: Decimator, loop: LoopSettings, cad: np.ndarray | None = None
 ) -> ClosedLoops:
-    """Return the closed control loops of recordings whose motions contain `q_ref`.
+    """Return the closed control loops of recordings whose motions contain a reference `q_ref`.
 
     Args:
         model: model of the robot, which can be simulated (`plant_of`).
-        decimator: filter of the rows; parts too short for it are left out.
-        cad: standard parameters from the robot's description, for feedforward of kind ``cad``; None: not known.
+        cases: recordings.
+        decimator: filter of the rows; parts too short for it are omitted.
+        loop: settings of the loop.
+        cad: standard parameters from the robot's description, for feedforward of kind ``cad``; None: unknown.
 
     Raises:
-        MeasurementError: where a recording has no reference, or one that cannot be its own.
-        UsageError: for a control rate that does not fit the recording's, or gains of another number of joints.
+        MeasurementError: for a recording without a reference, or with one that it cannot have followed.
+        UsageError: for a control rate below the recording's rate, or gains of another number of joints.
     """
     for case in cases:
         _check_reference(case.motion)
@@ -92,7 +95,7 @@ def close_loops(
             if usable.stop - usable.start > 2 * len(decimator.taps):
                 stretches.append(part)
     if not stretches:
-        refuse_data(cases[0].motion.file, "no part without gaps is long enough to be simulated")
+        refuse_data(cases[0].motion.file, "no part without gaps is long enough to be simulated: record longer")
     ordered = sorted(stretches, key=lambda part: -len(part.motion))
     controller, identified, notes = _controller(loop, ordered[0])
     shifts: dict[str, float] = {}
@@ -121,7 +124,7 @@ def close_loops(
 
 
 def take(case: Case, part: slice) -> Case:
-    """Return the part of a case in the slice `part`."""
+    """Return the part of a case whose samples are in the slice `part`."""
     motion = case.motion.part(part)
     target = case.target[part]
     present = case.present[part]
@@ -129,7 +132,11 @@ def take(case: Case, part: slice) -> Case:
 
 
 def _check_reference(motion: Motion) -> None:
-    """Raise an error if a motion's reference is missing, belongs to another motion, or is in degrees."""
+    """Raise an error for a motion's reference that is missing, wrong, in degrees, or a copy of the motion.
+
+    Raises:
+        MeasurementError: in these cases.
+    """
     if motion.q_ref is None:
         refuse_data(
             motion.file,
@@ -141,7 +148,9 @@ def _check_reference(motion: Motion) -> None:
     if not finite.all():
         joint = int(np.argmin(finite))
         refuse_data(
-            motion.file, f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere"
+            motion.file,
+            f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere: cut those "
+            "samples out",
         )
     for j in np.flatnonzero(np.ptp(motion.q, axis=0) > 1e-3):
         reference = motion.q_ref[:, j]
@@ -152,9 +161,14 @@ def _check_reference(motion: Motion) -> None:
 
 
 def _compare(motion: Motion, reference: np.ndarray, joint: int, max_difference: float = 0.3) -> None:
-    """Raise an error if a joint does not follow its `reference` (N,), naming a likely unit error.
+    """Raise an error if a joint does not follow its `reference` (N,), and name a likely error of units.
 
     `max_difference`: largest deviation from the reference, relative to the joint's motion (our choice).
+
+    Args:
+        motion: the recorded motion.
+        reference: (N,) reference of the joint [rad or m].
+        joint: index of the joint.
     """
     q = motion.q[:, joint]
     spread = np.std(q)
@@ -185,12 +199,18 @@ def _compare(motion: Motion, reference: np.ndarray, joint: int, max_difference: 
 
 
 def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., LoopController]) -> tuple[float, tuple[str, ...]]:
-    """Return the time [s] by which the reference of a recording was played later than stated, and notes.
+    """Return the time [s] by which a recording's reference was played later than stated, and remarks for the user.
 
-    A stated time is used as it is, or refused where the torques contradict it.
+    If the reference's time is stated, the result is 0, unless the torques contradict this time.
+
+    Args:
+        part: a gap-free part of the recording.
+        loop: settings of the loop.
+        fed_forward: function of motion, reference and control periods per sample that returns the controller with
+            feedforward.
 
     Raises:
-        MeasurementError: for a reference that is late or early according to the motors' torques.
+        MeasurementError: if the motors' torques show that the reference is late or early.
         UsageError: for a designed motion without motor torques, from which its time is estimated.
     """
     motion = part.motion
@@ -198,9 +218,9 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., LoopContro
     if motor_torques(part) is None:
         if estimated:
             raise UsageError(
-                f"{part.name}: no motor torques (rows = '{part.torque_rows.name}') tell when its reference was played; "
-                "use rows = 'both', or log the reference (q_ref); for iv alone [loop] timing = 'stated' will do, which "
-                "leaves it at the measured positions"
+                f"{part.name}: the time of its reference is estimated from motor torques, which rows = "
+                f"'{part.torque_rows.name}' do not have; use rows = 'both', or log the reference (q_ref); for method "
+                "iv alone, [loop] timing = 'stated' suffices: the reference stays where it matches the positions"
             )
         return 0.0, ()
     reference, every = _make_reference(motion, loop.rate)
@@ -222,10 +242,10 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., LoopContro
     significant = abs(shift.seconds) > max(5.0 * shift.sigma, min_shift)
     if significant and shift.left < max_left and shift.before > min_gain * shift.left:
         message = (
-            f"its reference (q_ref) is {'late' if shift.seconds < 0.0 else 'early'} by {text}: so "
-            f"moved, the controller of [loop] explains {100 * (1 - shift.left):.3g} % of the torques, as logged "
-            f"{100 * (1 - min(shift.before, 1.0)):.2g} %. Set [loop] timing = 'estimated' to move it; or correct kd "
-            "and share, which may look like this; timing = 'stated' takes it as it is"
+            f"its reference (q_ref) is {'late' if shift.seconds < 0.0 else 'early'} by {text}: "
+            f"shifted by this, the controller of [loop] explains {100 * (1 - shift.left):.3g} % of the torques, "
+            f"as logged {100 * (1 - min(shift.before, 1.0)):.2g} %. Set [loop] timing = 'estimated' to shift it; or "
+            "correct kd and share, which may have the same effect; timing = 'stated' uses the logged times"
         )
         refuse_data(motion.file, message)
     return 0.0, ()
@@ -234,15 +254,19 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., LoopContro
 def _make_reference(
     motion: Motion, rate: float | None = None, shift: float = 0.0, cutoff_factor: float = 4.0
 ) -> tuple[Reference, float]:
-    """Return the reference of a motion without gaps, resampled at the control rate, and the control periods per sample.
+    """Return the reference of a gap-free motion at the control rate, and the control periods per recorded sample.
 
-    The reference is delayed by `shift` [s]. The logged positions are low-passed at `cutoff_factor` f_q and joined by a
-    cubic spline, whose slopes are v and a.
+    The reference is delayed by `shift` [s]. The logged positions are low-passed at `cutoff_factor` times f_q (the
+    positions' cut-off) and interpolated by a cubic spline, whose derivatives are v and a.
+
+    Args:
+        motion: the recorded motion.
+        rate: control rate [Hz]; None: the rate of the motion, or the smallest multiple of it that is at least 1 kHz.
+        shift: delay [s].
+        cutoff_factor: cut-off of the low-pass over f_q; it removes the rounding of the logged reference (our choice).
 
     Raises:
-        UsageError: where the control rate is below the motion's.
-
-    `cutoff_factor`: cut-off of the low-pass over f_q; it removes the rounding of the logged reference (our choice).
+        UsageError: if the control rate is below the motion's rate.
     """
     every = periods_per_sample(motion, rate)
     cutoff = min(cutoff_factor * float(motion.cutoff.max()), USABLE * motion.rate / 2)
@@ -256,10 +280,15 @@ def _make_reference(
 
 
 def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
-    """Return the control periods per sample, not always an integer; `rate` None: the controller's is >= `min_rate`.
+    """Return the control periods per recorded sample, not always an integer.
+
+    Args:
+        motion: the recorded motion.
+        rate: control rate [Hz]; None: the rate of the motion, or the smallest multiple of it that is at least
+            `min_rate`.
 
     Raises:
-        UsageError: where the control rate is below the motion's.
+        UsageError: if the control rate is below the motion's rate.
     """
     # of a controller whose rate is not stated [Hz] (our choice)
     min_rate = 1000.0
@@ -279,9 +308,13 @@ def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
 
 
 def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
-    """Return the slice of samples that are compared: without settling time and filter borders.
+    """Return the slice of samples that are compared with the simulation: without settling time and filter borders.
 
-    `settling_time`: time until the simulated robot's start no longer matters [s] (our choice).
+    `settling_time`: time after which the simulated robot's initial state has no effect [s] (our choice).
+
+    Args:
+        motion: the recorded motion.
+        settling_time: time [s].
     """
     edge = max(border(motion.rate, float(motion.cutoff.min())), 4)
     settling_samples = int(np.ceil(settling_time * motion.rate))
@@ -289,7 +322,12 @@ def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
 
 
 def _controller(loop: LoopSettings, case: Case) -> tuple[LoopController, IdentifiedController | None, tuple[str, ...]]:
-    """Return the controller (stated, or identified from the longest part), its identification result, and notes."""
+    """Return the controller, the result of its identification (None if it is stated), and remarks for the user.
+
+    Args:
+        loop: settings of the loop.
+        case: the longest part, from which a controller is identified if requested.
+    """
     n = case.motion.n
     if loop.controller != "identify":
         return stated_controller(loop, n), None, ()
@@ -328,7 +366,11 @@ def _controller(loop: LoopSettings, case: Case) -> tuple[LoopController, Identif
 
 
 def _best_shift(identified: Callable[[float], IdentifiedController]) -> float:
-    """Return the shift of the reference [s] with which an identified controller explains the torques best."""
+    """Return the shift of the reference [s] with which the identified controller best explains the torques.
+
+    Args:
+        identified: function of the shift that returns the identified controller.
+    """
     # within 0.03 s of where positions match best (our choice)
     middle, step = 0.0, 0.01
     while step > 1e-6:
@@ -347,7 +389,17 @@ def _fed_forward(
     reference: Reference,
     every: float,
 ) -> LoopController:
-    """Return the controller with its feedforward torques along the reference."""
+    """Return the controller with feedforward torques along the reference, as the settings require.
+
+    Args:
+        controller: controller without feedforward.
+        loop: settings of the loop.
+        cad: standard parameters from the robot's description, for feedforward of kind ``cad``; None: unknown.
+        model: model of the robot.
+        motion: the recorded motion.
+        reference: reference at the controller's rate.
+        every: control periods per recorded sample.
+    """
     if loop.feedforward == "none":
         return controller
     if loop.feedforward == "recording":
@@ -368,8 +420,13 @@ def _fed_forward(
 def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
     """Return the case with the simulated motion at the recorded times, filtered like the recorded motion.
 
-    With the same low-pass and differences their effect on a motion (they round off reversals) is equal in W and Z,
-    which then differ by noise only.
+    Low-pass and differences round off reversals of a motion. Since both motions are filtered equally, this affects the
+    observation matrix W and the instruments Z equally, so that they differ by noise only.
+
+    Args:
+        case: a gap-free part of a recording.
+        run: simulation of its loop.
+        loop: loop of the recording.
     """
     samples = simulated_samples(case, run.t, loop)
     q, v, a = followed(run.q, case.motion, samples)
@@ -378,10 +435,11 @@ def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
 
 
 def followed(q: np.ndarray, motion: Motion, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return q, v, a (M, n, ...) of simulated positions, or of their derivatives, filtered like the recorded motion.
+    """Return q, v, a (M, n, ...) from simulated positions, filtered and differentiated like the recorded motion.
 
     Args:
-        q: (N, n, ...) positions of the whole simulation, or their derivatives.
+        q: (N, n, ...) positions of the whole simulation, or their derivatives with respect to parameters.
+        motion: the recorded motion.
         index: (M,) indices of the samples to return.
     """
     positions = low_passed(q, motion, motion.cutoff)
@@ -392,7 +450,16 @@ def followed(q: np.ndarray, motion: Motion, index: np.ndarray) -> tuple[np.ndarr
 
 
 def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
-    """Return for each sample of a case the index of the simulated sample at its time; `t`: simulated times [s]."""
+    """Return the index of the simulated sample at the time of each sample of a case.
+
+    Args:
+        case: the recording.
+        t: simulated times [s].
+        loop: loop of the recording.
+
+    Raises:
+        CalibError: if the simulation does not cover the recording's times.
+    """
     step = loop.reference.period * loop.every
     since = case.motion.t - loop.reference.t[0]
     index = np.rint(since / step).astype(int)
@@ -409,7 +476,9 @@ def low_passed(q: np.ndarray, motion: Motion, cutoff: np.ndarray | None = None) 
     """Return simulated positions (N, n), or their derivatives (N, n, ...), low-passed like the recorded positions.
 
     Args:
-        cutoff: (n,) cut-off of another filter of the motion [Hz]; None: that of the positions.
+        q: (N, n, ...) values at the recording's rate.
+        motion: the recorded motion.
+        cutoff: (n,) another cut-off [Hz]; None: that of the recorded positions.
     """
     result = np.empty_like(q)
     cutoffs = motion.cutoff if cutoff is None else cutoff

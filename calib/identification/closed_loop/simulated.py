@@ -1,4 +1,4 @@
-"""Methods that simulate the closed loop of a recording: instrumental variables, and DIDIM."""
+"""Methods that simulate the closed loop of a recording: instrumental variables (IV), and DIDIM."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -9,7 +9,7 @@ import numpy as np
 from calib.dynamics.drives import DriveTerm
 from calib.errors import CalibError, Finding, UsageError, finding
 from calib.estimation.triangles import Triangles
-from calib.identification.closed_loop.instrumental import Instrumental, identify_instrumental, sign_noise
+from calib.identification.closed_loop.instrumental import Instrumental, identify_instrumental
 from calib.identification.closed_loop.loop_recordings import ClosedLoops, close_loops
 from calib.identification.closed_loop.simulation import simulable
 from calib.identification.loop import LoopDisagreement, LoopMetrics, LoopResults
@@ -33,7 +33,11 @@ class LoopEstimate(MethodEstimate):
     instrumental: Instrumental | None = None
 
     def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
-        """Return R factors whose least-squares solution is this estimate, with std and inflation (g,), for tests."""
+        """Return R factors whose least-squares solution is this estimate, for tests of nested models.
+
+        Returns:
+            R factors of g groups, standard deviations (g,), and variance inflations (g,).
+        """
         identification = self.instrumental
         if identification is None:
             return super().testable()
@@ -45,7 +49,14 @@ class LoopEstimate(MethodEstimate):
 def attempted_in_loop(
     method: str, problem: IdentificationProblem, loops: ClosedLoops, run: Callable[[], MethodEstimate]
 ) -> LoopEstimate:
-    """Return the result of `run` on a problem with its loops and computing time; a failure is returned as a status."""
+    """Return the result of `run` with the loops and its computing time; an estimation's failure becomes a status.
+
+    Args:
+        method: name of the method.
+        problem: data and settings, with which a failure is recorded.
+        loops: closed loops that `run` simulates.
+        run: function that makes the estimate.
+    """
     estimate = attempted(method, problem, run)
     if isinstance(estimate, LoopEstimate):
         return estimate
@@ -57,8 +68,8 @@ class _Simulated(Method):
     """A method that simulates the closed loop.
 
     Attributes:
-        instruments: how the method uses the simulated motion, see
-            `calib.identification.closed_loop.instrumental.ROUNDS`; "": according to the loop's settings.
+        instruments: use of the simulated motion, a key of `calib.identification.closed_loop.instrumental.ROUNDS`;
+            empty: as in the loop's settings.
     """
 
     needs_controller: bool = field(default=True, kw_only=True)
@@ -67,10 +78,10 @@ class _Simulated(Method):
     instruments: str = ""
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the base columns, with row weights and variance inflation from WLS.
+        """Return the estimate of the problem's columns; row weights and variance inflation are those of WLS.
 
         Raises:
-            UsageError, MeasurementError: for a loop or recordings that no simulation can start from.
+            UsageError, MeasurementError: for a loop or recordings that cannot be simulated.
         """
         if problem.loop is None or not simulable(problem.model):
             raise UsageError(f"method '{self.name}' needs a [loop], and a robot that can be simulated")
@@ -85,7 +96,16 @@ class _Simulated(Method):
     def beside(
         self, problem: IdentificationProblem, plain: MethodEstimate, terms: Sequence[DriveTerm] = ()
     ) -> LoopEstimate:
-        """Return the estimate, starting from the least-squares estimate `plain`, with the richer friction `terms`."""
+        """Return the estimate with instruments, which starts from a least-squares estimate.
+
+        Args:
+            problem: data and settings.
+            plain: the least-squares estimate.
+            terms: additional friction terms.
+
+        Raises:
+            UsageError: without a loop, or for a robot that cannot be simulated.
+        """
         model: Any = problem.model
         loop = problem.loop
         if loop is None or not simulable(model):
@@ -111,6 +131,7 @@ class _Simulated(Method):
                 positive=loop.positive,
                 terms=terms,
                 constraints=constraints,
+                say=problem.say,
             )
             simulations = 0
             for iteration in identification.rounds:
@@ -146,7 +167,7 @@ DIDIM = _Simulated(
     f"the simulated robot moves like the real one: stated controller, reference and {CHOSEN}; measured positions are "
     "not used",
     "didim",
-    description="least squares on the simulated motion alone (the slides' CLIE)",
+    description="least squares on the simulated motion alone (CLIE of the source)",
     source="Gautier, Janot & Vandanjon 2013",
 )
 PC_IV = replace(
@@ -172,12 +193,12 @@ METHODS = (IV, DIDIM, PC_IV, PC_DIDIM)
 
 @dataclass(frozen=True, eq=False)
 class LoopTest:
-    """Result of instrumental variables from simulation.
+    """Test of an estimate by instrumental variables (IV) from simulation.
 
     Attributes:
-        found: IV estimate of the standard model, with the test of least squares; None if IV failed.
-        loops: the simulated closed loops.
-        failure: reason for a missing estimate.
+        found: IV estimate of the standard model, with the test of least squares for bias; None if IV failed.
+        loops: the simulated closed loops; None if IV failed.
+        failure: reason for a missing estimate; empty otherwise.
     """
 
     found: Instrumental | None = None
@@ -185,18 +206,26 @@ class LoopTest:
     failure: str = ""
 
     def findings(self, is_estimate: bool) -> list[Finding]:
-        """Return the findings for a user of the IV estimate (`is_estimate`), or of a least-squares estimate."""
+        """Return the findings of the test.
+
+        Args:
+            is_estimate: whether IV is the user's estimate; otherwise it is the comparison for a least-squares estimate.
+        """
         if self.found is None or self.loops is None:
             return [finding("loop-test-failed", why=self.failure)]
         causes = _distance(self.found) or _gains(self.found) or _torques(self.found)
         noticed = [*_weakness(self.found), *causes]
-        return noticed + (_blurred(self.found, self.loops) if is_estimate else _biased(self.found))
+        return noticed if is_estimate else noticed + _biased(self.found)
 
 
 def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
-    """Return the result of instrumental variables for an estimate whose closed loop is described in the options.
+    """Return the test of an estimate by instrumental variables (IV), with the closed loop of the problem.
 
-    An IV estimate is returned as its own comparison; for another method's estimate, a failure of IV is reported.
+    An IV estimate is its own comparison. For an estimate of another method, a failure of IV is part of the result.
+
+    Args:
+        problem: data and settings, with the closed loop.
+        estimate: the user's estimate.
     """
     loop_estimate = None
     if isinstance(estimate, LoopEstimate) and estimate.instrumental is not None:
@@ -231,7 +260,11 @@ def _distance(identification: Instrumental) -> list[Finding]:
 
 
 def _gains(identification: Instrumental) -> list[Finding]:
-    """Return the finding on joints whose given gains differ from the gains in the recording."""
+    """Return the finding on joints whose stated gains differ from the gains during the recording.
+
+    Args:
+        identification: estimate by instrumental variables, with the gains that the simulation suggests.
+    """
     joints = [f"{identification.stray[j]:.2g} times at joint {j + 1}" for j in identification.off]
     if joints:
         return [finding("loop-gains-off", joints=joints)]
@@ -239,7 +272,11 @@ def _gains(identification: Instrumental) -> list[Finding]:
 
 
 def _torques(identification: Instrumental) -> list[Finding]:
-    """Return the finding on torque rows that the simulated motion does not explain, though the measured one does."""
+    """Return the finding on torque rows that are explained by the measured motion but not by the simulated motion.
+
+    Args:
+        identification: estimate by instrumental variables, with the simulation's errors.
+    """
     case = identification.rows[0][0]
     direct = identification.direct
     iv_torques = identification.own
@@ -251,7 +288,11 @@ def _torques(identification: Instrumental) -> list[Finding]:
 
 
 def _biased(identification: Instrumental) -> list[Finding]:
-    """Return the finding on a bias of least squares; none if the bias is small or the simulated loop fits poorly."""
+    """Return the finding that least squares is biased; none if the bias is small or the simulation fits poorly.
+
+    Args:
+        identification: estimate by instrumental variables, with its test of least squares.
+    """
     # standard deviations of a shift that is worth a word (our choice)
     shift = identification.shift
     min_shift = 1.0
@@ -266,35 +307,17 @@ def _biased(identification: Instrumental) -> list[Finding]:
     return [finding("least-squares-biased", p=identification.verdict.p, names=names)]
 
 
-def _blurred(identification: Instrumental, loops: ClosedLoops) -> list[Finding]:
-    """Return the finding on joints whose Coulomb sign is mainly velocity noise, which instruments cannot correct."""
-    if not identification.estimator.measured:
-        return []
-    # widths of the sign (our choice)
-    noise = sign_noise(identification.plant, loops.pairs[0][0].motion)
-    max_blur = 3.0
-    signs = [term for term in identification.plant.terms if term.shape == "sign"]
-    blurred = {}
-    for sign in signs:
-        joint = sign.acts[0][0]
-        blurred[sign.name] = noise[joint] / sign.settings[-1]
-    joints = [f"{size:.2g} at {name}" for name, size in blurred.items() if size > max_blur]
-    if joints:
-        return [finding("noisy-signs", joints=joints)]
-    return []
-
-
 # of both together, by which a parameter differs surely (our choice)
 SIGMAS = 5.0
 
 
 def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test: LoopTest) -> LoopDisagreement | None:
-    """Return the disagreement of an output-error estimate with the recorded torques; None if both agree.
+    """Return how an output-error estimate (fitted to simulated positions) contradicts the torques; None if it does not.
 
     Args:
-        problem: the problem that both estimates solve.
+        problem: data and settings of both estimates.
         estimate: the output-error estimate.
-        test: result of instrumental variables; least squares is compared if it has no estimate.
+        test: test by instrumental variables, whose estimate is the comparison; least squares if it has none.
     """
     if not (estimate.found and estimate.alone and isinstance(estimate, LoopEstimate)):
         return None
@@ -332,7 +355,12 @@ def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test:
 
 
 def _factors(problem: IdentificationProblem, estimate: np.ndarray, reference: np.ndarray) -> tuple[float, ...]:
-    """Return for each torque row the ratio (regression slope) of the torques of two estimates."""
+    """Return for each torque row the ratio of two estimates' torques (regression slope).
+
+    Args:
+        problem: data and settings.
+        estimate, reference: (p,) parameters; the ratios are torques of `estimate` over those of `reference`.
+    """
     factors = problem.pooled.factors[:, :, :-1]
     own_values = factors @ estimate
     reference_values = factors @ reference
@@ -343,7 +371,12 @@ def _factors(problem: IdentificationProblem, estimate: np.ndarray, reference: np
 
 
 def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopResults:
-    """Return the results of an estimate's loop test, in the form that is stored and printed."""
+    """Return the results of simulating an estimate's loop, in the form that is stored and printed.
+
+    Args:
+        problem: data and settings; without a loop the results are empty.
+        estimate: the user's estimate.
+    """
     test = compare_with_loop(problem, estimate)
     is_estimate = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
     table: tuple[tuple[object, ...], ...] = ()
@@ -356,7 +389,12 @@ def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> Lo
 
 
 def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
-    """Return the metrics of a test by simulation."""
+    """Return the metrics of a test by simulation.
+
+    Args:
+        test: result of instrumental variables.
+        beside: whether the user's estimate was made by another method.
+    """
     identification = test.found
     loops = test.loops
     notes = () if loops is None else loops.notes
@@ -367,9 +405,16 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
     distance = identification.apart
     if distance.any():
         notes += (
-            f"with the instruments of unbound parameters alone (Janot's slides) the estimate is at most "
+            f"with the instruments of unbound parameters alone (Janot's form) the estimate is at most "
             f"{distance.max():.2g} σ away, at {identification.names[int(np.argmax(distance))]}",
         )
+    shares = np.array([noise.share for noise in identification.noise]).min(axis=0)
+    by_joint = ", ".join(f"{100 * share:.0f}" for share in shares)
+    notes = (
+        f"share of the position noise that the controller answers, by joint: {by_joint} %; Coulomb signs are averaged "
+        "over the noise, simulated in the loop by this share",
+        *notes,
+    )
     rounds = len(identification.rounds)
     largest_shift_sigma = float(identification.shift.max())
     least_partial_r2 = float(strength.partial_r2.min())
@@ -396,7 +441,11 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
 
 
 def _table(identification: Instrumental) -> tuple[tuple[object, ...], ...]:
-    """Return table rows with both estimates of the standard model, one row per parameter."""
+    """Return a table that compares IV and least-squares estimates of the standard model, one row per parameter.
+
+    Args:
+        identification: estimate by instrumental variables, with the least-squares estimate.
+    """
     estimate = identification.fit.estimate
     ordinary = identification.ordinary.estimate.values
     explained = 100.0 * identification.strength.partial_r2

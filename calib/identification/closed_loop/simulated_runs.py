@@ -1,6 +1,6 @@
-"""Simulated runs of recordings' closed loops: of the regular robot at the start, and of robots between two estimates.
+"""Simulations of recordings' closed loops: of the initial regular robot, and of robots between two estimates.
 
-The distance of a run from the recorded motion shows how reliable the simulation is.
+The distance of a simulation from the recorded motion shows how reliable the simulation is.
 """
 
 from __future__ import annotations
@@ -31,7 +31,19 @@ Runs = list[tuple[tuple[Case, Loop], SimulatedRun]]
 def regular_plant(
     model: IdentificationModel, terms: Sequence[DriveTerm], loop: Loop, inertia: np.ndarray | None
 ) -> Plant:
-    """Return the robot of the first simulation: joint inertias J (its last n parameters), no bodies, no gravity."""
+    """Return the robot of the first simulation: joint inertias J only, without bodies and gravity.
+
+    J are its last n parameters.
+
+    Args:
+        model: model of the robot.
+        terms: additional friction terms, with values of zero.
+        loop: loop of the first recording.
+        inertia: J (n,) [kg m²]; None: kd² / (2 kp) of the loop's controller.
+
+    Raises:
+        UsageError: if the controller's gains give no positive inertia.
+    """
     if inertia is None:
         with np.errstate(divide="ignore", invalid="ignore"):
             inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
@@ -43,28 +55,48 @@ def regular_plant(
 
 
 def simulated_runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
-    """Return the noise-free simulation of every recording's loop."""
-    result: Runs = []
-    for case, loop in cases:
-        robot = plant.carrying(case.carried)
-        controller = loop.controller
-        if loop.design is not None:
-            controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
-        run = robot.run(controller, loop.reference, Sensing(every=loop.every))
-        result.append(((case, loop), run))
-    return result
+    """Return noise-free simulations of the loops of all recordings.
+
+    Args:
+        plant: the simulated robot.
+        cases: gap-free parts of recordings, each with its loop.
+    """
+    return [((case, loop), simulated_run(plant, case, loop, Sensing(every=loop.every))) for case, loop in cases]
+
+
+def simulated_run(plant: Plant, case: Case, loop: Loop, sensing: Sensing, seed: int = 0) -> SimulatedRun:
+    """Return the simulation of a recording's loop with the recording's payloads.
+
+    Args:
+        plant: the simulated robot.
+        case: the recording, which has the payloads.
+        loop: its loop.
+        sensing: noise, resolution and sampling.
+        seed: seed of all noise.
+    """
+    robot = plant.carrying(case.carried)
+    controller = loop.controller
+    if loop.design is not None:
+        controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
+    return robot.run(controller, loop.reference, sensing, seed)
 
 
 def between(start: Plant, end: Plant, share: float) -> Plant:
-    """Return the plant whose parameters are a share of the way from one plant to another."""
+    """Return the robot with parameters (1 - share) · start + share · end."""
     return end.with_parameters(share * end.parameters + (1.0 - share) * start.parameters)
 
 
 def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs]:
-    """Return the plant halfway from `start` to `end`, or nearer to `start` if it cannot be simulated, and its runs.
+    """Return a robot between `start` and `end` that can be simulated, with its simulations.
+
+    The robot is halfway, or nearer to `start` if that robot cannot be simulated.
+
+    Args:
+        start, end: robots with different parameters; `start` can be simulated.
+        cases: gap-free parts of recordings, each with its loop.
 
     Raises:
-        CannotSimulate: where no plant near `start` can be simulated.
+        CannotSimulate: if no robot near `start` can be simulated.
     """
     problem: CalibError | None = None
     for halvings in range(1, MAX_RETREATS + 1):
@@ -73,11 +105,15 @@ def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tupl
             return candidate, simulated_runs(candidate, cases)
         except CalibError as error:
             problem = error
-    raise CannotSimulate(f"no robot on the way to the estimate can be simulated: {problem}", start)
+    raise CannotSimulate(f"no parameters between the start and the estimate can be simulated: {problem}", start)
 
 
 def distance_percent(runs: Runs) -> np.ndarray:
-    """Return the position difference of simulated and recorded robot (n,), relative to the travel [%]."""
+    """Return the rms difference of simulated and recorded positions (n,), relative to the motion's rms [%].
+
+    Args:
+        runs: simulations of the recordings' loops.
+    """
     n = runs[0][0][0].motion.n
     away, size = np.zeros((2, n))
     for (case, loop), run in runs:
@@ -90,7 +126,11 @@ def distance_percent(runs: Runs) -> np.ndarray:
 
 
 def error_ratio(runs: Runs) -> np.ndarray:
-    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN where noise hides them."""
+    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN if noise hides the ratio.
+
+    Args:
+        runs: simulations of the recordings' loops.
+    """
     measured_errors = []
     expected_errors = []
     for (case, loop), run in runs:

@@ -2,9 +2,9 @@
 
     (M(q) + Ia) a + c(q, v) + g(q) + Fv v + Fc tanh(v / v0) + off = tau + push,    tau held for one control period,
 
-integrated by the classical Runge-Kutta form at the controller's rate, in more steps where the smoothed sign of Coulomb
-friction is stiff (`kernels`): there is no chatter at rest, and the simulated model is the identified one. At every
-recorded instant the equation holds to rounding for the true q, v, a and the torque.
+integrated by the classical Runge-Kutta method at the controller's rate, with more steps where the smoothed sign of
+Coulomb friction is stiff (`loop_kernels`). There is no chatter at rest, and the simulated model is the identified one.
+At every recorded time the equation is satisfied to rounding by the true q, v, a and the torque.
 
 `tracking_error` judges a model by a robot's deviation from its reference when the model's torques are fed forward. This
 complements the computed-torque test, which by itself is "not a direct answer" about tracking (Kolyubin, Shiriaev &
@@ -36,7 +36,13 @@ LOWER = "these gains cannot stabilise this robot at this rate; lower kp and kd (
 
 
 def added_inertia(terms: Iterable[DriveTerm], values: np.ndarray, n: int) -> np.ndarray:
-    """Return the constant inertia (n, n) that acceleration terms add to that of the bodies: diag(Ia) and couplings."""
+    """Return the constant inertia matrix (n, n) of the drives: motor inertias and their couplings between joints.
+
+    Args:
+        terms: drive terms.
+        values: values of their parameters.
+        n: number of joints.
+    """
     result = np.zeros((n, n))
     for term, value in zip(terms, values, strict=True):
         if term.shape == "acceleration":
@@ -48,13 +54,13 @@ def added_inertia(terms: Iterable[DriveTerm], values: np.ndarray, n: int) -> np.
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """A robot model to simulate.
+    """A robot model that can be simulated.
 
     Attributes:
         bodies: rigid bodies of the robot.
-        terms: drive terms of the robot; Coulomb signs must have a smoothing above zero.
+        terms: k drive terms of the robot; Coulomb signs must have a smoothing above zero.
         parameters: (10 B + k,) standard parameters of the bodies, then one value per term. All values that give a
-            positive definite inertia are valid, also base parameters with zeros for the others.
+            positive definite inertia matrix are valid, also base parameters with zeros for the regrouped ones.
     """
 
     bodies: Bodies
@@ -72,7 +78,7 @@ class Plant:
 
     @property
     def inertial(self) -> int:
-        """Number of the bodies' parameters, which come first."""
+        """Number of the bodies' parameters, which precede the drive parameters."""
         return 10 * self.bodies.count
 
     def with_parameters(self, parameters: np.ndarray) -> Plant:
@@ -80,27 +86,48 @@ class Plant:
         return replace(self, parameters=parameters)
 
     def carrying(self, carried: Collection[str]) -> Plant:
-        """Return the robot model with only the payloads of these labels."""
+        """Return the robot with only the payloads of these labels; the parameters of other payloads become zero.
+
+        Args:
+            carried: labels of the payloads.
+        """
         carried_columns = IdentificationModel(self.bodies).carried_columns(carried)
         factors = np.append(carried_columns, np.ones(len(self.terms)))
         return self.with_parameters(self.parameters * factors)
 
-    def run(self, controller: LoopController, reference: Reference, sensing: Sensing | None = None) -> SimulatedRun:
-        """Return the simulated motion of the robot that follows a reference; see `simulate`."""
-        return simulate(self, controller, reference, sensing)
+    def run(
+        self,
+        controller: LoopController,
+        reference: Reference,
+        sensing: Sensing | None = None,
+        seed: int | np.random.Generator = 0,
+    ) -> SimulatedRun:
+        """Return the simulated motion of the robot that follows a reference, by `simulate`.
+
+        Args:
+            controller: the controller.
+            reference: reference sampled at the controller's rate.
+            sensing: noise, resolution and sampling; None: no noise, one sample per control period.
+            seed: seed of all noise.
+        """
+        return simulate(self, controller, reference, sensing, seed)
 
     def feed_forward(self, reference: Reference) -> np.ndarray:
-        """Return the torques (N, n) along a reference; see `feed_forward`."""
+        """Return the torques (N, n) of this model along a reference, drives included [N m or N]."""
         return feed_forward(self, reference)
 
     def inertia(self, q: np.ndarray) -> np.ndarray:
-        """Return the inertia matrices (N, n, n), motor inertia included, at configurations q (N, n)."""
+        """Return the inertia matrices (N, n, n), motor inertia included, at joint positions q (N, n)."""
         rigid, drives = np.split(self.parameters, [self.inertial])
         matrices = mass_matrix(self.bodies, rigid, np.ascontiguousarray(q, dtype=float))
         return matrices + added_inertia(self.terms, drives, self.bodies.n)
 
     def inertia_diagonal(self, q: np.ndarray) -> np.ndarray:
-        """Return the mean diagonal (n,) of the inertia matrix, motor inertia included, over configurations (N, n)."""
+        """Return the diagonal (n,) of the inertia matrix, motor inertia included, mean over joint positions (N, n).
+
+        Args:
+            q: (N, n) joint positions [rad or m].
+        """
         return np.einsum("kii->i", self.inertia(q)) / len(q)
 
 
@@ -109,10 +136,11 @@ class Sensing:
     """Measurement noise, resolution and sampling of controller and log.
 
     Attributes:
-        sigma_q: (n,) white noise of every measured position [rad or m]; the controller acts on it.
+        sigma_q: (n,) standard deviation of the noise of measured positions [rad or m]; the controller acts on it.
         q_band: cut-off of the first-order low-pass that colours the position noise at unchanged σ [Hz]; None: white.
         quantum: (n,) resolution of the encoders [rad or m]; 0 for none.
-        sigma_tau: (n,) white noise of the recorded torque [N m or N]; it does not act on the joints.
+        sigma_tau: (n,) standard deviation of the white noise of recorded torques [N m or N]; it does not act on the
+            joints.
         push: (n,) standard deviation of a torque that acts but is not recorded: ripple, cables, other effects [N m or
             N].
         push_band: cut-off of the first-order low-pass that colours `push` at unchanged σ [Hz]; None: white.
@@ -134,10 +162,10 @@ class SimulatedRun:
 
     Attributes:
         t: (M,) sample times [s].
-        q, v, a: (M, n) true motion.
-        measured: (M, n) positions measured by the encoders.
-        tau: (M, n) torques as recorded, with `Sensing.sigma_tau`.
-        torque: (M, n) torques that acted on the joints.
+        q, v, a: (M, n) true motion [rad or m, and per s, per s²].
+        measured: (M, n) positions measured by the encoders [rad or m].
+        tau: (M, n) torques as recorded, with noise of `Sensing.sigma_tau` [N m or N].
+        torque: (M, n) torques that acted on the joints [N m or N].
     """
 
     t: np.ndarray
@@ -161,14 +189,17 @@ def simulate(
     """Return the simulated motion of a robot that follows a reference.
 
     Args:
+        plant: the robot.
+        controller: its controller.
         reference: reference sampled at the controller's rate, which it thereby defines.
-        seed: seed of all noise; the same seed gives the same run to the last bit.
+        sensing: noise, resolution and sampling; None: no noise, one sample per control period.
+        seed: seed of all noise; equal seeds give exactly equal results.
         start: q, v (n,) at the first instant; None: on the reference.
-        push: (N, n) additional torque at the reference's instants [N m or N]; None: none.
+        push: (N, n) additional torque at the reference's instants [N m or N]; None: no additional torque.
 
     Raises:
-        CalibError: where the inertia is not positive definite, or friction too stiff for the rate.
-        NotConverged: where the loop is unstable.
+        CannotSimulate: if the inertia matrix is not positive definite, or friction too stiff for the rate.
+        Diverged: if the loop is unstable.
     """
     from calib.identification.closed_loop import loop_kernels
 
@@ -234,22 +265,28 @@ def simulate(
 
 
 def sample_ticks(count: int, every: float) -> np.ndarray:
-    """Return the times of recorded samples during `count` control periods, in periods, not necessarily integers."""
+    """Return the times of the samples that are recorded during `count` control periods, in periods.
+
+    `every` is the number of periods per sample, not necessarily an integer.
+    """
     return np.arange(int((count - 1) / every + 1e-9) + 1) * every
 
 
 def forward_dynamics(
     plant: Plant, q: np.ndarray, v: np.ndarray, tau: np.ndarray, parameters: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return the accelerations (N, n) under drive torques (N, n), with friction and motor inertia.
+    """Return the joint accelerations (N, n) under drive torques, with friction and motor inertia.
 
-    Friction with hysteresis is taken as unstressed.
+    The states of friction with hysteresis are taken as zero.
 
     Args:
+        plant: the robot.
+        q, v: (N, n) joint positions and velocities [rad or m, and per s].
+        tau: (N, n) drive torques [N m or N].
         parameters: (N, p) parameters of each sample; None: the plant's.
 
     Raises:
-        CalibError: where the inertia is not positive definite.
+        CannotSimulate: if the inertia matrix is not positive definite.
     """
     from calib.identification.closed_loop import loop_kernels
 
@@ -271,14 +308,27 @@ def forward_dynamics(
 
 
 def _draw(rng: np.random.Generator, sigma: np.ndarray, count: int) -> np.ndarray:
-    """Return white noise (count, n), or an empty array if the noise is zero."""
+    """Return white noise (count, n) with standard deviations sigma (n,), or an empty array if all are zero.
+
+    Args:
+        rng: generator of random numbers.
+        sigma: (n,) standard deviations.
+        count: number of samples.
+    """
     if not np.any(sigma):
         return np.empty((0, len(sigma)))
     return rng.standard_normal((count, len(sigma))) * sigma
 
 
 def _coloured(white: np.ndarray, step: float) -> np.ndarray:
-    """Return noise x_k = p x_{k-1} + √(1 - p²) w_k, p = exp(-step), with the variance of the white noise w (N, n)."""
+    """Return low-passed noise x_k = p x_{k-1} + √(1 - p²) w_k with p = exp(-step), for white noise w (N, n).
+
+    Its variance equals the variance of w.
+
+    Args:
+        white: (N, n) white noise w.
+        step: time step over the time constant of the low-pass.
+    """
     if not len(white):
         return white
     pole = float(np.exp(-step))
@@ -289,7 +339,7 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
 
 
 def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the index arrays by which `loop_kernels.set_parameters` writes parameters into the output of `packed`."""
+    """Return the index arrays by which `loop_kernels.set_parameters` writes into the arrays of `packed(plant)`."""
     n = plant.bodies.n
     first = plant.inertial
     orders = np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10))
@@ -313,7 +363,7 @@ def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 
 def packed(plant: Plant) -> Packed:
-    """Return the robot model as arrays in the layout of the kernels: tree, body, linear, kinds and acts."""
+    """Return the robot model `plant` as the arrays tree, body, linear, kinds and acts of `loop_kernels`."""
     bodies = plant.bodies.count
     n = plant.bodies.n
     parents = np.where(plant.bodies.parents < 0, bodies, plant.bodies.parents)
@@ -332,7 +382,14 @@ def packed(plant: Plant) -> Packed:
 
 
 def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
-    """Return placements and parameters of bodies, in frames rotated so that each joint moves about or along z."""
+    """Return placements and parameters of the bodies as the array `body` (B + 1, 23) of `loop_kernels`.
+
+    Frames are rotated so that each joint moves about or along z.
+
+    Args:
+        bodies: the B bodies.
+        parameters: (10 B,) their standard parameters.
+    """
     result = np.zeros((bodies.count + 1, 23))
     result[-1, :3] = -bodies.gravity
     turns = [upright_turn(axis)[:3, :3] for axis in bodies.axes]
@@ -351,9 +408,17 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
 
 
 def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float = 0.1) -> tuple[np.ndarray, list]:
-    """Return the linear terms (n, 2 n + 1), and the friction terms: row, code, amount, seven settings, weights (n,).
+    """Return the linear drive terms (n, 2 n + 1), and a list of the other friction terms.
 
-    `ramp`: width of the smoothing of a dead-zone sign, relative to its dead zone (a jump cannot be integrated).
+    An entry of the list is a tuple of torque row, shape code, parameter value, seven settings, and joint weights (n,).
+
+    `ramp`: width over which the sign with a dead zone is smoothed, relative to its dead zone (a jump cannot be
+    integrated).
+
+    Args:
+        terms: drive terms.
+        values: values of their parameters.
+        n: number of joints.
     """
     from calib.dynamics import shape_kernels
 
@@ -382,7 +447,13 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float 
 
 
 def failure(status: int, time: float, where: str | None = None) -> NotConverged:
-    """Return the error for a failure status of the kernels at `time` [s], or at the place described by `where`."""
+    """Return the error for a failure status of the kernels.
+
+    Args:
+        status: status returned by a kernel.
+        time: time of the failure [s].
+        where: text that replaces the time in the message; None: the time.
+    """
     from calib.identification.closed_loop import loop_kernels
 
     location = f"at {time:.4g} s " if where is None else where
@@ -401,7 +472,12 @@ def failure(status: int, time: float, where: str | None = None) -> NotConverged:
 
 
 def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
-    """Return the torques (N, n) of the controller's robot model along the reference, drives included [N m or N]."""
+    """Return the torques (N, n) of the controller's robot model along a reference, drives included [N m or N].
+
+    Args:
+        believed: the controller's model.
+        reference: reference sampled at the controller's rate.
+    """
     model = IdentificationModel(believed.bodies, believed.terms)
     # instants at a time
     block = 4096
@@ -417,19 +493,27 @@ def tracking_error(
     ahead: np.ndarray | None = None,
     push: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the rms of q - q_r (n,) [rad or m] of a robot without noise, at the controller's instants.
+    """Return the rms tracking error q - q_r (n,) [rad or m] of a robot without noise, at the controller's instants.
 
     Args:
         robot: the robot that moves; for a real arm, its best available model.
-        ahead: (N, n) feedforward torques, e.g. from `feed_forward`; None: those of the controller.
-        push: (N, n) additional torques; None: none.
+        controller: its controller.
+        reference: reference sampled at the controller's rate.
+        ahead: (N, n) feedforward torques [N m or N], e.g. from `feed_forward`; None: those of the controller.
+        push: (N, n) additional torques [N m or N]; None: no additional torque.
     """
     run = simulate(robot, controller if ahead is None else controller.with_feedforward(ahead), reference, push=push)
     return np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0))
 
 
 def plant_of(model: Any, values: np.ndarray, terms: Sequence[DriveTerm] = ()) -> Any:
-    """Return simulable robot of a model with parameter values and further terms (an arm's, or the model's `plant`)."""
+    """Return a robot that can be simulated from a model with parameter values.
+
+    Args:
+        model: an identification model, or a model with a method `plant`.
+        values: parameters of the model and of the further terms.
+        terms: further drive terms.
+    """
     if isinstance(model, IdentificationModel):
         return Plant(model.bodies, (*model.columns, *terms), values)
     return model.plant(values, terms)

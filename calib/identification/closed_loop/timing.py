@@ -1,10 +1,11 @@
-"""Time of a reference in its recording, from the stated controller: the shift δ that explains the logged torques best.
+"""Time of a reference in its recording: the time shift δ with which the stated controller best explains the torques.
 
     y_j(t) = C_j(q_ref(t - δ) - q(t)) + c_j,    min over δ of Σ_j ‖y_j - C_j - c_j‖² / σ_j²    (our choice)
 
-C is the control law with its gains, delays and feedforward. Gauss–Newton steps start at the shift at which positions
-match best, which is too late by the tracking lag. No model of the robot is used: unknown friction or masses have no
-influence, wrong gains do. A reference that follows the measured positions to their last digit is a copy.
+C is the control law with its gains, delays and feedforward, y are the logged torques, c_j constants. Gauss–Newton steps
+start at the shift with which positions match best, which is too late by the tracking lag. No model of the robot is
+used, so that unknown friction or masses have no influence; wrong gains do. A reference that equals the measured
+positions to their last digit is a copy of them and is refused.
 """
 
 from dataclasses import dataclass
@@ -30,10 +31,11 @@ class ReferenceShift:
     """Shift of a reference in time.
 
     Attributes:
-        seconds, sigma: time by which the reference is later than stated, and its standard deviation [s]. left, before:
-        share of the torque that the controller does not explain, with this shift and without it; only the part of the
-        torque correlated with the reference's motion counts.
-        effect: change of the reference's torque by one sigma, as a share of the torque.
+        seconds, sigma: time by which the reference is later than stated, and its standard deviation [s].
+        left, before: share of the torque that the controller does not explain, with this shift and without it; only the
+            part of the torque correlated with the reference's motion counts.
+        effect: rms change of the torque if the reference moves by one sigma, as a share of the torque's standard
+            deviation.
     """
 
     seconds: float
@@ -52,11 +54,11 @@ def reference_shift(
         case: the part, with motor torques.
         reference: reference at the controller's rate, from the part's first sample on.
         every: control periods per sample.
-        controller: the controller that followed it.
+        controller: the controller that followed the reference.
         band: cut-off of the low-pass of torques and positions [Hz].
 
     Raises:
-        NotConverged: where no shift within `MAX_SHIFT` explains the torques best.
+        NotConverged: if no shift within `MAX_SHIFT` explains the torques best.
     """
     law = _Law(case, reference, every, controller, band)
     t = law.t[law.rows]
@@ -86,7 +88,7 @@ def reference_shift(
 
 
 class _Law:
-    """Control law of a recording as splines in time: reference, measured positions and torques, low-passed."""
+    """Control law of a recording, with low-passed reference, measured positions and torques as splines in time."""
 
     def __init__(self, case: Case, reference: Reference, every: float, controller: LoopController, band: float) -> None:
         rate = case.motion.rate
@@ -117,7 +119,11 @@ class _Law:
         self.speed_late = self.late + 0.5 * reference.period + lag
 
     def linearised(self, shift: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return residual torques (M, n), without their means, and the law's derivative with respect to the shift."""
+        """Return residual torques (M, n) minus their means, and the control law's derivative by the shift (M, n).
+
+        Args:
+            shift: time by which the reference is later than stated [s].
+        """
         controller = self.controller
         instants = self.t - self.late
         shifted = np.clip(instants - shift, self.t[0], self.t[-1])
@@ -135,10 +141,10 @@ class _Law:
         return residual - residual.mean(axis=0), slopes - slopes.mean(axis=0)
 
     def left(self, shift: float) -> tuple[float, float]:
-        """Return the shares of the torques that the law does not explain, with the shift and without.
+        """Return the shares of the torques that the control law does not explain, with the shift and without it.
 
-        Only the parts of torques and residuals that are correlated with the reference (shifted or not) and its
-        derivatives count, joint by joint, so that position noise in the law cannot hide a delay (our choice).
+        Only those parts of torques and residuals count that are correlated with the reference (shifted or not) and its
+        derivatives, joint by joint, so that position noise in the law cannot hide a delay (our choice).
         """
         times = self.t[self.rows]
         derivatives = []
@@ -164,7 +170,12 @@ class _Law:
 
 
 def _by_positions(reference: CubicSpline, measured: CubicSpline, t: np.ndarray) -> float:
-    """Return the shift [s] of the reference at which it is nearest to the measured positions, at times t (M,)."""
+    """Return the shift [s] of the reference with which it is nearest to the measured positions, at times t (M,).
+
+    Args:
+        reference, measured: reference and measured positions as splines in time.
+        t: (M,) times [s].
+    """
     shift = 0.0
     low = float(reference.x[0])
     high = float(reference.x[-1])
@@ -182,7 +193,7 @@ def _by_positions(reference: CubicSpline, measured: CubicSpline, t: np.ndarray) 
 
 
 def motor_torques(case: Case) -> np.ndarray | None:
-    """Return the motors' torques (N, n) of a case [N m or N]; None where its rows or recording do not contain them."""
+    """Return the motors' torques (N, n) of a case [N m or N]; None if rows and recording do not contain them."""
     if case.torque_rows.with_motors:
         return case.target[:, -case.motion.n :]
     projected = case.torque_rows.projection is not None and case.motion.kind == "torque"
@@ -192,16 +203,17 @@ def motor_torques(case: Case) -> np.ndarray | None:
 
 
 def check_no_copy(motion: Motion, reference_q: np.ndarray) -> None:
-    """Refuse a reference that is the measured motion itself, perhaps shifted in time, rounded or low-passed.
+    """Raise an error for a reference that is the measured motion, perhaps shifted in time, rounded or low-passed.
 
-    After the motion has ended, measured positions contain only noise: a reference that contains this noise, too, is a
+    After the motion has ended, measured positions contain only noise; a reference that also contains this noise is a
     copy.
 
     Args:
-        reference_q: the reference (N, n), filtered like the measured positions.
+        motion: the recorded motion.
+        reference_q: (N, n) the reference, filtered like the measured positions.
 
     Raises:
-        MeasurementError: for a copy, naming the shift.
+        MeasurementError: for a copy; the message states the shift.
     """
     moves = np.ptp(motion.q, axis=0) > 1e-3
     t = np.arange(len(motion)) / motion.rate
@@ -230,16 +242,22 @@ def check_no_copy(motion: Motion, reference_q: np.ndarray) -> None:
         note = f", {1e3 * -shift:.4g} ms later" if abs(shift) > 1e-5 else ""
         refuse_data(
             motion.file,
-            f"its reference (q_ref) is the measured positions{note}: instruments from it hold the noise that they are "
-            "to avoid. Log what was commanded (UR: target_q, Franka: q_d), or give the folder of the designed motion "
-            "(--excitation)",
+            f"its reference (q_ref) is the measured positions{note}: instruments from it contain the noise that they "
+            "are to avoid. Log what was commanded (UR: target_q, Franka: q_d), or give the folder of the designed "
+            "motion (--excitation)",
         )
 
 
 def _noise_shares(motion: Motion, measured: np.ndarray, residual: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Return the noise power in `residual` over that in the `measured` positions (N, k), for `joints` with noise alone.
+    """Return the ratio of the noise powers in `residual` and in the `measured` positions, joint by joint.
 
-    Both are taken in the lowest octave below f_q in which the positions' spectrum is at its noise floor.
+    Both powers are taken in the lowest octave below the positions' cut-off in which the spectrum of the positions is at
+    its noise floor. Joints without such an octave are omitted.
+
+    Args:
+        motion: the recorded motion.
+        measured, residual: (N, k) measured positions, and their deviation from the reference.
+        joints: (k,) joints of the columns.
     """
     # slow to load
     from scipy.signal import welch

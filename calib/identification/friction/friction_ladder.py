@@ -1,16 +1,17 @@
-"""Forward selection of friction terms, step by step and joint by joint, by the errors on held-out time.
+"""Forward selection of friction terms ("ladder"), step by step and joint by joint, by the errors on held-out time.
 
     standard → + coupling → + the steps of `calib.dynamics.shapes.STEPS` in their order → + ripple
 
-Every step is tested in addition to the accepted ones: all joints get its terms, every time block is predicted by a fit
-to the other blocks, and the terms are kept at joints whose error on held-out time falls by `MIN_GAIN` and does not grow
-when one half of the time predicts the other (neighbouring blocks alone do not test extrapolation). Terms of a step have
-a ridge per joint, chosen by evidence, so that a rich step (ripple) may have more terms than the data identify.
+Every step is tested in addition to the accepted ones. All joints get the terms of the step, and every time block is
+predicted by a fit to the other blocks. The terms are kept at joints whose error on held-out time falls by `MIN_GAIN`
+and does not grow when one half of the time predicts the other (neighbouring blocks alone do not test extrapolation).
+Terms of a step have a ridge per joint, determined by the evidence, so that a step with many terms may have more terms
+than the data identify.
 
-A coupling is a gear whose motor turns with two joints; it is a candidate for pairs of joints where the other joint's
-motion explains most of the standard model's residual, and is distinguishable from the standard model. Cables are
-candidates where sensors behind the gears separate them from friction; if named, always. A term is judged by the rows
-that it acts on, each in units of its residuals' standard deviation.
+A coupling is a gear whose motor turns with two joints. It is a candidate for two neighbouring joints if it explains
+most of the standard model's residual at both, and if the motion distinguishes it from the standard model. Cable torques
+are candidates only if sensors behind the gears separate them from friction, or if the user requests them. A term is
+judged by the torque rows that it affects, each in units of its residuals' standard deviation.
 """
 
 from __future__ import annotations
@@ -88,9 +89,12 @@ class FrictionTrial:
 
 @dataclass(frozen=True, eq=False)
 class FrictionSelection:
-    """Result of forward selection: the selected terms, their ridge groups, and the tested steps.
+    """Result of the forward selection of friction terms.
 
     Attributes:
+        terms: the selected drive terms.
+        groups: ridge group of each term.
+        steps: the tested steps, in order.
         off: names of terms that the final fit's ridges set to zero; their rows of ``covariance.csv`` contain the
             smallest ridge, so that all other σ are those of a model without these terms.
     """
@@ -101,7 +105,11 @@ class FrictionSelection:
     off: tuple[str, ...] = ()
 
     def fitted(self, sigma: np.ndarray) -> FrictionSelection:
-        """Return the selection without the terms that the final fit switched off, from the σ (k,) of its terms."""
+        """Return the selection without the terms that the final fit switched off.
+
+        Args:
+            sigma: (k,) standard deviations of the selected terms' parameters in the final fit; zero if switched off.
+        """
         off = []
         joints = {}
         for term, term_sigma in zip(self.terms, sigma, strict=True):
@@ -121,7 +129,7 @@ class FrictionSelection:
 
     @property
     def chosen(self) -> str:
-        """Steps that are part of the model, as text: ``standard + load + stribeck``."""
+        """Text on the steps that are part of the model: ``standard + load + stribeck``."""
         names = [step.model[2:] for step in self.steps if step.kept and step.model[0] == "+"]
         return " + ".join(["standard", *names])
 
@@ -133,14 +141,14 @@ class FrictionCandidates:
     Attributes:
         cases: training recordings.
         rows: rows of these recordings in the base columns and standard drive terms, with time blocks numbered.
-        loads: torques transmitted by the gears of each case (N, n), from a first fit.
+        loads: torques transmitted by the gears of each case (N, n), from a first fit; None if no term depends on them.
         decimator: filter of the rows.
-        std, inflation: (rows,) standard deviation and variance inflation of the first fit's residuals.
-        v0: (n,) smoothing of the Coulomb sign.
-        linear: (n,) which joints are prismatic.
-        apart: rows with a different unit, excluded from totals.
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation of the first fit's residuals.
+        v0: (n,) smoothing of the Coulomb sign [rad/s or m/s].
+        linear: (n,) whether each joint is prismatic.
+        apart: indices of rows with a different unit, excluded from totals.
         prior: prior of the base parameters; None without one.
-        torque_rows: kind of torques in the rows, motor torques included.
+        torque_rows: kind of torques in the rows.
         coupled: pairs of joints, from 0, whose coupling is already in the model.
     """
 
@@ -168,10 +176,14 @@ def select_friction(
     """Return the friction terms that reduce the error on held-out time, or all terms of a named step.
 
     Args:
-        candidates: the rows, and the data that terms depend on.
-        friction: ``auto``; ``standard`` (or ``ripple``, found later by `calib.identification.friction.ripple`): none;
-            a step's name: that step at all joints, nothing else.
-        progress: called with a short text at each step; None: not called.
+        candidates: rows, and the data on which terms depend.
+        friction: ``auto`` for the selection; ``standard`` or ``ripple`` for no terms
+            (`calib.identification.friction.ripple` identifies ripple later); the name of a step for the terms of this
+            step at all joints.
+        progress: function that is called with a short text at each step; None: not called.
+
+    Raises:
+        UsageError: for an unknown name.
     """
     say = progress or (lambda message: None)
     one_of(friction, NAMES, "friction", UsageError)
@@ -199,7 +211,7 @@ def select_friction(
             accepted, accepted_error, at = bench.test(selected, columns, error)
             note = ""
             if not columns:
-                note = "no joint shows a need for such terms in its residual: none tried"
+                note = "the residual of no joint shows a need for such terms: none tried"
             elif not at:
                 note = "no improvement on held-out time: not used"
             if accepted:
@@ -225,7 +237,7 @@ class _Bench:
     """Test of friction terms by cross-validation; the columns of all candidate terms follow the base columns.
 
     Attributes:
-        candidates: the rows, and the data that terms depend on.
+        candidates: rows, and the data on which terms depend.
         validation: cross-validation of the base columns and all terms.
         terms: all candidate terms.
         forced: whether terms are kept without a test.
@@ -237,12 +249,17 @@ class _Bench:
     forced: bool
 
     def term(self, column: int) -> DriveTerm:
-        """Return the term of a column."""
+        """Return the drive term of a column."""
         first = self.validation.data.parameters - len(self.terms)
         return self.terms[column - first]
 
     def errors(self, columns: Sequence[int], folds: int | None = None) -> np.ndarray:
-        """Return the squared errors (blocks, rows) of a model with the base columns and these columns."""
+        """Return the squared errors (blocks, rows) of the model with the base columns and these further columns.
+
+        Args:
+            columns: indices of further columns, counted from the first base column.
+            folds: number of folds of the cross-validation; None: each time block is one.
+        """
         return self.validation.errors(self._with_base(columns), folds)
 
     def _with_base(self, columns: Sequence[int]) -> np.ndarray:
@@ -252,7 +269,7 @@ class _Bench:
     def test(
         self, selected: list[int], columns: list[int], error: np.ndarray
     ) -> tuple[list[int], np.ndarray, tuple[int, ...]]:
-        """Return the columns that pass the test, the errors of the model with them, and their joints.
+        """Return the columns that pass the test, the squared errors of the model with these columns, and their joints.
 
         Args:
             selected: columns of the model so far.
@@ -298,7 +315,12 @@ class _Bench:
         return accepted, self.errors([*selected, *accepted]), _flat(at)
 
     def _rows(self, joints: tuple[int, ...], side: str) -> list[int]:
-        """Return the torque rows that terms of these joints act on."""
+        """Return the indices of the torque rows that terms of these joints affect, on one side of the gears.
+
+        Args:
+            joints: joints, from 0.
+            side: ``link`` or ``motor``.
+        """
         torque_rows = self.candidates.torque_rows
         rows: list[int] = []
         for joint in joints:
@@ -306,7 +328,12 @@ class _Bench:
         return rows
 
     def _whitened(self, squares: np.ndarray, rows: list[int]) -> np.ndarray:
-        """Return the squared errors (k,) summed over some rows, each in units of its residuals' variance."""
+        """Return the squared errors (k,) of the given rows, each divided by its residual variance, summed.
+
+        Args:
+            squares: (k, all rows) squared errors.
+            rows: indices of the rows.
+        """
         relative = squares[:, rows] / self.validation.std[rows] ** 2
         return np.sum(relative, axis=1)
 
@@ -319,7 +346,16 @@ class _Bench:
         note: str = "",
         terms: tuple[str, ...] = (),
     ) -> FrictionTrial:
-        """Return the result of a step from its columns, its squared errors, and the joints at which it is kept."""
+        """Return the record of a tested step.
+
+        Args:
+            name: name of the step.
+            columns: columns of the model besides the base columns.
+            error: (blocks, rows) squared errors on held-out time.
+            at: joints, from 0, at which the step is kept.
+            note: remark on the step.
+            terms: names of the terms that are kept.
+        """
         blocks = self.validation.blocks
         rows = self.validation.rows
         target_squares = (self.validation.data.factors[:, :, -1] ** 2).sum(axis=1)
@@ -339,22 +375,30 @@ class _Bench:
 
 
 def _joints(term: DriveTerm) -> tuple[int, ...]:
-    """Return the joints whose torques a term acts on."""
+    """Return the joints whose torques a term affects."""
     return tuple(sorted({row for row, _ in term.acts}))
 
 
 def _flat(joint_sets: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-    """Return all joints of some sets."""
+    """Return the sorted union of sets of joints."""
     return tuple(sorted({joint for joint_set in joint_sets for joint in joint_set}))
 
 
 def _carries(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the rms error of cross-validation with two halves grew by at most the share `MIN_GAIN`."""
+    """Return whether the rms error of cross-validation with two halves grew by a share of at most `MIN_GAIN`.
+
+    Args:
+        before, after: squared errors per time block without and with the tested terms.
+    """
     return bool(after.sum() <= (1.0 + MIN_GAIN) ** 2 * before.sum())
 
 
 def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the geometric mean of a joint's squared errors in held-out ranges (k,) did not increase."""
+    """Return whether the squared errors in held-out ranges of motion (k,) did not increase, in geometric mean.
+
+    Args:
+        before, after: (k,) squared errors in each range without and with the tested terms.
+    """
     positive = (before > 0.0) & (after > 0.0)
     if not positive.any():
         return True
@@ -362,7 +406,11 @@ def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _pays(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the squared errors per time block decreased by enough in total, and on enough blocks."""
+    """Return whether the squared errors fell by a share of `MIN_GAIN` (rms), and in a share `MIN_BLOCKS_WON` of blocks.
+
+    Args:
+        before, after: squared errors per time block without and with the tested terms.
+    """
     positive = before > 0.0
     if not positive.any():
         return False
@@ -372,7 +420,12 @@ def _pays(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _terms(candidates: FrictionCandidates, names: Sequence[str]) -> dict[str, list[DriveTerm]]:
-    """Return the candidate terms of steps for all joints."""
+    """Return the candidate terms of each named step, for all joints.
+
+    Args:
+        candidates: rows, and the data on which terms depend.
+        names: names of the steps.
+    """
     terms: dict[str, list[DriveTerm]] = {name: [] for name in names}
     if "coupling" in terms:
         terms["coupling"] = _couplings(candidates)
@@ -395,9 +448,13 @@ def _terms(candidates: FrictionCandidates, names: Sequence[str]) -> dict[str, li
 
 
 def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
-    """Return the coupling terms of neighbouring joints that explain residual torques of the standard model.
+    """Return coupling terms of neighbouring joints that explain residual torques of the standard model.
 
-    A joint is in one coupling at most, and its motor turns with the sum or the difference, whichever explains more.
+    A joint is in one coupling at most. Its motor turns with the sum or the difference of the joints, whichever explains
+    more.
+
+    Args:
+        candidates: rows, and the data on which terms depend.
     """
     n = candidates.n
     if not candidates.torque_rows.motors_alone:
@@ -445,7 +502,14 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
 
 
 def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Return about `COUPLING_ROWS` weighted rows (M, n, b) and (M, n), their weights, and q, v, a (n, M)."""
+    """Return about `COUPLING_ROWS` weighted samples of the recordings.
+
+    Args:
+        candidates: rows, and the data on which terms depend.
+
+    Returns:
+        regressor (M, n, b), torques (M, n), weights (M, n), and the list of q, v, a (n, M).
+    """
     matrices = []
     targets = []
     weights = []
@@ -470,7 +534,13 @@ def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, np
 def _cross_validation(
     candidates: FrictionCandidates, offered: dict[str, list[DriveTerm]], all_terms: list[DriveTerm]
 ) -> tuple[CrossValidation, dict[str, list[int]]]:
-    """Return the cross-validation of base and all candidate columns, and the column indices of each step."""
+    """Return the cross-validation of base and all candidate columns, and the column indices of each step.
+
+    Args:
+        candidates: rows, and the data on which terms depend.
+        offered: candidate terms of each step.
+        all_terms: all candidate terms, in the order of the steps.
+    """
     decimator, torque_rows = candidates.decimator, candidates.torque_rows
     rows = []
     for part, case, load in zip(candidates.rows, candidates.cases, candidates.loads):

@@ -1,4 +1,4 @@
-"""Passivity of friction: every joint's friction dissipates energy, or the model is physically inconsistent."""
+"""Passivity of friction: a model is physically inconsistent if the friction of a joint does not dissipate energy."""
 
 from collections.abc import Sequence
 
@@ -18,9 +18,13 @@ SPEEDS_PER_DIRECTION = 8
 
 
 def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
-    """Return the energy dissipated by each joint's friction, ∫ v_j τ_friction,j dt, as a share of ∫ |v_j τ_j| dt, (n,).
+    """Return the share (n,) of each joint's energy that friction dissipates, ∫ v_j τ_friction,j dt / ∫ |v_j τ_j| dt.
 
-    Joints at rest have zero; noise does not count as motion.
+    The share is zero for joints at rest; noise does not count as motion.
+
+    Args:
+        dynamics: model with its parameter values.
+        cases: recordings.
     """
     model = dynamics.model
     n = model.n
@@ -46,11 +50,11 @@ def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
 
 
 def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarray:
-    """Return the rows A (c, p) of A x >= 0: friction of the p columns dissipates and motor inertia is positive.
+    """Return the rows A (c, p) of constraints A x >= 0 by which friction dissipates and motor inertia is positive.
 
-    Friction dissipates both without load and at unlimited load. Beyond the recorded speeds friction is linear
-    (`calib.dynamics.shapes`) except for Stribeck's peak, which decays: ten times the fastest speed represents all
-    higher ones.
+    Friction must dissipate both without load and at unlimited load. Beyond the recorded speeds friction is linear
+    (`calib.dynamics.shapes`), except for Stribeck's peak, which decays; so ten times the fastest speed represents all
+    higher speeds.
 
     Args:
         terms: (p,) drive term of each column; None for parameters of bodies.
@@ -86,15 +90,24 @@ def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarra
 
 
 def driving(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
-    """Return the mask (n,) of joints whose identified friction adds energy."""
+    """Return the mask (n,) of joints whose identified friction adds energy instead of dissipating it.
+
+    Args:
+        dynamics: model with its parameter values.
+        cases: recordings, along which the energy is computed.
+    """
     return np.asarray(_dissipated(dynamics, cases) < MIN_ENERGY_SHARE)
 
 
 def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
-    """Return the joints, from 0, whose friction adds energy: their torques are reversed, or belong to another joint.
+    """Return the joints, from 0, whose friction adds energy: their torques are reversed or exchanged between joints.
+
+    Args:
+        dynamics: model with its parameter values.
+        cases: recordings, along which the energy is computed.
 
     Raises:
-        MeasurementError: where the friction of most of the moving joints adds energy.
+        MeasurementError: if the friction of most of the moving joints adds energy.
     """
     share = _dissipated(dynamics, cases)
     joints = np.flatnonzero(share < MIN_ENERGY_SHARE)

@@ -1,24 +1,25 @@
-"""Gear ripple: torque periodic in a gear's position, identified from a model's residuals above the motion's band.
+"""Gear ripple: torque that is periodic in a gear's position, identified from residuals above the motion's bandwidth.
 
     tau_j += Σ_i Σ_k Σ_m g_m(k v_i) (s_ikm sin k q_i + c_ikm cos k q_i),
 
-g_m hat functions of the ripple's frequency k v / 2π, one set per direction: the structure responds as an oscillator,
-with a gain and a phase that depend on this frequency (our choice). A joint's torque may contain ripple of other gears:
-on the Panda, gear 1 explains more of joint 3's ripple than gear 3 does. The ripple model decays to zero beyond the
-positions of the training data.
+where g_m are triangular functions of the ripple's frequency k v / 2π, one set per direction of motion: the structure
+responds as an oscillator, with a gain and a phase that depend on this frequency (our choice). A joint's torque may
+contain ripple of other gears: on the Panda, gear 1 explains more of joint 3's ripple than gear 3 does. The ripple model
+decays to zero beyond the positions of the training data.
 
-Orders come in families: a gear of N motor turns per turn shows at N, a harmonic drive (whose wave has two lobes) above
-all at 2 N against the flexspline and at 2 N + 2 against the output, and at twice those. A motion of three radians
-hardly distinguishes orders two apart, and single orders fitted at some positions do not extrapolate to others: on the
-Panda, with the same search, free orders explain less of held-out motion than the family does. So a gear's N is found
-first, in common for similar gears; free orders are tested where no family reduces the error. Whether a wave repeats
-follows from the coherence of the residual's phase between time blocks:
+Orders (waves per turn of the joint) occur in families. A gear of N motor turns per turn shows order N. A harmonic drive
+(whose wave has two lobes) mainly shows 2 N, against the flexspline, and 2 N + 2, against the output, and twice these
+orders. A motion of three radians hardly distinguishes orders that differ by two, and single orders fitted at some
+positions do not extrapolate to others: on the Panda, with the same search, free orders explain less of held-out motion
+than the family does. Therefore N of each gear is found first, with a common value for similar gears; free orders are
+tested only if no family reduces the error. Whether a wave repeats is measured by the coherence of the residual's phase
+between time blocks:
 
     S(k) = Σ_b (|Σ_c F_bc(k)|² - Σ_c |F_bc(k)|²) / N_b,    F_bc(k) = Σ residual · exp(-i k q)
 
-over speed bins b and time blocks c, for all whole orders at once by FFT over the position (our choice: neither noise
-nor a single short disturbance contributes). Held-out time blocks decide how strongly the columns are regularised
-towards zero, how finely frequency is resolved, and whether an order is kept.
+over speed bins b with N_b samples and time blocks c, for all integer orders at once by FFT over the position (our
+choice: neither noise nor a single short disturbance contributes). Held-out time blocks decide how strongly the columns
+are regularised towards zero, how finely frequency is resolved, and whether an order is kept.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -74,7 +75,12 @@ Wave = tuple[int, int]
 
 @dataclass(frozen=True)
 class GearWave:
-    """A wave of the ripple: number of the gear's joint (from 1), and order per turn of the gear."""
+    """A wave of the ripple.
+
+    Attributes:
+        gear: joint of the gear, from 1.
+        order_per_turn: waves per turn of the gear.
+    """
 
     gear: int
     order_per_turn: float
@@ -82,7 +88,14 @@ class GearWave:
 
 @dataclass(frozen=True)
 class RippleWaves:
-    """Ripple of a joint (from 1), and the share of high-frequency residual power that it explains on held-out time."""
+    """Record of the ripple in a joint's torque.
+
+    Attributes:
+        joint: joint, from 1.
+        waves: the waves.
+        explained_share_on_unseen_blocks: share of the high-frequency residual's power that they explain on held-out
+            time.
+    """
 
     joint: int
     waves: tuple[GearWave, ...]
@@ -91,13 +104,13 @@ class RippleWaves:
 
 @dataclass(frozen=True, eq=False)
 class Ripple:
-    """The ripple in one joint's torque.
+    """Ripple in one joint's torque.
 
     Attributes:
-        joint: index of the joint, from 0.
+        joint: joint, from 0.
         waves: for each wave, the joint whose gear causes it, and the order per turn.
         terms, values: (k,) drive terms and their parameters.
-        share: explained part of the fast residual's power on held-out blocks.
+        share: explained share of the high-frequency residual's power on held-out blocks.
     """
 
     joint: int
@@ -108,7 +121,7 @@ class Ripple:
 
     @property
     def found(self) -> RippleWaves:
-        """Record of the waves and of the share of the residual that they explain."""
+        """Record of the waves, with the share of the residual that they explain."""
         waves = tuple(GearWave(gear + 1, order) for gear, order in self.waves)
         joint = self.joint + 1
         return RippleWaves(joint, waves, self.share)
@@ -116,7 +129,13 @@ class Ripple:
 
 @dataclass(frozen=True, eq=False)
 class GearTravel:
-    """Gear positions in the recordings: q, v (N, n), the time block of each sample (N,), and the joints that move."""
+    """Motion of the gears in the recordings.
+
+    Attributes:
+        q, v: (N, n) positions [rad or m] and velocities [per s].
+        block: (N,) time block of each sample.
+        moving: joints, from 0, that move enough.
+    """
 
     q: np.ndarray
     v: np.ndarray
@@ -125,10 +144,11 @@ class GearTravel:
 
 
 def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Ripple]:
-    """Return the ripples in all joints' torques.
+    """Return the ripple in the torques of all joints that have any.
 
     Args:
-        residuals: per case (N, n), unexplained torque at the full rate; its slow part is removed here.
+        cases: recordings.
+        residuals: for each case, the unexplained torque (N, n) at the full rate; its slow part is removed here.
     """
     step = max(1, sum(len(case.motion) for case in cases) // MAX_SAMPLES)
     case_blocks = []
@@ -164,10 +184,13 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
 
 
 def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
-    """Return joint → motor turns per gear turn for joints that move enough, from the most coherent orders.
+    """Return the motor turns per turn of each gear that moves enough, from the most coherent orders.
+
+    The result maps a joint, from 0, to the number of turns.
 
     Args:
-        residuals: (N, n) fast parts of the unexplained torques.
+        track: motion of the gears.
+        residuals: (N, n) high-frequency parts of the unexplained torques [N m or N].
     """
     scores: dict[int, np.ndarray] = {}
     total = np.zeros(len(TURNS))
@@ -193,13 +216,13 @@ def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
 
 
 def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int, int]) -> Ripple | None:
-    """Return the ripple in a joint's torque; None if held-out time blocks do not confirm it.
+    """Return the ripple in a joint's torque; None if held-out time blocks do not confirm any.
 
     Args:
-        joint: index of the joint, from 0.
-        track: positions of the gears.
-        residual: (N,) torque not explained, without its slow part, at the samples of `track`.
-        turns: result of `find_turns`.
+        joint: joint, from 0.
+        track: motion of the gears.
+        residual: (N,) unexplained torque [N m or N], without its slow part, at the samples of `track`.
+        turns: motor turns per turn of each gear, from `find_turns`.
     """
     if not residual.any():
         return None
@@ -243,7 +266,14 @@ def _family(turns: int) -> tuple[tuple[int, ...], ...]:
 def _terms(
     joint: int, waves: Sequence[Wave], nodes: Sequence[float], track: GearTravel | None
 ) -> tuple[DriveTerm, ...]:
-    """Return the drive terms of a joint's ripple, wave by wave; without `track`, the terms apply at all positions."""
+    """Return the drive terms of a joint's ripple, wave by wave.
+
+    Args:
+        joint: joint whose torque contains the ripple, from 0.
+        waves: pairs of a gear's joint and order per turn.
+        nodes: frequencies of the gain's nodes [Hz].
+        track: motion of the gears, beyond which the terms decay; None: the terms apply at all positions.
+    """
     edges = (0.0, *nodes, np.inf)
     terms = []
     for gear, order in waves:
@@ -266,9 +296,9 @@ def _terms(
 
 
 class _WaveCrossValidation:
-    """A joint's residual and its candidate columns, to test the share that they explain on held-out blocks.
+    """Cross-validation of waves: the share of a joint's residual that they explain on held-out blocks.
 
-    Columns of a wave are computed once.
+    The columns of each wave are computed once and stored.
     """
 
     def __init__(self, track: GearTravel, residual: np.ndarray) -> None:
@@ -278,14 +308,24 @@ class _WaveCrossValidation:
         self._columns: dict[tuple[Wave, tuple[float, ...]], np.ndarray] = {}
 
     def columns(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> np.ndarray:
-        """Return the regressor columns (N, k) of the waves, in the order of `_terms`."""
+        """Return the regressor columns (N, k) of the waves, in the order of `_terms`.
+
+        Args:
+            waves: pairs of a gear's joint and order per turn.
+            nodes: frequencies of the gain's nodes [Hz].
+        """
         for wave in waves:
             if (wave, nodes) not in self._columns:
                 self._columns[wave, nodes] = _columns(self._track, wave, nodes)
         return np.hstack([self._columns[wave, nodes] for wave in waves])
 
     def explained_share(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> tuple[float, float]:
-        """Return the explained share of the power on held-out blocks, and the best ridge."""
+        """Return the explained share of the residual's power on held-out blocks, and the best ridge of `RIDGES`.
+
+        Args:
+            waves: pairs of a gear's joint and order per turn.
+            nodes: frequencies of the gain's nodes [Hz].
+        """
         matrix = self.columns(waves, nodes)
         residual = self.residual
         squares = np.array([matrix[block].T @ matrix[block] for block in self._blocks])
@@ -308,7 +348,13 @@ class _WaveCrossValidation:
         return float(share[best]), RIDGES[best]
 
     def fit(self, waves: Sequence[Wave], nodes: tuple[float, ...], ridge: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the residual after fitting the waves (N,), and their parameters (k,)."""
+        """Return the residual after fitting the waves (N,), and their parameters (k,).
+
+        Args:
+            waves: pairs of a gear's joint and order per turn.
+            nodes: frequencies of the gain's nodes [Hz].
+            ridge: weight of the parameters' squares, in units of the mean information of a column.
+        """
         matrix = self.columns(waves, nodes)
         square = matrix.T @ matrix
         unit = float(np.trace(square)) / len(square)
@@ -319,7 +365,13 @@ class _WaveCrossValidation:
 
 
 def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarray:
-    """Return the regressor columns (N, k) of a wave along a track, in the order of `_terms`."""
+    """Return the regressor columns (N, k) of a wave along a motion of the gears, in the order of `_terms`.
+
+    Args:
+        track: motion of the gears.
+        wave: pair of the gear's joint and order per turn.
+        nodes: frequencies of the gain's nodes [Hz].
+    """
     gear = wave[0]
     q = track.q[:, gear]
     v = track.v[:, gear]
@@ -329,7 +381,15 @@ def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarra
 
 
 def coherence(track: GearTravel, gear: int, residual: np.ndarray) -> np.ndarray:
-    """Return the coherence S(k) of a gear's integer orders k = 0, 1, ..., (cells / 2 + 1,); see the module."""
+    """Return the coherence S(k) of integer orders k = 0, 1, … of a gear, (cells / 2 + 1,).
+
+    The module's docstring defines S(k).
+
+    Args:
+        track: motion of the gears.
+        gear: joint of the gear, from 0.
+        residual: (N,) high-frequency part of an unexplained torque.
+    """
     q = track.q[:, gear]
     v = track.v[:, gear]
     speed = np.abs(v)
@@ -353,7 +413,11 @@ def coherence(track: GearTravel, gear: int, residual: np.ndarray) -> np.ndarray:
 
 
 def _lobes(power: np.ndarray) -> np.ndarray:
-    """Return the sum of the coherence S at N, 2 N and 2 N + 2, for every N of `TURNS`."""
+    """Return, for every N of `TURNS`, the sum of the coherence S(k) over the orders N, 2 N and 2 N + 2.
+
+    Args:
+        power: coherence S(k) of the orders k = 0, 1, …, from `coherence`.
+    """
     turns = np.array(TURNS)
     positive = np.maximum(power, 0.0)
     return positive[turns] + positive[2 * turns] + positive[2 * turns + 2]
@@ -367,11 +431,13 @@ def _climb(
 ) -> tuple[tuple[Wave, ...], float, float]:
     """Return the waves of a forward selection by held-out blocks, their explained share, and the ridge.
 
+    Without a significant wave the result is an empty tuple and a share of 0.
+
     Args:
         validation: cross-validation of the joint's residual.
         candidates: function of the remaining residual (N,) that returns sets of waves.
-        min_gain: explained share of the residual's power that each set adds, at least.
-        max_sets: number of sets, at most.
+        min_gain: smallest share of the residual's power that each further set must explain.
+        max_sets: largest number of sets.
     """
     selection: tuple[Wave, ...] = ()
     selection_share, ridge = 0.0, RIDGES[-1]
@@ -397,7 +463,13 @@ def _climb(
 
 
 def _free(track: GearTravel, joint: int, residual: np.ndarray) -> list[tuple[Wave, ...]]:
-    """Return the most coherent order of the joint's gear, and the most coherent pair of orders with difference two."""
+    """Return two sets of waves of the joint's gear: the most coherent order, and the most coherent pair k, k + 2.
+
+    Args:
+        track: motion of the gears.
+        joint: joint, from 0.
+        residual: (N,) high-frequency part of its unexplained torque.
+    """
     power = coherence(track, joint, residual)
     order = MIN_ORDER + int(np.argmax(power[MIN_ORDER : MAX_ORDER + 1]))
     pairs = power[MIN_ORDER : MAX_ORDER - 1] + power[MIN_ORDER + 2 : MAX_ORDER + 1]
@@ -406,7 +478,12 @@ def _free(track: GearTravel, joint: int, residual: np.ndarray) -> list[tuple[Wav
 
 
 def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
-    """Return the high-pass part of a residual (N,), above twice the bandwidth of the motion, by segments."""
+    """Return the high-pass part of a residual (N,), above twice the bandwidth of the motion, segment by segment.
+
+    Args:
+        case: the recording.
+        residual: (N,) unexplained torque of one joint.
+    """
     motion = case.motion
     cutoff = min(2.0 * motion.cutoffs.dynamics, 0.4 * motion.rate)
     slow = []
@@ -416,7 +493,7 @@ def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
 
 
 def _blocks(cases: Sequence[Case]) -> list[np.ndarray]:
-    """Return the block number of each sample: contiguous, about `TIME_BLOCKS`; -1 at the start of a recording."""
+    """Return the time block of each sample of each case, about `TIME_BLOCKS` in all; -1 at the start of a recording."""
     total = sum(len(case.motion) for case in cases)
     min_count = 1 if len(cases) > 1 else 2
     numbers = []

@@ -1,11 +1,11 @@
 """Base parameters of physically consistent bodies, i.e. of standard parameters with pseudo-inertias P_i >= 0.
 
-    { β : β = T χ,  P_i(χ) ⪰ 0,  drives' terms >= 0 }       unidentified parts of χ are free
+    { β : β = T χ,  P_i(χ) ⪰ 0,  drive terms >= 0 }       unidentified parts of χ are free
 
-(Sousa & Cortesão 2014, with the pseudo-inertia of Wensing, Kim & Slotine 2018). Where the unconstrained optimum is
-outside this convex cone, the optimum on the cone is found by a semidefinite program (Clarabel), and the cone is
-replaced by its tangent plane at the optimum, νᵀ β >= νᵀ β*. This gives the same optimum with one multiplier, and a
-covariance that treats the plane as an equality (our choice; the cone is curved).
+(Sousa & Cortesão 2014, with the pseudo-inertia of Wensing, Kim & Slotine 2018). If the unconstrained optimum is outside
+this convex cone, a semidefinite program (Clarabel) finds the optimum in the cone, and the cone is replaced by its
+tangent plane at this optimum β*, νᵀ β >= νᵀ β*. This gives the same optimum with one multiplier, and a covariance that
+treats the plane as an equality (our choice; the cone is curved).
 """
 
 from collections.abc import Sequence
@@ -41,12 +41,12 @@ class Touching:
 
 @dataclass(frozen=True, eq=False)
 class BodyCone(Frozen):
-    """Convex cone of all base parameters that belong to physically consistent bodies and drives.
+    """Convex cone of the base parameters of all physically consistent bodies and drives.
 
     Attributes:
-        transform: T (b, P) of the standard parameters, ten by body, then the drives' terms.
+        transform: T (b, P), from the standard parameters (ten per body, then the drive terms) to base parameters.
         labels: names of the bodies.
-        positive: (P - 10 B,) which drive terms must not be negative.
+        positive: (P - 10 B,) whether each drive term must not be negative.
     """
 
     transform: np.ndarray
@@ -61,14 +61,18 @@ class BodyCone(Frozen):
         upper: np.ndarray,
         sets: Sequence[ConvexSet] = (),
     ) -> Touching:
-        """Return tangent planes at argmin ½ ‖R β - z‖² on the cone, lower <= A β <= upper, β in convex sets.
+        """Return tangent planes at argmin ½ ‖R β - z‖² under lower <= A β <= upper, the cone and convex sets.
+
+        β (p,) are the parameters of the columns, base parameters first.
 
         Args:
-            factor: (p + 1, p + 1) triangle [R z; 0 ρ]; base columns first.
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem in β; base columns first.
+            matrix: A (c, p).
+            lower, upper: (c,) bounds, -inf and inf allowed.
             sets: convex sets of β.
 
         Raises:
-            NotConverged: where no bodies satisfy the bounds and sets.
+            NotConverged: if no bodies satisfy the bounds and sets.
         """
         p = len(factor) - 1
         count = len(self.labels)
@@ -134,7 +138,12 @@ class BodyCone(Frozen):
 
 
 def cone_of(model: RegressorModel, base: Base) -> BodyCone:
-    """Return the cone of consistent base parameters of a model."""
+    """Return the cone of physically consistent base parameters of a model.
+
+    Args:
+        model: model of standard parameters.
+        base: its base parameters.
+    """
     labels = tuple(name.removeprefix("XX") for name in model.names[: model.inertial : 10])
     positive = [column.nonnegative for column in model.columns]
     return BodyCone(np.asarray(base.transform), labels, np.array(positive, dtype=bool))

@@ -1,13 +1,13 @@
 """Least squares under bounds, equalities and positive definite matrices, from an R factor of [W y].
 
-min ½ ‖R b - z‖² under A b >= e, E b = d and M_k(b) = Σ_j A_kj b_j ⪰ λ I. With R from `triangles.combine` it is
-constrained least squares, with `instruments.projected` the inner problem of PC-IDIM-IV (Janot's slides on the TX40,
-where the sign of the multipliers' term must be read as minus). Clarabel finds which constraints bind (Goulart & Chen
-2024); on them the optimum is that of Gouriéroux & Monfort, to the last bit. Matrices come in only where the optimum
-without them leaves one indefinite.
+min ½ ‖R b - z‖² under A b >= e, E b = d and M_k(b) = Σ_j A_kj b_j ⪰ λ I. With R from `triangles.combine` this is
+constrained least squares; with `instrumental_variables.projected` it is the inner problem of PC-IDIM-IV (Janot's slides
+on the TX40, where the sign of the multipliers' term must be read as minus). Clarabel finds which constraints bind
+(Goulart & Chen 2024); for these, the optimum is computed exactly by the formula of Gouriéroux & Monfort. Matrices are
+added only if the optimum without them violates one.
 
-Constraints add knowledge, not consistency: where they bind at wrong values the estimate is biased, and they do not cure
-the bias of least squares in a loop.
+Constraints add knowledge, not consistency: if they bind at wrong values, the estimate is biased, and they do not remove
+the bias of least squares in a closed loop.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ class Definite:
     Attributes:
         matrices: A (K, n, n, p), symmetric.
         least: lower bound of the eigenvalues, above zero.
-        likely: indices of matrices that were binding in a similar problem; the search starts with them.
+        likely: indices of matrices that were binding in a similar problem, with which the search starts; None: unknown.
     """
 
     matrices: np.ndarray
@@ -38,7 +38,7 @@ class Definite:
     likely: np.ndarray | None = None
 
     def least_eigenvalues(self, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the smallest eigenvalues minus `least` (K,), and their derivatives (K, p) with respect to b (p,)."""
+        """Return the smallest eigenvalue of each matrix minus `least` (K,), and the derivatives (K, p) by b (p,)."""
         size, n, _, p = self.matrices.shape
         flat = self.matrices.reshape(size, n * n, p)
         combined = flat @ b
@@ -48,16 +48,25 @@ class Definite:
         return values[:, 0] - self.least, np.asarray(products[:, 0])
 
     def satisfied(self, sizes: np.ndarray) -> bool:
-        """Return whether the smallest eigenvalues minus `least` (K,) satisfy the constraint."""
+        """Return whether the smallest eigenvalues, given minus `least` as `sizes` (K,), satisfy the constraint.
+
+        Args:
+            sizes: smallest eigenvalue of each of the K matrices, minus `least`.
+        """
         # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
         max_violation = 1e-3
         return bool((sizes >= -max_violation * self.least).all())
 
 
 def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[int, ...]:
-    """Return the indices of rows lower <= A b <= upper that contradict each other; empty if all can be satisfied.
+    """Return the indices of rows of lower <= A b <= upper that contradict each other; empty if all can be satisfied.
 
-    A linear program over the excess of each row; the rows are those with a multiplier, Farkas' certificate.
+    A linear program minimises the sum of violations. Rows with a non-zero multiplier contradict each other (Farkas'
+    certificate).
+
+    Args:
+        matrix: A (c, p).
+        lower, upper: (c,) bounds, -inf and inf allowed.
     """
     from scipy.optimize import linprog
 
@@ -82,13 +91,14 @@ def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> t
 
 
 def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return the covariance of an estimate under A b = d, P C Pᵀ with P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A, Q = RᵀR.
+    """Return the covariance P C Pᵀ of an estimate under A b = d, from the covariance C of the unconstrained estimate.
 
-    C may be any covariance of the free estimate, also one for correlated residuals.
+    P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A with Q = RᵀR, R (p, p) the triangular factor of the observation matrix. C may also be a
+    covariance for correlated residuals.
 
     Args:
         covariance: C (p, p).
-        factor: (p + 1, p + 1) triangle [R z; 0 ρ] that the estimate minimises.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem.
         normals: A (k, p), of any rank.
     """
     if not len(normals):
@@ -106,7 +116,10 @@ def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) 
 
 
 def null_space(rows: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (p, p - rank) of the null space of rows; exact zeros for fixed parameters."""
+    """Return an orthonormal basis (p, p - rank) of the null space of `rows` (k, p).
+
+    Entries of parameters that the rows fix are exactly zero.
+    """
     size = np.linalg.norm(rows, axis=1)
     rows = rows[size > 0.0] / size[size > 0.0, None]
     _, values, right = np.linalg.svd(rows)
@@ -119,11 +132,12 @@ class Constrained:
     """Optimum under constraints, with multipliers and slack to check it.
 
     Attributes:
-        values: (p,) b.
-        multipliers: (c,) μ of the constraints, >= 0 but for equalities.
+        values: (p,) optimum b.
+        multipliers: (c,) Lagrange multipliers μ of the constraints; >= 0 except those of equalities.
         slack: (c,) distances to the bounds, and smallest eigenvalues minus their limit.
-        binding: (c,) bool, whether a constraint is active, which indicates a too tight constraint or a biased estimate.
-        normals: (c, p) slopes of the slack at the optimum; of a matrix that binds <A, Z> / trace Z, Z its multiplier.
+        binding: (c,) whether each constraint is binding, which indicates a too tight constraint or a biased estimate.
+        normals: (c, p) derivatives of the slack at the optimum; for a binding matrix <A, Z> / trace Z with its
+            multiplier Z.
         planes: for each convex set the normal (p,) of the plane that touches it; None where the set does not bind.
     """
 
@@ -143,23 +157,24 @@ def within(
     matrices: Definite | None = None,
     sets: Sequence[ConvexSet] = (),
 ) -> Constrained:
-    """Minimise ½ ‖R b - z‖² under lower <= A b <= upper, with equality if both are the same, and definite matrices.
+    """Return the optimum of min ½ ‖R b - z‖² under lower <= A b <= upper and definite matrices.
 
     And in convex sets, whose planes at the optimum are in `Constrained.planes`, not among the normals.
 
-    Infinite bounds are left out. Multipliers, slack, binding and normals come in the order of the finite lower bounds,
-    the finite upper ones, the matrices, the equalities, whose multipliers have either sign.
+    R (p, p) and z (p,) are the data's triangle, b (p,) the unknowns. Equal bounds are an equality; infinite bounds are
+    ignored. Multipliers, slack, binding and normals have the order: finite lower bounds, finite upper bounds, matrices,
+    equalities. Multipliers of equalities have either sign.
 
     Args:
-        factor: (p + 1, p + 1) triangle [R z; 0 ρ], R of full rank.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem in b, R of full rank.
         matrix: A (c, p); the identity for bounds on single parameters.
         lower, upper: (c,), -inf and inf allowed.
-        matrices: matrices that must be positive definite; None: none.
+        matrices: matrices that must be positive definite; None: no matrices.
         sets: convex sets of b.
 
     Raises:
         CalibError: for crossed bounds, and for equalities that contradict each other or fix all parameters.
-        NotConverged: where inequalities contradict each other, or no point makes the matrices definite.
+        NotConverged: if inequalities contradict each other, or no point makes the matrices definite.
     """
     p = len(factor) - 1
     shape = (None, p)
@@ -168,7 +183,7 @@ def within(
     upper = np.asarray(upper, dtype=float)
     has_length = lower.shape == (len(matrix),) == upper.shape
     sound = has_length and not np.isnan([lower, upper]).any()
-    require(sound, f"bounds: expected {len(matrix)} lower and upper ones, none of them NaN")
+    require(sound, f"bounds: expected {len(matrix)} lower and as many upper values, none of them NaN")
     if (lower > upper).any():
         worst = int(np.argmax(lower - upper))
         raise CalibError(f"bounds: lower {lower[worst]:g} is above upper {upper[worst]:g} in row {worst}")
@@ -191,9 +206,10 @@ def within(
 
 
 class _Planes:
-    """Problem with the linear constraints A b >= e and E b = d only, in scaled units.
+    """Least-squares problem under the linear constraints A b >= e and E b = d only, in scaled units.
 
-    Columns of R and rows of A and E of unit norm, ‖z‖ = 1: `upper`, `target`, `scaled` and `edges` in b / `unit`.
+    Columns of R and rows of A and E are scaled to unit norm, and ‖z‖ = 1. `upper`, `target`, `scaled` and `edges`
+    describe this problem for the unknowns b / `unit`.
     """
 
     def __init__(self, factor: np.ndarray, rows: np.ndarray, sides: np.ndarray, equal: np.ndarray, fixed: np.ndarray):
@@ -219,24 +235,27 @@ class _Planes:
         self._require_solvable()
 
     def _require_solvable(self, max_contradiction: float = 1e-8) -> None:
-        """Refuse equalities that contradict each other or fix all parameters.
+        """Raise an error for equalities that contradict each other or fix all parameters.
 
-        `max_contradiction`: of an equality, by which the best point may miss it.
+        `max_contradiction`: largest relative violation of an equality by the best point.
         """
         scaled = self.scaled[self.count :]
         edges = self.edges[self.count :]
         if not len(scaled):
             return
         acts = scaled.any(axis=1)
-        require(acts.all(), f"equality {int(np.argmin(acts)) + 1} has only zero coefficients")
+        require(acts.all(), f"equality {int(np.argmin(acts)) + 1} has only zero coefficients; remove it")
         origin, _, rank, _ = np.linalg.lstsq(scaled, edges, rcond=1e-10)
         largest = max(float(np.abs(origin).max()), 1e-300)
         away = np.abs(scaled @ origin - edges) / np.maximum(np.abs(edges), largest)
-        require(away.max() <= max_contradiction, "equalities contradict each other: no point satisfies all of them")
-        require(rank < len(self.free), f"equalities fix all {rank} parameters: nothing remains to be estimated")
+        require(
+            away.max() <= max_contradiction,
+            "equalities contradict each other: no point satisfies all of them; remove one",
+        )
+        require(rank < len(self.free), f"equalities fix all {rank} parameters, so that none is estimated; remove some")
 
     def optimum(self, active: np.ndarray) -> Constrained:
-        """Return the optimum under equalities and active inequalities (c,), the other inequalities ignored."""
+        """Return the optimum under all equalities and the inequalities marked in `active` (c,), taken as equalities."""
         equalities = np.ones(len(self.sides) - self.count, dtype=bool)
         binding = np.append(active, equalities)
         normals = self.normals[binding]
@@ -256,10 +275,10 @@ class _Planes:
         return _frozen(values, scaled_multipliers, slack, binding, self.normals)
 
     def bounded(self) -> Constrained:
-        """Return the optimum under the inequalities, exact on the binding ones.
+        """Return the optimum under the inequalities; the binding ones are satisfied exactly.
 
-        Where this is degenerate (a multiplier would change its sign, or another inequality be violated), the solver's
-        solution is returned as it is.
+        If that point is not optimal (a multiplier would change its sign, or another inequality be violated), the
+        solver's solution is returned.
         """
         c = self.count
         p = len(self.free)
@@ -275,10 +294,11 @@ class _Planes:
         return exact if good else solution
 
     def definite(self, matrices: Definite, sets: Sequence[ConvexSet] = ()) -> Constrained:
-        """Return the optimum under inequalities, matrices and convex sets by cone programs.
+        """Return the optimum under inequalities, definite matrices and convex sets, by cone programs.
 
-        Few of many matrices are binding: the most indefinite ones are added until all others are definite. Matrices
-        that are not binding are removed; since the misfit rises from set to set, no set recurs (our choice).
+        Few of many matrices are binding. The matrices with the smallest eigenvalues are added until all others are
+        definite, and matrices that are not binding are removed. Since the minimum grows with every change of the set,
+        no set occurs twice (our choice).
         """
         c = self.count
         rows = self.scaled
@@ -347,7 +367,14 @@ def _frozen(*parts: np.ndarray) -> Constrained:
 
 
 def _widened(solution: Constrained, position: int, normals: np.ndarray, slack: np.ndarray) -> Constrained:
-    """Return the optimum with further, inactive inequalities inserted at `position`."""
+    """Return the optimum with further inequalities, which are not binding, inserted at index `position`.
+
+    Args:
+        solution: the optimum without the further inequalities.
+        position: index of the first inserted inequality in the order of `within`.
+        normals: (k, p) their derivatives.
+        slack: (k,) their distances to the bounds.
+    """
     zero = np.zeros(len(slack))
     multipliers = np.insert(solution.multipliers, position, zero)
     all_slack = np.insert(solution.slack, position, slack)

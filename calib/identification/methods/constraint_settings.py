@@ -1,4 +1,4 @@
-"""Constraints on parameters: table [constraints] of the options file, and what a constrained estimate reports.
+"""Constraints on parameters: table [constraints] of the options file, and the report of a constrained estimate.
 
 The methods with constraints are in `calib.identification.methods.estimators` and `calib.identification.closed_loop`.
 """
@@ -23,7 +23,7 @@ POSTURES = 50
 
 
 def _in_order(value: object) -> object:
-    """Refuse a lower bound above the upper."""
+    """Raise a ValueError if the lower bound exceeds the upper one; return the value unchanged otherwise."""
     match value:
         case [int() | float() as low, int() | float() as high] if low > high:
             raise ValueError(f"the lower bound {low:g} is above the upper {high:g}")
@@ -138,7 +138,7 @@ class Binding:
 
     Attributes:
         name: name of the constraint.
-        multiplier: μ, slope of ½ ‖R β - z‖² against the bound; of either sign for an equality.
+        multiplier: μ, derivative of the minimum of ½ ‖R β - z‖² by the bound; of either sign for an equality.
         free: aᵀ β of the unconstrained estimate; NaN for M(q).
         sigma: standard deviation of `free`.
         bound: value of the binding bound.
@@ -160,10 +160,10 @@ class Held:
     Attributes:
         names: names of all constraints.
         binding: constraints that are binding.
-        tight: indices of the random postures in which M(q) is on its bound.
+        tight: indices of the random postures in which the constraint on the inertia matrix M(q) is binding.
         free: the unconstrained estimate.
-        normals: (k, p) slopes of the binding constraints.
-        findings: on binding constraints.
+        normals: (k, p) derivatives of the binding constraints.
+        findings: findings on binding constraints.
     """
 
     names: tuple[str, ...]
@@ -175,5 +175,5 @@ class Held:
 
     @property
     def postures(self) -> int:
-        """Number of postures in which M(q) is on its bound."""
+        """Number of random postures in which the constraint on the inertia matrix M(q) is binding."""
         return len(self.tight)

@@ -1,12 +1,12 @@
-"""Curved constraints h(β) >= 0: twice differentiable functions of parameters by name, stated by the user.
+"""Nonlinear ("curved") constraints h(β) >= 0: twice differentiable functions of named parameters, stated by the user.
 
     min ½ ‖R β - z‖²    under    h_i(β) >= 0    and all other constraints
 
-by sequential quadratic programs (Wilson 1963; with slack at a price, so that each has a solution: Fletcher 1985). Each
-takes h by its tangent planes at the last β, Jacobian A, and adds the positive part of -Σ μ_i ∇²h_i to RᵀR, as Janot's
-slides on the TX40 ask for (there AᵀA stands for it). At the optimum the planes replace h: they give the same optimum,
-with one multiplier each, and a covariance that treats the binding ones as equalities (our choice; h is curved). Where h
-is not concave the feasible set is not convex: the optimum is a local one.
+is solved by sequential quadratic programs (Wilson 1963; with penalised slack, so that each program has a solution:
+Fletcher 1985). Each program replaces h by its tangent planes at the last β (Jacobian A), and adds the positive part of
+-Σ μ_i ∇²h_i to RᵀR, as Janot's slides on the TX40 require (they use AᵀA instead). At the optimum the planes replace h:
+they give the same optimum, with one multiplier each, and a covariance that treats the binding planes as equalities (our
+choice; h is curved). If h is not concave, the feasible set is not convex, and the optimum is a local one.
 """
 
 import ast
@@ -43,8 +43,9 @@ class Curved:
         name: name of the constraint in messages.
         arguments: names of the parameters.
         rows: (k, p) matrix of u = rows β.
-        h, slope: function of u (k,), and its derivatives (k,).
-        stated: whether the slope is the user's: it is compared with differences of h wherever it is used.
+        h, slope: function of u (k,), and function that returns its derivatives (k,).
+        stated: whether the user stated the derivatives; they are then compared with differences of h whenever they are
+            used.
     """
 
     name: str
@@ -55,7 +56,7 @@ class Curved:
     stated: bool
 
     def value(self, b: np.ndarray) -> float:
-        """Return h at b (p,), or NaN where it has no value."""
+        """Return h at parameters b (p,); NaN if it is not defined there."""
         with np.errstate(all="ignore"):
             try:
                 return float(self.h(self.rows @ b))
@@ -63,10 +64,10 @@ class Curved:
                 return float("nan")
 
     def normal(self, b: np.ndarray) -> np.ndarray:
-        """Return ∂h/∂b (p,).
+        """Return ∂h/∂b (p,) at parameters b (p,).
 
         Raises:
-            UsageError: where h has no value, or the stated derivative is not that of h.
+            UsageError: if h is not defined there, or the stated derivative is wrong.
         """
         u = self.rows @ b
         try:
@@ -75,13 +76,15 @@ class Curved:
         except ArithmeticError:
             slope = np.full(len(u), np.nan)
         if not np.isfinite([self.value(b), *slope]).all():
-            self._refuse(f"no finite value or derivative at {self._at(u)}; state it so that it has one there")
+            self._refuse(
+                f"no finite value or derivative at {self._at(u)}; restate the constraint so that it has one there"
+            )
         if self.stated:
             self._compare(u, slope)
         return np.asarray(slope @ self.rows)
 
     def curvature(self, b: np.ndarray) -> np.ndarray:
-        """Return ∂²h/∂b² (p, p), by differences of the slope; zero where it has none."""
+        """Return ∂²h/∂b² (p, p) at parameters b (p,), by differences of the slope; zero where it is not defined."""
         u = self.rows @ b
         with np.errstate(all="ignore"):
             bend = _differences(self.slope, u)
@@ -112,13 +115,13 @@ class Curved:
 
 
 def _sizes(u: np.ndarray) -> np.ndarray:
-    """Return the size (k,) of each argument, of at least a thousandth of the largest."""
+    """Return the absolute value (k,) of each argument, but at least a thousandth of the largest one."""
     smallest = max(1e-3 * float(np.abs(u).max()), 1e-9)
     return np.maximum(np.abs(u), smallest)
 
 
 def _differences(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray) -> np.ndarray:
-    """Return central differences (m, k) of a function of u (k,)."""
+    """Return the Jacobian (m, k) of a function from u (k,) to m numbers at u, by central differences."""
     steps = np.diag(1e-5 * _sizes(u))
     slopes = []
     for step in steps:
@@ -131,10 +134,11 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
     """Return a constraint from its formula, or from a Python function and its derivatives.
 
     Args:
-        row: weights of parameters by name → row (p,) of the columns.
+        constraint: the stated constraint.
+        row: function of weights by parameter name that returns the row (p,) of this weighted sum.
 
     Raises:
-        UsageError: for a formula of anything but names, numbers, + - * / ** and a few functions.
+        UsageError: for a formula with anything but names, numbers, + - * / ** and a few functions.
     """
     h = constraint.h
     if callable(h):
@@ -144,7 +148,7 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
     name = constraint.name or (f"h({', '.join(names)}) >= 0" if callable(h) else h)
     location = f"[constraints] curved '{name}'"
     if callable(h) == (constraint.slope is None):
-        refuse_option(location, "'slope' states the derivatives of a function; a formula has its own")
+        refuse_option(location, "a function needs 'slope' (its derivatives), a formula has none: add or remove it")
     if callable(h) and constraint.slope is not None:
         function = _called(h, location, 1)
         count = len(names)
@@ -185,7 +189,15 @@ def _rows(names: Sequence[str], row: Callable[[Mapping[str, float]], np.ndarray]
 
 
 def _parsed(text: str, location: str) -> tuple[ast.expr, tuple[str, ...]]:
-    """Return the tree of h from a formula ``h``, ``left >= right`` or ``left <= right``, and its names."""
+    """Return the syntax tree of h and the names in it, from a formula ``h``, ``left >= right`` or ``left <= right``.
+
+    Args:
+        text: the formula.
+        location: name of the constraint, for messages.
+
+    Raises:
+        UsageError: for a text that is not such a formula.
+    """
     try:
         require(len(text) <= MAX_FORMULA, "too long", ValueError)
         tree = ast.parse(text.strip(), mode="eval").body
@@ -208,7 +220,7 @@ def _parsed(text: str, location: str) -> tuple[ast.expr, tuple[str, ...]]:
         allowed = f"parameters' names, numbers, + - * / **, {' '.join(_KNOWN)}, and one >= or <="
         refuse_option(location, f"expected {allowed}; found '{wrong}'")
     if not names:
-        refuse_option(location, "names no parameter")
+        refuse_option(location, "contains no parameter: state at least one")
     return tree, names
 
 
@@ -224,16 +236,22 @@ def tangents(
     start: np.ndarray,
     solve: Callable[[np.ndarray, np.ndarray, np.ndarray], Constrained],
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tangent planes normals (m, p), bounds (m,) of m curved constraints at the optimum under all.
+    """Return the tangent planes of m curved constraints at the optimum under all constraints.
 
     Args:
-        factor: (p + 1, p + 1) triangle [R z; 0 ρ].
+        curved: the m constraints.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem min ‖R β - z‖² in the parameters
+            β.
         start: (p,) β that satisfies the other constraints.
-        solve: the optimum of a triangle (p + m + 1)², under rows (2 m, p + m) b >= lower (2 m,) and the others.
+        solve: function that returns the optimum of a problem with p + m unknowns b, given its triangle (p + m + 1, p +
+            m + 1) and further inequalities rows (2 m, p + m) b >= lower (2 m,), under the other constraints.
+
+    Returns:
+        normals (m, p) and bounds (m,) of the planes.
 
     Raises:
-        UsageError: for a derivative that is not that of h.
-        NotConverged: where no estimate satisfies them.
+        UsageError: for a stated derivative that is wrong.
+        NotConverged: if no estimate satisfies all constraints.
     """
     p = len(start)
     m = len(curved)
@@ -280,11 +298,17 @@ def tangents(
         if not satisfied:
             price = min(10.0 * price, MAX_PRICE)
     heights_text = "; ".join(f"h of '{constraint.name}' = {constraint.value(b):.3g}" for constraint in curved)
-    raise NotConverged(f"the nearest found has {heights_text}", b)
+    raise NotConverged(f"the nearest estimate has {heights_text}", b)
 
 
 def _share(merit: Callable[[np.ndarray], float], b: np.ndarray, step: np.ndarray) -> float:
-    """Return the share of a step, halved until the merit does not rise."""
+    """Return the largest of 1, ½, ¼, … by which a step can be multiplied without an increase of the merit function.
+
+    Args:
+        merit: merit function of parameters (p,).
+        b: (p,) parameters before the step.
+        step: (p,) change of the parameters.
+    """
     share = 1.0
     merit_now = merit(b)
     max_halvings = 30
@@ -294,7 +318,18 @@ def _share(merit: Callable[[np.ndarray], float], b: np.ndarray, step: np.ndarray
 
 
 def _elastic(factor: np.ndarray, b: np.ndarray, bend: np.ndarray, unit: np.ndarray, price: np.ndarray) -> np.ndarray:
-    """Return the triangle of ½ ‖R x - z‖² + ½ (x - b)ᵀ K₊ (x - b) + Σ price t + ½ ‖length t‖², unknowns x and t."""
+    """Return the triangle of a quadratic program with unknowns x (p,) and slack t (m,).
+
+    It represents ½ ‖R x - z‖² + ½ (x - b)ᵀ K₊ (x - b) + Σ price t + ½ ‖length t‖², where K₊ is the positive part of
+    `bend` and length = ‖z‖.
+
+    Args:
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ].
+        b: (p,) point at which the constraints are linearised.
+        bend: (p, p) curvature of the constraints, whose positive part is K₊.
+        unit: (p,) units of the parameters, in which K₊ is computed.
+        price: (m,) weights of the slack.
+    """
     p = len(b)
     m = len(price)
     length = float(np.linalg.norm(factor[:-1, -1])) or 1.0

@@ -1,9 +1,8 @@
-"""Methods other than ordinary and weighted least squares: robust, total, and under constraints on parameters.
+"""Methods other than ordinary and weighted least squares: robust, total, and constrained least squares.
 
-Total least squares: noise in the columns of W as well as in y, some columns exact, each noise with its own size.
-
-Used where measured signals stand on both sides, as the motor currents in the identification of drive gains with a known
-payload (Gautier & Briot 2014): [V -W] [g; χ] = y, y the torque of the payload.
+Total least squares (TLS) assumes noise in the columns of W as well as in y. Some columns may be exact, and each noise
+has its own size. TLS is needed if measured signals are on both sides, as the motor currents in the identification of
+drive gains with a known payload (Gautier & Briot 2014): [V -W] [g; χ] = y, with y the torque of the payload.
 """
 
 from collections.abc import Callable
@@ -26,23 +25,24 @@ from calib.records import shaped
 def tls(
     data: Triangles, noise: np.ndarray, std: np.ndarray | None = None, inflation: np.ndarray | None = None
 ) -> LinearFit:
-    """Estimate x of (W - ΔW) x = y - Δy with the smallest Σ (ΔW_kc / noise_c)² + (Δy_k / noise_y)².
+    """Estimate x of (W - ΔW) x = y - Δy with the smallest Σ (ΔW_kc / noise_c)² + (Δy_k / noise_y)², by TLS.
 
-    With exact columns first, [W y] = Q [R11 R12; 0 R22]; the right singular vector of R22 / noise to the smallest
-    singular value gives the noisy components of [x; -1], back substitution the exact ones (Golub, Hoffman & Stewart
-    1987; Van Huffel & Vandewalle 1991, section 3.6). The noise level is σ² = s_min² / (r - p). Covariance (Fuller 1987,
-    theorem 2.3.2, normal noise): V = M⁻¹ σ_vv + r M⁻¹ (Σ_uu σ_vv - Σ_uv Σ_uvᵀ) M⁻¹ with M = WᵀW - r Σ_uu,
-    Σ_uv = -Σ_uu x and σ_vv = σ² (noise_y² + Σ noise_c² x_c²). With correlated rows, the share of V
-    that M's rows W_g bear is taken by what each of them is worth: V + σ_vv M⁻¹ (Σ_g (τ_g - 1) W_gᵀ W_g) M⁻¹.
+    With exact columns first, the QR of [W y] is Q [R11 R12; 0 R22]. The right singular vector of R22 / noise for the
+    smallest singular value gives the noisy components of [x; -1], and back substitution the exact ones (Golub, Hoffman
+    & Stewart 1987; Van Huffel & Vandewalle 1991, section 3.6). The noise level is σ² = s_min² / (r - p). The covariance
+    (Fuller 1987, theorem 2.3.2, normal noise) is V = M⁻¹ σ_vv + r M⁻¹ (Σ_uu σ_vv - Σ_uv Σ_uvᵀ) M⁻¹ with M = WᵀW - r
+    Σ_uu, Σ_uv = -Σ_uu x and σ_vv = σ² (noise_y² + Σ noise_c² x_c²). For correlated rows with variance inflations τ_g it
+    becomes V + σ_vv M⁻¹ (Σ_g (τ_g - 1) W_gᵀ W_g) M⁻¹.
 
     Args:
-        data: triangles of W and y.
+        data: R factors of W and y.
         noise: (p + 1,) standard deviation of the noise in each column and in y, in their units, up to one common
             factor; zero for exact ones.
-        std: (g,) factor by which the noise of each group of rows exceeds `noise`; None: one.
-        inflation: (g,) >= 1, τ, see `linear`; None: every row counts.
+        std: (g,) factor by which the noise of each group of rows exceeds `noise`; None: 1.
+        inflation: (g,) variance inflation τ_g >= 1, explained in the module `linear`; None: every row is independent.
 
     Raises:
+        CalibError: for negative noise, or no noise at all.
         Unidentifiable: if the noise, not the data, determines the solution.
     """
     p = data.parameters
@@ -54,14 +54,19 @@ def tls(
     factor = combine(data, std)
     direction, singular = _null_direction(factor, noise, count, data.names)
     if abs(direction[p]) <= 1e-10 * np.abs(direction).max():
-        raise Unidentifiable("no combination of the columns explains y: the columns depend on each other", data.names)
+        raise Unidentifiable(
+            "no combination of the columns explains y: the columns depend on each other; choose base columns",
+            data.names,
+        )
     values = -direction[:p] / direction[p]
     if count > p:
         variance = singular**2 / (count - p)
     else:
         variance = np.nan
     if not np.isfinite(variance):
-        raise Unidentifiable(f"{count} rows for {p} parameters: no residual is left to check them", data.names)
+        raise Unidentifiable(
+            f"{count} rows for {p} parameters: no residual is left to check them; record longer", data.names
+        )
     prior_rows = np.zeros((0, p))
     independent = count
     if inflation is not None:
@@ -85,8 +90,17 @@ def _null_direction(
 ) -> tuple[np.ndarray, float]:
     """Return v (p + 1,) that minimises ‖[W y] v‖ relative to the noise, and the smallest singular value.
 
-    Singular values of pure noise spread between 1 ± sqrt(columns / rows) (Marchenko & Pastur 1967): when the second
-    smallest is within that band of the smallest, the noise picks the solution.
+    Singular values of pure noise are spread between 1 ± sqrt(columns / rows) (Marchenko & Pastur 1967). If the second
+    smallest one is within this range of the smallest, the noise determines the solution.
+
+    Args:
+        factor: (p + 1, p + 1) R factor of [W y].
+        noise: (p + 1,) relative noise of the columns and of y; 0 for exact columns.
+        rows: number of rows.
+        names: names of the columns, for messages.
+
+    Raises:
+        Unidentifiable: if the noise determines the solution, or exact columns are dependent.
     """
     exact = np.flatnonzero(noise == 0.0)
     noisy = np.flatnonzero(noise > 0.0)
@@ -106,7 +120,10 @@ def _null_direction(
     direction[noisy] = vt[-1] / noise[noisy]
     if k:
         if np.abs(np.diag(upper)[:k]).min() <= 1e-12 * np.abs(upper).max():
-            raise Unidentifiable("the exact columns are dependent", [names[c] for c in exact if c < len(names)])
+            raise Unidentifiable(
+                "the columns without noise are linearly dependent; choose base columns",
+                [names[c] for c in exact if c < len(names)],
+            )
         coupled = upper[:k, k:] @ direction[noisy]
         direction[exact] = -scipy.linalg.solve_triangular(upper[:k, :k], coupled)
     return direction, float(values[-1])
@@ -121,7 +138,20 @@ def _covariance(
     names: tuple[str, ...],
     prior_rows: np.ndarray,
 ) -> np.ndarray:
-    """Return V (p, p) of `tls`, computed on columns of unit norm; `more` (k, p): rows √(τ - 1) W."""
+    """Return the covariance V (p, p) of `tls`, computed with columns of unit norm.
+
+    Args:
+        upper: (p, p) R factor of W.
+        noise: (p + 1,) relative noise of columns and y.
+        values: (p,) estimate.
+        variance: σ² of the noise level.
+        rows: number of rows.
+        names: names of the columns.
+        prior_rows: (k, p) rows √(τ - 1) W, which correct for correlated rows.
+
+    Raises:
+        Unidentifiable: if some columns contain only noise.
+    """
     norms = np.linalg.norm(upper, axis=0)
     scaled = upper / norms
     column_noise = variance * (noise[:-1] / norms) ** 2
@@ -145,16 +175,16 @@ COLUMN_NOISE = 0.01
 
 
 def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation: np.ndarray | None = None) -> LinearFit:
-    """Return the scaled TLS fit: noise of moving columns: `COLUMN_NOISE` times their rms; of y: its residuals.
+    """Return the TLS fit with noise of `COLUMN_NOISE` times the rms in each column, and of the residuals' size in y.
 
-    The common level is the smallest singular value's; the ratio of the noises, which no single recording identifies, is
-    our choice.
+    The smallest singular value gives the common level of the noise. The ratio of the noises, which no single recording
+    identifies, is our choice.
 
     Args:
-        pooled: triangles, one group per torque row.
-        std: (rows,) of the residuals.
-        exact: (p,) bool, columns without noise: ones (offsets) and signs.
-        inflation: (rows,) of the residuals; None: every row counts.
+        pooled: R factors, one group per torque row.
+        std: (rows,) standard deviations of the residuals [N m or N].
+        exact: (p,) mask of columns without noise: ones (offsets) and signs.
+        inflation: (rows,) variance inflation of the residuals; None: every row is independent.
     """
     p = pooled.parameters
     weighted = pooled.factors / std[:, None, None]
@@ -167,10 +197,10 @@ def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation:
 
 @dataclass(frozen=True)
 class _ConstrainedLeastSquares(Method):
-    """A method that solves the rows directly, under constraints: physically consistent least squares.
+    """Physically consistent least squares: a method that solves the rows directly, under constraints.
 
-    Weights are computed from the residuals of the free estimate; only IRLS uses the residuals of the constrained one,
-    on which its weights of samples depend.
+    Row weights are computed from the residuals of the unconstrained estimate. Only IRLS uses residuals of the
+    constrained estimate, on which its weights of samples depend.
 
     Attributes:
         free: the method without constraints.
@@ -180,7 +210,7 @@ class _ConstrainedLeastSquares(Method):
     free: LeastSquares
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate under the problem's constraints; its covariance treats active constraints as equalities.
+        """Return the estimate under the problem's constraints; its covariance treats binding ones as equalities.
 
         Raises:
             UsageError: for constraints that contradict each other.
@@ -206,14 +236,24 @@ class _ConstrainedLeastSquares(Method):
 def _reweighted(
     problem: IdentificationProblem, tau: np.ndarray, solve: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> SampleFit:
-    """Return the IRLS fit over whole samples, with the variance inflation of the most correlated row."""
+    """Return the IRLS fit of whole samples, with the largest variance inflation `tau` of any torque row.
+
+    Args:
+        problem: data and settings.
+        tau: (rows,) variance inflations.
+        solve: function of a triangle [R z; 0 ρ] that returns x (p,); None: least squares.
+    """
     inflation = float(np.max(tau))
     data = samples_of(problem)
     return irls(data, inflation=inflation, solve=solve)
 
 
 def samples_of(problem: IdentificationProblem) -> Samples:
-    """Return the rows of all recordings, grouped by sample."""
+    """Return the weighted rows of all recordings, grouped by sample.
+
+    Args:
+        problem: data and settings.
+    """
     rows = problem.rows
     weighted = [part.matrix * part.weight[:, :, None] for part in rows]
     matrix = np.concatenate(weighted)
@@ -244,7 +284,7 @@ TLS = LeastSquares(
 
 
 def _constrained(method: LeastSquares) -> _ConstrainedLeastSquares:
-    """Return a least-squares method with the constraints of ``[constraints]``."""
+    """Return the variant of a least-squares method with the constraints of ``[constraints]``."""
     description = method.name + CONSTRAINED
     return _ConstrainedLeastSquares(
         f"pc-{method.name}",

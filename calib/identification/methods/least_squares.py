@@ -32,7 +32,8 @@ class LeastSquares(Method):
     """A method that solves the rows directly.
 
     Attributes:
-        solve: function of the problem, standard deviations (rows,) and inflation (rows,) to the fit.
+        solve: function of the problem, standard deviations (rows,) and variance inflations (rows,) that returns the
+            fit.
         weighted: whether rows are weighted with their standard deviations.
     """
 
@@ -40,9 +41,9 @@ class LeastSquares(Method):
     weighted: bool = True
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the problem's columns, with a covariance for autocorrelated residuals.
+        """Return the estimate of the problem's columns, with a covariance that accounts for autocorrelated residuals.
 
-        A prior of base parameters and the ridges of richer friction take part where the method takes them.
+        If the method takes a prior, the prior of base parameters and the ridges of additional friction are used.
         """
         return attempted(self.name, problem, lambda: self._estimate(problem))
 
@@ -62,7 +63,7 @@ class LeastSquares(Method):
 
 
 def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Return the standard deviation and variance inflation (rows,) of a problem's residuals by WLS without a prior."""
+    """Return standard deviation and variance inflation (rows,) of a problem's residuals after WLS without prior."""
     pooled, noise = problem.pooled, problem.noise
     if noise is None:
         std = settled_std(pooled)
@@ -74,10 +75,16 @@ def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
 def _regularised(
     problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, inflation: np.ndarray, tempering: float = 1.0
 ) -> tuple[LinearFit, np.ndarray, np.ndarray]:
-    """Return the WLS fit with a prior of the base columns and with ridges of richer friction chosen by evidence.
+    """Return the WLS fit with a prior of the base parameters, and ridges of additional friction chosen by evidence.
 
-    Also returned: the covariance (p, p) of both, infinite without prior or ridge, and their whitened rows (k, p).
-    The prior counts `tempering` times.
+    Args:
+        problem: data and settings.
+        prior: prior of the base parameters; None: no prior.
+        std, inflation: (rows,) noise standard deviation [N m or N] and variance inflation of each torque row.
+        tempering: factor by which the prior's weight is increased.
+
+    Returns:
+        the fit; the covariance (p, p) of prior and ridges, infinite where there is neither; their whitened rows (k, p).
     """
     pooled, group = problem.pooled, problem.groups
     base_count = problem.base.b
@@ -102,11 +109,15 @@ def _regularised(
 
 
 def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the fit with a prior, the prior's rows (k, p), and its residuals' std and inflation (rows,).
+    """Return the fit with a prior, the prior's rows (k, p), and std and variance inflation of its residuals (rows,).
 
-    The prior counts `Prior.tempering` times more for the values than for their covariance; drives' inertia is
-    constrained to be positive and friction to be dissipative, which the covariance ignores. At joints whose data
-    contradict dissipative friction it is not constrained, so that the error in the data remains visible.
+    For the values, the prior has `Prior.tempering` times the weight that it has for their covariance. Motor inertia is
+    constrained to be positive and friction to be dissipative; the covariance ignores this. Friction is not constrained
+    at joints whose data contradict dissipative friction, so that the error in the data remains visible.
+
+    Args:
+        problem: data and settings.
+        prior: prior of the base parameters.
     """
     pooled = problem.pooled
     base_count = problem.base.b
@@ -130,7 +141,14 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
 
 
 def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, prior_rows: np.ndarray) -> np.ndarray:
-    """Return the estimate (p,) with dissipative friction, except at joints where the data contradict it."""
+    """Return the estimate (p,) with dissipative friction, except at joints where the data contradict it.
+
+    Args:
+        problem: data and settings.
+        free: (p,) unconstrained estimate.
+        std: (rows,) noise standard deviation of each torque row [N m or N], times the root of its variance inflation.
+        prior_rows: (k, p) whitened rows of prior and ridges.
+    """
     terms, pooled = problem.terms, problem.pooled
     speeds = [np.abs(case.motion.v).max(axis=0) for case in problem.cases]
     fastest = np.max(speeds, axis=0)
@@ -157,7 +175,12 @@ def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, 
 
 
 def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
-    """Return the mask (n,) of joints where friction of an unconstrained estimate adds energy."""
+    """Return the mask (n,) of joints at which the friction of an unconstrained estimate adds energy.
+
+    Args:
+        problem: data and settings.
+        values: (p,) unconstrained estimate.
+    """
     model, base = problem.model, problem.base
     if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
         return np.zeros(0, dtype=bool)

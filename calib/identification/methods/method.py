@@ -1,7 +1,7 @@
 """Interface of identification methods: from a problem to an estimate with its status.
 
-A failure is a status, not an exception: studies compare methods over conditions in which some of them fail. The error
-that says what to do about it is in the estimate, for whoever wants it raised (`MethodEstimate.fit`).
+A failure is a status, not an exception, since studies compare methods under conditions in which some of them fail. The
+estimate contains the error with its advice, and `MethodEstimate.fit` raises it.
 """
 
 import time
@@ -53,18 +53,20 @@ class IdentificationProblem:
 
     Attributes:
         model: model with standard friction.
-        base: base columns of the model.
+        base: base parameters of the model.
         cases: recordings with their motion at the full rate.
-        decimator: the parallel filter of all rows.
-        rows: observation matrix and torques of each case; p columns, base columns first, then richer friction.
+        decimator: filter and decimation of all rows.
+        rows: observation matrix and torques of each case; p columns, base columns first, then additional friction.
         terms: (p,) drive term of each column; None for parameters of bodies.
-        groups: (p,) ridge group of each column of richer friction; -1 for base columns.
-        noise: (rows,) standard deviation of the torques, up to a common factor; None: from their residuals.
+        groups: (p,) ridge group of each column of additional friction; -1 for base columns.
+        noise: (rows,) standard deviation of the torques' noise, up to a common factor; None: from the residuals.
         prior: prior of the base parameters; None without one.
         loop: the closed loop in which the recordings were made; None if not stated.
-        cad: standard parameters of the bodies from the robot's description, for a loop that feeds them forward.
+        cad: standard parameters of the bodies from the robot's description, for a loop that feeds them forward; None:
+            unknown.
         constraints: constraints of the options, for methods that support them; None: the defaults.
-        start: (p,) start values of methods that simulate; None: least squares, where that can be simulated.
+        start: (p,) start values of methods that simulate; None: least squares, if that robot can be simulated.
+        progress: called with a short text at each round of a method that simulates; None: not called.
     """
 
     model: RegressorModel
@@ -80,9 +82,15 @@ class IdentificationProblem:
     cad: np.ndarray | None = None
     constraints: ConstraintSettings | None = None
     start: np.ndarray | None = None
+    progress: Callable[[str], None] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", frozen(self.groups, int))
+
+    def say(self, text: str) -> None:
+        """Call `progress`, if there is one, with a short text."""
+        if self.progress is not None:
+            self.progress(text)
 
     @cached_property
     def pooled(self) -> Triangles:
@@ -93,7 +101,7 @@ class IdentificationProblem:
 
     @property
     def nonnegative(self) -> np.ndarray:
-        """Columns that must not be negative (p,) bool: inertia and friction of drives."""
+        """Mask (p,) of columns whose parameters must not be negative: inertia and friction of drives."""
         return np.array([term is not None and term.nonnegative for term in self.terms], dtype=bool)
 
     @property
@@ -110,18 +118,20 @@ class MethodEstimate:
     Attributes:
         method: name of the method.
         status: outcome of the estimation.
-        solution: values with covariance, and details of the fit; None unless found.
-        pooled: triangles of all rows, one group per row.
+        solution: values with covariance, and details of the fit; None after a failure.
+        pooled: R factors of all rows, one group per torque row.
         std: (rows,) standard deviation by which each row is weighted: that of its residuals, unless stated.
-        inflation: (rows,) variance inflation: number of rows that count as one, from the residuals' autocorrelation.
-        weighted: whether the rows were weighted with `std` (all but OLS).
-        beforehand: (k, p) rows L that a prior and ridges add to the whitened ones; None without these.
+        inflation: (rows,) variance inflation (number of rows that count as one), from the residuals' autocorrelation.
+        weighted: whether the rows were weighted with `std` (all methods but OLS).
+        beforehand: (k, p) whitened rows of the prior and ridges, which are added to those of the data; None without
+            these.
         iterations: number of iterations; 1 for a method that does not iterate.
         simulations: number of closed-loop simulations.
         seconds: computing time.
-        failure: reason for a missing solution, and advice.
-        held: the constraints and which of them bind, for a method with constraints.
-        alone: whether only values and covariance describe it, because least squares of `pooled` differs.
+        failure: reason for a missing solution, with advice; None without a failure.
+        held: the constraints and which of them bind; None for a method without constraints.
+        alone: whether least squares with `pooled` does not give this estimate, so that only values and covariance
+            describe it.
         instruments: for a method with instruments, by recording: the case whose motion W describes, its rows, and Z in
             the form of `ObservationRows.matrix`; () for other methods.
     """
@@ -149,10 +159,10 @@ class MethodEstimate:
 
     @property
     def fit(self) -> LinearFit:
-        """The solution.
+        """Values with covariance, and details of the fit.
 
         Raises:
-            Unidentifiable, NotConverged: where there is none.
+            Unidentifiable, NotConverged: after a failure.
         """
         if self.solution is None:
             raise self.failure or NotConverged(f"{self.method}: {self.status.value}")
@@ -163,12 +173,16 @@ class MethodEstimate:
         """Values with covariance.
 
         Raises:
-            Unidentifiable, NotConverged: where there are none.
+            Unidentifiable, NotConverged: after a failure.
         """
         return self.fit.estimate
 
     def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
-        """Return R factors on which least squares gives this estimate, with std and inflation (g,), for tests."""
+        """Return R factors whose least-squares solution is this estimate, for tests of nested models.
+
+        Returns:
+            R factors of g groups, standard deviations (g,), and variance inflations (g,).
+        """
         if self.alone:
             return _equivalent_triangle(self.estimate), np.ones(1), np.ones(1)
         if self.beforehand is None:
@@ -184,7 +198,7 @@ class MethodEstimate:
 
 
 def _equivalent_triangle(estimate: Estimate) -> Triangles:
-    """Return the R factor of one group, whose least-squares solution is an estimate with its covariance."""
+    """Return the R factor of one group whose least-squares solution is a given estimate with its covariance."""
     p = len(estimate.values)
     freedom = max(estimate.dof, 1)
     factor = np.zeros((1, p + 1, p + 1))
@@ -199,25 +213,26 @@ def _equivalent_triangle(estimate: Estimate) -> Triangles:
 
 @dataclass(frozen=True)
 class Method(ABC):
-    """A method that returns an estimate for a problem.
+    """An identification method, which returns an estimate for a problem.
 
-    The flags determine which steps around a method (prior, richer friction, stated noise, elimination) are made.
+    The flags determine which steps around a method (prior, additional friction, stated noise, elimination) are made.
 
     Attributes:
         name: name in options and files.
         assumes: assumptions of the estimate, for the user.
         description: one line.
         source: authors and year.
-        tunes: settings chosen beforehand, not estimated from the data; () for none.
-        version: raised whenever the same data give another estimate or number of iterations: results that studies
-            have stored before are discarded and computed again.
-        takes_prior: whether it uses a prior, ridges of richer friction, and a stated noise of the rows.
+        tunes: settings chosen beforehand, not estimated from the data; () without any.
+        version: number to be raised whenever the same data give another estimate or number of iterations; results that
+            studies stored before are then discarded and computed again.
+        takes_prior: whether it uses a prior, ridges of additional friction, and a stated noise of the rows.
         needs_controller: whether it simulates the closed loop of a recording.
         takes_start: whether its estimate depends on the problem's start values.
         needs_simulation: whether it needs a model whose motion can be computed from torques.
-        takes_models: whether it takes joint torque sensors and richer friction; otherwise motor torques alone.
+        takes_models: whether it supports joint torque sensors and additional friction; otherwise motor torques and
+            standard friction only.
         takes_constraints: whether its estimate satisfies the options' [constraints].
-        auto_friction: what friction = "auto" is for it: auto, chosen by least squares, or standard.
+        auto_friction: meaning of friction = "auto" for this method: auto (chosen by least squares) or standard.
     """
 
     name: str
@@ -236,10 +251,10 @@ class Method(ABC):
 
     @abstractmethod
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the problem's p columns, or a status with the reason of failure."""
+        """Return the estimate of the problem's p columns, or a failure as a status with its reason."""
 
     def takes(self, rows: TorqueRows) -> bool:
-        """Return whether the method accepts these torque rows; methods that simulate need the bodies in them."""
+        """Return whether the method supports these torque rows; methods that simulate need rows with bodies."""
         simulable = rows.has_bodies and rows != POWER
         return rows.motors_alone or (self.takes_models and (simulable or not self.needs_simulation))
 
@@ -255,7 +270,13 @@ class Method(ABC):
 
 
 def attempted(method: str, problem: IdentificationProblem, run: Callable[[], MethodEstimate]) -> MethodEstimate:
-    """Return the result of `run` with its computing time; an error of the estimation becomes a status."""
+    """Return the result of `run` with its computing time; a failure of the estimation becomes a status.
+
+    Args:
+        method: name of the method.
+        problem: data and settings, with which a failure is recorded.
+        run: function that makes the estimate.
+    """
     began = time.perf_counter()
     try:
         estimate = run()

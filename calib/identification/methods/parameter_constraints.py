@@ -1,12 +1,13 @@
-"""Constraints on parameters by name, and constrained estimates: the common part of the PC methods.
+"""Constraints on parameters by name, and constrained estimates: the common part of the methods pc-*.
 
-A row is lower <= aᵀ β <= upper over the columns that are estimated. A standard parameter, or a weighted sum of several,
-is such a row where the torques depend on it alone: cᵀ χ = aᵀ β with c = Tᵀ a, T the regrouping of the base; any other
-has no effect, and a bound on it would say nothing of the estimate (Janot's slides on the TX40). Inertia matrices M(q)
-over random postures are matrix inequalities: λ_min(S M(q; β) S) >= `MIN_EIGENVALUE`, S making the mean diagonal one.
-Bodies that can exist are a cone (`calib.identification.methods.body_cone`), which M(q) > 0 follows from. A user's own
-functions h(β) >= 0 may bend (`calib.identification.methods.curved`); convex constraints in CVXPY are rows and convex
-sets (`calib.identification.methods.convex`).
+A linear constraint is lower <= aᵀ β <= upper for the estimated columns' parameters β. A standard parameter, or a
+weighted sum cᵀ χ of several, can be constrained so if the torques identify it: cᵀ χ = aᵀ β with c = Tᵀ a, where T is
+the regrouping of the base parameters. A bound on any other sum has no effect on the estimate (Janot's slides on the
+TX40) and is refused. Inertia matrices M(q) at random postures are matrix inequalities: λ_min(S M(q; β) S) >=
+`MIN_EIGENVALUE`, with a scaling S that makes the mean diagonal one. Physically consistent bodies form a cone
+(`calib.identification.methods.body_cone`), which implies M(q) > 0. The user's own functions h(β) >= 0 may be nonlinear
+(`calib.identification.methods.curved`); convex constraints in CVXPY are rows and convex sets
+(`calib.identification.methods.convex`).
 """
 
 from __future__ import annotations
@@ -41,17 +42,18 @@ RAISED_BY, MAX_EIGENVALUE = 10**0.5, 0.4
 
 @dataclass(frozen=True, eq=False)
 class Constraints(Frozen):
-    """Constraints on p columns.
+    """Constraints on the parameters β of p columns.
 
     Attributes:
         names: c names of the constraints, for users.
         matrix, lower, upper: (c, p), (c,), (c,), linear constraints lower <= matrix β <= upper.
-        inertia: (K, n, n, p), M(q_k; β) = inertia[k] β.
-        cone: of physically consistent bodies; None if not requested.
+        inertia: (K, n, n, p), inertia matrices M(q_k; β) = inertia[k] β of K postures.
+        cone: cone of physically consistent bodies; None if not requested.
         plane: name of the row that replaces the cone (`touched`); empty without one.
-        least: lower bound of the smallest eigenvalue of S M(q) S, see `raised`.
-        likely: indices of the postures whose constraint was binding in a similar problem.
-        curved: constraints h(β) >= 0; tangents: names of the rows that replace them (`touched`).
+        least: lower bound of the smallest eigenvalue of S M(q) S.
+        likely: indices of the postures whose constraint was binding in a similar problem; None: unknown.
+        curved: constraints h(β) >= 0.
+        tangents: names of the rows that replace the curved constraints (`touched`).
         sets: convex sets; touching: names of the rows that replace those that bind (`touched`), inactive: the others.
     """
 
@@ -71,10 +73,11 @@ class Constraints(Frozen):
     inactive: tuple[str, ...] = ()
 
     def solve(self, factor: np.ndarray, free: np.ndarray | None = None) -> Constrained:
-        """Return argmin ½ ‖R β - z‖² under these constraints, see `calib.identification.methods.constrained.within`.
+        """Return argmin ½ ‖R β - z‖² under these constraints, computed by `constrained.within`.
 
         Args:
-            free: (p,) β without constraints, from which the scale of M(q) is taken; None: that of the factor.
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem in the parameters β.
+            free: (p,) unconstrained β, which gives the scale of M(q); None: the least-squares solution of the triangle.
 
         Raises:
             NotConverged: with the last β, if no positive definite inertia satisfies the other constraints.
@@ -99,9 +102,10 @@ class Constraints(Frozen):
         return "; ".join(names) or "them"
 
     def raised(self) -> Constraints | None:
-        """Return these constraints with a three times larger least eigenvalue of M(q); None beyond `MAX_EIGENVALUE`.
+        """Return the constraints with a three times larger bound on the inertia matrix M(q)'s smallest eigenvalue.
 
-        A robot may have a definite inertia, and yet so little in a direction that a sampled controller cannot hold it.
+        The result is None if the bound would exceed `MAX_EIGENVALUE`. A robot may have a positive definite inertia
+        matrix, but so little inertia in some direction that a sampled controller cannot stabilise it.
         """
         least = self.least * RAISED_BY
         if len(self.inertia) and least <= MAX_EIGENVALUE:
@@ -109,15 +113,14 @@ class Constraints(Frozen):
         return None
 
     def touched(self, factor: np.ndarray, free: np.ndarray | None = None) -> Constraints:
-        """Return the constraints with curved ones, convex sets and the cone of consistent bodies replaced by planes.
-
-        Planes at the optimum, which give the same optimum.
+        """Return the constraints with the cone, convex sets and curved constraints replaced by planes at the optimum.
 
         Args:
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ], which defines the optimum.
             free: (p,) β without constraints, from which the scale of M(q) is taken; None: that of the factor.
 
         Raises:
-            NotConverged: where no estimate, or no physically consistent bodies, satisfy the other constraints.
+            NotConverged: if no estimate, or no physically consistent bodies, satisfy the other constraints.
         """
         if self.curved:
             return self._flattened(factor).touched(factor, free)
@@ -127,12 +130,12 @@ class Constraints(Frozen):
         if self.cone is None:
             optimum = self._optimum(factor, free)
             return linear._with_planes(self.sets, optimum.planes, optimum.values)
-        with _unsatisfied(f"no bodies that can exist satisfy {self}: remove bounds"):
+        with _unsatisfied(f"no physically consistent bodies satisfy {self}: remove bounds"):
             touching = self.cone.touching(factor, self.matrix, self.lower, self.upper, self.sets)
         linear = linear._with_planes(self.sets, touching.planes, touching.values)
         if touching.normal is None:
             return linear
-        label = f"bodies that can exist ({', '.join(touching.bodies) or 'all'} on the border)"
+        label = f"physically consistent bodies ({', '.join(touching.bodies) or 'all'} on the border)"
         with_plane = linear._with_row(label, touching.normal, touching.values)
         return replace(with_plane, plane=label)
 
@@ -158,7 +161,11 @@ class Constraints(Frozen):
         return replace(self, names=names, matrix=matrix, lower=lower, upper=upper)
 
     def _flattened(self, factor: np.ndarray) -> Constraints:
-        """Return the constraints with the curved ones replaced by their tangent planes at the optimum."""
+        """Return the constraints with the curved ones replaced by their tangent planes at the optimum.
+
+        Args:
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ], which defines the optimum.
+        """
         linear = replace(self, curved=())
         m = len(self.curved)
         p = len(factor) - 1
@@ -168,7 +175,13 @@ class Constraints(Frozen):
         free = np.append(least_squares, np.zeros(m))
 
         def solve(triangle: np.ndarray, rows: np.ndarray, lower: np.ndarray) -> Constrained:
-            """Return the optimum of parameters and m further unknowns, with further inequalities."""
+            """Return the optimum of parameters and m further unknowns, under more inequalities rows · b >= lower.
+
+            Args:
+                triangle: (p + m + 1, p + m + 1) upper triangle of the problem.
+                rows: (k, p + m) rows of the further inequalities.
+                lower: (k,) their lower bounds.
+            """
             wider = np.pad(self.matrix, ((0, 0), (0, m)))
             names = ("",) * len(rows) + self.names
             matrix = np.vstack([rows, wider])
@@ -181,7 +194,7 @@ class Constraints(Frozen):
             return further.solve(triangle, free)
 
         names = tuple(constraint.name for constraint in self.curved)
-        with _unsatisfied(f"no estimate satisfies {'; '.join(names)} beside {linear}: remove one of them"):
+        with _unsatisfied(f"no estimate satisfies {'; '.join(names)} together with {linear}: remove one of them"):
             normals, bounds = tangents(self.curved, factor, start, solve)
         all_names = (*self.names, *names)
         matrix = np.vstack([self.matrix, normals])
@@ -192,7 +205,7 @@ class Constraints(Frozen):
 
 @contextmanager
 def _unsatisfied(message: str) -> Iterator[None]:
-    """Put `message` in front of the message of a `NotConverged` that is raised inside."""
+    """Prefix the message of a `NotConverged` that is raised in the context with `message`."""
     try:
         yield
     except NotConverged as error:
@@ -209,7 +222,9 @@ def make_constraints(
     """Return the constraints on an estimate's columns that the settings request.
 
     Args:
-        names: (p,) names of the columns: base columns, then richer friction.
+        settings: table [constraints] of the options.
+        model, base: the model and its base parameters.
+        names: (p,) names of the columns: base columns, then additional friction.
         terms: (p,) drive term of each column; None for parameters of bodies.
 
     Raises:
@@ -228,7 +243,7 @@ def make_constraints(
         low, high = weighted_sum.limits
         label = weighted_sum.name or " + ".join(f"{weight:g} {name}" for name, weight in weighted_sum.weights.items())
         twice = weighted_sum.equal is not None and (weighted_sum.least, weighted_sum.most) != (None, None)
-        require(not twice, f"{location}: 'equal' excludes 'least' and 'most'", UsageError)
+        require(not twice, f"{location}: 'equal' cannot be combined with 'least' or 'most': remove one", UsageError)
         if low > high or not (np.isfinite(low) or np.isfinite(high)):
             refuse_option(f"{location} ({label})", "expected equal, or least <= most")
         requests.append((label, weighted_sum.weights, low, high))
@@ -279,10 +294,10 @@ def make_constraints(
 
 
 def constraints_of(problem: IdentificationProblem) -> Constraints:
-    """Return the constraints on a problem's columns.
+    """Return the constraints on a problem's columns; without settings, the default ones.
 
     Raises:
-        UsageError: see `make_constraints`.
+        UsageError: for an unknown name, a bound without effect on the torques, or contradicting bounds.
     """
     richer_names = problem.rows[0].names[problem.base.b :]
     names = (*problem.base.names, *richer_names)
@@ -293,15 +308,19 @@ def constraints_of(problem: IdentificationProblem) -> Constraints:
 def hold(
     fit: LinearFit, factor: np.ndarray, data: Triangles, std: np.ndarray, constraints: Constraints, stated_noise: bool
 ) -> tuple[LinearFit, Held]:
-    """Return a constrained fit, whose covariance treats active constraints as equalities, and these constraints.
+    """Return a constrained fit, whose covariance treats binding constraints as equalities, and its constraints.
 
     Args:
-        fit: the free estimate.
-        factor: (p + 1, p + 1) triangle [R z; 0 ρ] that it minimises.
-        data: triangles of the rows whose residuals give the noise, one group per torque row.
-        std: (g,) of the groups.
-        stated_noise: whether the covariance takes `std` as the noise; otherwise σ² of the residuals, of the constrained
-            estimate.
+        fit: the unconstrained estimate.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of its least-squares problem min ‖R β - z‖².
+        data: R factors of the rows whose residuals give the noise, one group per torque row.
+        std: (g,) noise standard deviations of the groups, in units of y.
+        constraints: the constraints.
+        stated_noise: whether `std` is the noise from which the covariance follows; otherwise σ² of the constrained
+            estimate's residuals.
+
+    Raises:
+        NotConverged: if no estimate satisfies the constraints.
     """
     free = fit.estimate
     constraints = constraints.touched(factor)
@@ -325,7 +344,13 @@ def hold(
 
 
 def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -> Held:
-    """Return the binding constraints of a solution, by its multipliers in the order of `within`."""
+    """Return the constraints, and which of them bind at a solution.
+
+    Args:
+        constraints: the constraints.
+        solution: the constrained optimum, in the order of `within`.
+        free: the unconstrained estimate.
+    """
     equal = constraints.lower == constraints.upper
     low = np.flatnonzero(np.isfinite(constraints.lower) & ~equal)
     high = np.flatnonzero(np.isfinite(constraints.upper) & ~equal)
@@ -358,7 +383,7 @@ def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -
 
 
 def _findings(constraints: Constraints, binding: Sequence[Binding], postures: int) -> Iterator[Finding]:
-    """Yield the findings on binding constraints, and on the `postures` in which M(q) is on its bound."""
+    """Yield the findings on binding constraints; `postures` is the number of postures in which M(q) is at its bound."""
     # standard deviations by which the data speak against an equality that is named (our choice)
     max_sigmas = 3.0
     for one in binding:
@@ -387,10 +412,15 @@ def _words(name: str, low: float, high: float) -> str:
 
 
 def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.ndarray:
-    """Return the row a (p,) of a weighted sum of columns and standard parameters.
+    """Return the row a (p,) of a weighted sum of columns and standard parameters, so that the sum is aᵀ β.
+
+    Args:
+        weights: name of a column or standard parameter to its weight.
+        base: base parameters of the model.
+        names: (p,) names of the columns.
 
     Raises:
-        UsageError: where the torques do not identify the sum.
+        UsageError: if the torques do not identify the sum, or a name is unknown.
     """
     row = np.zeros(len(names))
     standard = np.zeros(len(base.standard))
@@ -409,12 +439,19 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
     if np.abs(base.transform.T @ base_row - standard).max() > 1e-6 * max(np.abs(standard).max(), 1e-300):
         refuse_option("[constraints]", _without_effect(weights, base))
     row[: base.b] += base_row
-    require(row.any(), f"[constraints]: the weights of {', '.join(weights)} sum to zero", UsageError)
+    require(
+        row.any(), f"[constraints]: the weights of {', '.join(weights)} sum to zero; state other weights", UsageError
+    )
     return row
 
 
 def _without_effect(weights: Mapping[str, float], base: Base) -> str:
-    """Return the reason why a sum of standard parameters cannot be constrained."""
+    """Return the text why a weighted sum of standard parameters cannot be constrained.
+
+    Args:
+        weights: name of a standard parameter to its weight.
+        base: base parameters of the model.
+    """
     silent = [name for name in weights if name in base.without_effect]
     if silent:
         return f"{', '.join(silent)} has no effect on the torques of this robot: remove the bound"
@@ -425,7 +462,16 @@ def _without_effect(weights: Mapping[str, float], base: Base) -> str:
 
 
 def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p: int) -> np.ndarray:
-    """Return the tensor (K, n, n, p) of M(q_k) over random postures, linear in the parameters: M(q_k) = tensor[k] β."""
+    """Return the tensor (K, n, n, p) of the inertia matrices at random postures, M(q_k) = tensor[k] β.
+
+    K is 0 if the constraint is not requested, or the rows are not those of all joint torques.
+
+    Args:
+        settings: table [constraints], with the number K of postures.
+        model: the model.
+        base: its base parameters.
+        p: number of columns.
+    """
     if not settings.inertia or not model.inertial or model.rows != model.n:
         return np.zeros((0, model.n, model.n, p))
     q = bases.random_samples(model, settings.inertia).q
@@ -442,7 +488,16 @@ def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p:
 
 
 def _definite(inertia: np.ndarray, free: np.ndarray, least: float, likely: np.ndarray | None) -> Definite | None:
-    """Return the scaled inertia matrices S M(q) S of the postures, S from the diagonals at the free estimate."""
+    """Return the constraint on the scaled inertia matrices S M(q) S; None without matrices.
+
+    S scales the mean diagonal at the unconstrained estimate `free` (p,) to one.
+
+    Args:
+        inertia: (K, n, n, p) inertia matrices M(q_k) = inertia[k] β.
+        free: (p,) unconstrained estimate.
+        least: lower bound of the eigenvalues of S M(q) S.
+        likely: indices of matrices that were binding in a similar problem; None: unknown.
+    """
     if not len(inertia):
         return None
     size = np.abs(np.einsum("kiip,p->ki", inertia, free)).mean(axis=0)

@@ -1,14 +1,13 @@
-"""Least squares with noise correlated across the rows of a sample: full covariance across joints, outliers.
+"""Robust least squares with noise that is correlated across the rows (joints) of a sample.
 
-The residual of sample k, e_k = y_k - W_k x (n joints), has covariance S across joints and none between samples; its
-size is Mahalanobis', d_k² = e_kᵀ S⁻¹ e_k. A robust fit weights each sample by w(d_k), and beyond the gate by nothing.
-That guards against bad y; a sample with a bad W of great leverage draws the fit unseen, as in every M-estimator.
-The samples stay in memory, since each round weights them anew: meant for decimated data.
+The residual of sample k, e_k = y_k - W_k x (n joints), has covariance S across joints and no correlation between
+samples. Its Mahalanobis size is d_k² = e_kᵀ S⁻¹ e_k. A robust fit weights each sample by w(d_k), and by zero beyond a
+gate. This protects against wrong y; a sample with a wrong W of large leverage remains undetected, as in every
+M-estimator. All samples are in memory, since each iteration weights them anew, so the method is meant for decimated
+data.
 
-Robust weights of whole samples, by the Mahalanobis size of their residuals.
-
-For e ~ N(0, S) with n joints the size d = (eᵀ S⁻¹ e)^½ is chi-distributed, so what counts as large grows with n. The
-expectations below are means over 4000 quantiles of d², good to four digits.
+For e ~ N(0, S) with n joints, d = (eᵀ S⁻¹ e)^½ is chi-distributed, so that the limit between small and large d grows
+with n. Expectations are means over 4000 quantiles of d², accurate to four digits.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,10 +32,14 @@ GATE = 0.999
 
 @lru_cache
 def tuning(joints: int, efficiency: float = 0.95) -> float:
-    """Return Huber's constant with efficiency `efficiency` for normal residuals of `joints` joints at once.
+    """Return the constant of Huber's weights with which the estimate has the given efficiency for normal residuals.
 
-    The efficiency of the weights w(d) is b² / a with a = E w² d² / n and b = E w d² / n (Maronna 1976; the latter
-    equals E[w + w' d / n] by Stein's lemma). For one joint: 1.345.
+    The efficiency of the weights w(d) is b² / a with a = E w² d² / n and b = E w d² / n (Maronna 1976; b equals E[w +
+    w' d / n] by Stein's lemma). For one joint the constant is 1.345.
+
+    Args:
+        joints: number n of joints in a sample.
+        efficiency: efficiency relative to least squares.
     """
     from scipy.optimize import brentq
 
@@ -52,11 +55,12 @@ def tuning(joints: int, efficiency: float = 0.95) -> float:
 
 
 def weigh(size: np.ndarray, joints: np.ndarray, gated: bool = True) -> np.ndarray:
-    """Return Huber's weights w(d) (N,) of samples of Mahalanobis size d (N,), zero beyond the gate.
+    """Return Huber's weights w(d) (N,) of samples with Mahalanobis sizes d (N,).
 
     Args:
-        joints: (N,) how many joints each sample has.
-        gated: whether samples beyond `GATE` weigh nothing.
+        size: (N,) Mahalanobis sizes.
+        joints: (N,) number of joints in use in each sample.
+        gated: whether samples beyond the gate (quantile `GATE`) have weight zero.
     """
     result = np.zeros(len(size))
     for n in np.unique(joints[joints > 0]):
@@ -67,7 +71,13 @@ def weigh(size: np.ndarray, joints: np.ndarray, gated: bool = True) -> np.ndarra
 
 @lru_cache
 def consistency(joints: int) -> float:
-    """Return c = E w / E[w d² / n], so that c Σ w e eᵀ / Σ w estimates S for normal residuals."""
+    """Return c = E w / E[w d² / n], with which c Σ w e eᵀ / Σ w is a consistent estimate of S for normal residuals.
+
+    S is the noise covariance of a sample, e its residual, d its Mahalanobis size, w(d) its weight.
+
+    Args:
+        joints: number n of joints in use in a sample.
+    """
     square = _quantiles(joints)
     size = np.sqrt(square)
     w = _weights(size, joints)
@@ -75,10 +85,16 @@ def consistency(joints: int) -> float:
 
 
 def variance_factor(size: np.ndarray, joints: np.ndarray) -> float:
-    """Return v with cov(x) = v (Σ w_k W_kᵀ S⁻¹ W_k)⁻¹ for the weighted fit (Huber & Ronchetti 2009, section 7.6).
+    """Return the factor v of the weighted fit's covariance cov(x) = v (Σ w_k W_kᵀ S⁻¹ W_k)⁻¹.
 
-    cov(x) = a / b² (Σ W_kᵀ S⁻¹ W_k)⁻¹ with a = mean w² d² / n and b = mean(w + w' d / n) over the samples, and the sum
-    over all samples is the weighted one over mean w. The step of w at the gate is not counted: some per mille.
+    W_k (n, p) is the regressor of sample k, S (n, n) the noise covariance, w_k the weight. cov(x) = a / b² (Σ W_kᵀ S⁻¹
+    W_k)⁻¹ with a = mean w² d² / n and b = mean(w + w' d / n) over the samples (Huber & Ronchetti 2009, section 7.6),
+    and the sum over all samples is the weighted sum over mean w. The step of w at the gate is neglected, an error of a
+    few per mille.
+
+    Args:
+        size: (N,) Mahalanobis sizes.
+        joints: (N,) number of joints in use in each sample.
     """
     n = np.maximum(joints, 1)
     w = weigh(size, joints)
@@ -104,7 +120,11 @@ def _weights(size: np.ndarray, joints: int, gated: bool = True) -> np.ndarray:
 
 @lru_cache
 def _quantiles(joints: int) -> np.ndarray:
-    """Return 4000 equally likely values of d², for numerical expectations."""
+    """Return 4000 equally probable values of d², the squared Mahalanobis size of normal residuals.
+
+    Args:
+        joints: number of joints in a sample, the degrees of freedom of d².
+    """
     return np.asarray(chdtri(joints, 1.0 - (np.arange(4000) + 0.5) / 4000))
 
 
@@ -115,13 +135,13 @@ ROUNDS = 200
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """N samples of n joints.
+    """N samples of the torques of n joints.
 
     Attributes:
-        names, units: p strings each.
-        matrix: (N, n, p), the regressors.
-        target: (N, n).
-        present: (N, n) bool, rows in use: slow joints may be cut sample by sample.
+        names, units: names and units of the p parameters.
+        matrix: (N, n, p) regressors.
+        target: (N, n) torques [N m or N].
+        present: (N, n) mask of rows in use; rows of slow joints may be unused in single samples.
     """
 
     names: tuple[str, ...]
@@ -132,7 +152,7 @@ class Samples:
 
     @property
     def joints(self) -> np.ndarray:
-        """Number of rows in use per sample (N,)."""
+        """Number of joints whose rows are in use, per sample (N,)."""
         return self.present.sum(axis=1)
 
 
@@ -141,11 +161,11 @@ class SampleFit:
     """Linear fit with the noise covariance across joints.
 
     Attributes:
-        fit: the estimate; ``fit.group_std`` is the root of the diagonal of `noise`.
+        fit: the estimate; ``fit.group_std`` is the square root of the diagonal of `noise`.
         noise: (n, n) covariance S of one sample's residual.
-        weights: (N,) in 0..1.
-        outliers: (N,) bool, samples beyond the gate.
-        factor: (p + 1, p + 1) triangle [R z; 0 ρ] of the samples whitened and weighted.
+        weights: (N,) weights of the samples, 0 to 1.
+        outliers: (N,) mask of samples beyond the gate.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the whitened and weighted samples.
     """
 
     fit: LinearFit
@@ -166,7 +186,17 @@ def stack(
     names: Sequence[str] | None = None,
     units: Sequence[str] | None = None,
 ) -> Samples:
-    """Return samples checked for shape and finiteness, without a copy; see `Samples`."""
+    """Return samples, after checks of shapes and finiteness, without a copy.
+
+    Args:
+        matrix: (N, n, p) regressors.
+        target: (N, n) torques [N m or N].
+        present: (N, n) mask of rows in use; None: all.
+        names, units: names and units of the p parameters; None: x1, x2, … without units.
+
+    Raises:
+        CalibError: for wrong shapes or numbers of names.
+    """
     shape = (None, None, None)
     matrix = shaped(matrix, shape, "observation matrices W")
     target = shaped(target, matrix.shape[:2], "target y")
@@ -188,15 +218,19 @@ def stack(
 def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np.ndarray] | None = None) -> SampleFit:
     """Estimate x and S by iteratively reweighted least squares over whole samples (Maronna 1976), with a gate.
 
-    S, weights and x alternate until x moves by less than 1e-4 of its standard deviation. Starts from a row-wise Cauchy
-    fit with median spreads, because a covariance estimated from all samples would hide the outliers that made it. The
-    covariance of x is that of the M-estimator, `variance_factor`.
+    x (p,) are the parameters, S (n, n) is the noise covariance across joints. S, weights and x are computed in turn
+    until x changes by less than 1e-4 of its standard deviation. The iteration starts from a Cauchy fit of single rows
+    with median-based standard deviations, because outliers would increase a covariance estimated from all samples and
+    so remain hidden. The covariance of x is that of the M-estimator, `variance_factor`.
 
     Args:
         data: the samples.
-        inflation: >= 1, see `linear`; one number for all joints.
-        solve: triangle [R z; 0 ρ] of a round -> its x (p,); None: that of least squares. Other functions keep x within
-            constraints; the covariance ignores these.
+        inflation: variance inflation >= 1 of all joints, explained in the module `linear`.
+        solve: function of the triangle [R z; 0 ρ] of the weighted least-squares problem that returns x (p,), e.g. under
+            constraints, which the covariance ignores; None: least squares.
+
+    Raises:
+        NotConverged: if the weights do not converge.
     """
     start = row_irls(data)
     shares = np.sqrt(_share_left(data, start.group_std))
@@ -216,13 +250,20 @@ def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np
             values = solve(factor)
         if np.sum((factor[:-1, :-1] @ (values - last)) ** 2) <= 1e-8 * len(values):
             return _pack(data, values, covariance, size, weights, factor, inflation)
-    raise NotConverged("the weights of the samples do not converge", values)
+    raise NotConverged(f"the weights of the samples have not converged after {ROUNDS} rounds; use method wls", values)
 
 
 def row_irls(data: Samples) -> LinearFit:
-    """Estimate x with one Cauchy weight per row, w(|ρ| / σ_j), σ_j = 1.4826 · median |ρ| of joint j.
+    """Estimate x with one Cauchy weight w(|ρ| / σ_j) per row, σ_j = 1.4826 · median |ρ| of joint j.
 
-    For outliers that hit single joints. Its covariance is that of weighted rows, without the M-estimator's factor.
+    This is for outliers of single joints. The covariance is that of weighted rows, without the factor of the
+    M-estimator.
+
+    Args:
+        data: the samples; ρ is the residual of a row.
+
+    Raises:
+        NotConverged: if the weights do not converge.
     """
     weights = np.ones(data.target.shape)
     values = wls(_triangles(data, weights), _spreads(data, data.target)).estimate.values
@@ -235,7 +276,7 @@ def row_irls(data: Samples) -> LinearFit:
         values = fit.estimate.values
         if np.all(np.abs(step) <= 1e-3 * fit.estimate.sigma):
             return LinearFit(fit.estimate, std, fit.condition, fit.condition_normalised)
-    raise NotConverged("the weights of the rows do not converge", values)
+    raise NotConverged(f"the weights of the rows have not converged after {ROUNDS} rounds; use method wls", values)
 
 
 def _pack(
@@ -247,7 +288,16 @@ def _pack(
     factor: np.ndarray,
     inflation: float,
 ) -> SampleFit:
-    """Return the fit with the covariance of the chosen estimator."""
+    """Return the fit with the covariance of the M-estimator.
+
+    Args:
+        data: the samples.
+        values: (p,) estimate.
+        noise: (n, n) covariance S.
+        size, weights: (N,) Mahalanobis sizes and weights.
+        factor: triangle of the whitened and weighted samples.
+        inflation: variance inflation.
+    """
     _, inverse, conditions = solve_triangle(factor, data.names)
     squares = np.sum(weights * _consistent(data) * size**2)
     dof = int(data.joints[weights > 0.0].sum() / inflation) - len(values)
@@ -260,7 +310,13 @@ def _pack(
 
 
 def _sizes(residual: np.ndarray, noise: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Return Mahalanobis sizes (e_kᵀ S⁻¹ e_k)^½ (N,) of residuals (N, n), over the rows present."""
+    """Return the Mahalanobis sizes (e_kᵀ S⁻¹ e_k)^½ (N,) of residuals (N, n), computed with the rows in use.
+
+    Args:
+        residual: (N, n) residuals.
+        noise: (n, n) noise covariance S.
+        present: (N, n) mask of rows in use.
+    """
     patterns, pattern = _roots(noise, present)
     result = np.empty(len(residual))
     for k, root in enumerate(patterns):
@@ -270,7 +326,15 @@ def _sizes(residual: np.ndarray, noise: np.ndarray, present: np.ndarray) -> np.n
 
 
 def _roots(noise: np.ndarray, present: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return L⁻¹ (k, n, n) for every pattern of rows present, zero for absent ones, and each sample's pattern (N,)."""
+    """Return whitening matrices for every pattern of rows in use, and the pattern of each sample.
+
+    The matrices (k, n, n) are L⁻¹ with L Lᵀ = S for the rows in use, and zero for the others; the pattern is an index
+    (N,).
+
+    Args:
+        noise: (n, n) noise covariance S.
+        present: (N, n) mask of rows in use.
+    """
     patterns, pattern_index = np.unique(present, axis=0, return_inverse=True)
     roots = np.zeros((len(patterns), *noise.shape))
     for k, pattern in enumerate(patterns):
@@ -282,7 +346,13 @@ def _roots(noise: np.ndarray, present: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _factor(data: Samples, noise: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the R factor of the whitened and weighted [W y], a chunk of samples at a time."""
+    """Return the R factor of the whitened and weighted [W y], computed from blocks of samples.
+
+    Args:
+        data: the samples.
+        noise: (n, n) noise covariance, by which rows are whitened.
+        weights: (N,) weights of the samples.
+    """
     roots, pattern = _roots(noise, data.present)
     p = len(data.names)
     total = empty(data.names)
@@ -296,7 +366,12 @@ def _factor(data: Samples, noise: np.ndarray, weights: np.ndarray) -> np.ndarray
 
 
 def _triangles(data: Samples, weights: np.ndarray) -> Triangles:
-    """Return the R factors (QR) of all rows that are not missing, one group per joint, weighted by `weights` (N, n)."""
+    """Return the R factors of all rows in use, one group per joint, weighted by `weights` (N, n).
+
+    Args:
+        data: the samples.
+        weights: (N, n) weights of the rows.
+    """
     root = np.sqrt(weights)
     groups = data.target.shape[1]
     total = empty(data.names, data.units, groups)
@@ -311,7 +386,12 @@ def _triangles(data: Samples, weights: np.ndarray) -> Triangles:
 
 
 def _spreads(data: Samples, residual: np.ndarray) -> np.ndarray:
-    """Return the robust standard deviation of each joint's residuals (n,), always positive."""
+    """Return the robust standard deviation of each joint's residuals (n,), always above zero.
+
+    Args:
+        data: the samples.
+        residual: (N, n) residuals.
+    """
     spreads = []
     for joint_residual, present in zip(residual.T, data.present.T):
         spreads.append(robust.spread(joint_residual[present]))
@@ -320,7 +400,14 @@ def _spreads(data: Samples, residual: np.ndarray) -> np.ndarray:
 
 
 def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
-    """Return 1 - h_j / r_j (n,), the share of joint j's noise variance that remains in its residuals."""
+    """Return the share 1 - h_j / r_j (n,) of joint j's noise variance that remains in its r_j residuals after the fit.
+
+    h_j is the leverage of the joint's rows.
+
+    Args:
+        data: the samples.
+        std: (n,) standard deviations of the joints' residuals [N m or N].
+    """
     triangles = _triangles(data, np.ones(data.target.shape))
     inverse = solve_triangle(combine(triangles, std), data.names)[1]
     leverages = leverage(triangles, std, inverse)
@@ -328,7 +415,11 @@ def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
 
 
 def _consistent(data: Samples) -> np.ndarray:
-    """Return the factor (N,) that makes the weighted covariance consistent for normal residuals."""
+    """Return the factor (N,) of `consistency` for each sample, by its number of joints in use.
+
+    Args:
+        data: the samples.
+    """
     # By the number of joints in use; a sample without any has no weight.
     factors = [0.0]
     factors += [consistency(count) for count in range(1, data.target.shape[1] + 1)]
@@ -336,7 +427,16 @@ def _consistent(data: Samples) -> np.ndarray:
 
 
 def _scatter(data: Samples, residual: np.ndarray, scaled: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return S_ij = Σ c w e_i e_j / Σ w over samples with both rows, eigenvalues kept positive."""
+    """Return the noise covariance S_ij = Σ c w e_i e_j / Σ w over samples with both rows in use.
+
+    Eigenvalues are kept positive.
+
+    Args:
+        data: the samples.
+        residual: (N, n) residuals e.
+        scaled: (N,) products c w, with c of `consistency`.
+        weights: (N,) weights w.
+    """
     present = data.present.astype(float)
     total_weight = np.maximum((present * weights[:, None]).T @ present, 1e-300)
     noise = (residual * scaled[:, None]).T @ residual / total_weight

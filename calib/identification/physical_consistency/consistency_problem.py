@@ -1,17 +1,19 @@
 """Cost function of physically consistent standard parameters, as arrays: data, prior bodies, drive terms.
 
-Prior bodies, towards which consistent parameters are regularised, are the CAD's, else rods between the joints.
-
-`nearest` says how far an estimate is from the parameters of bodies that can exist:
+Consistent parameters are regularised towards prior bodies: those of the CAD, or else rods between the joints. `nearest`
+computes how far an estimate is from the parameters of physically consistent bodies:
 
     min ‖R T χ - z‖   over   P_i(χ) ⪰ 0,  Ia, Fv, Fc >= 0
 
-(Sousa & Cortesão 2014; Wensing, Kim & Slotine 2018): a semidefinite program (Clarabel).
-Its optimum lies on the border wherever the estimate itself is impossible; it says what consistency costs and no more.
-With a pull γ towards the prior bodies P_i⁰ = L Lᵀ it is the Euclidean counterpart of the entropic prior of
-`calib.identification.physical_consistency.solve`, whose second order it is: + ½ γ Σ ½ ‖L⁻¹ P_i L⁻ᵀ - 1‖², the drives'
-likewise. In
-these coordinates no weight between kg and kg m² is needed; unlike the entropic one it does not keep off the border.
+(Sousa & Cortesão 2014; Wensing, Kim & Slotine 2018), a semidefinite program (Clarabel). If the estimate itself is
+inconsistent, the optimum is at the limit of consistency, and the minimum is the cost of consistency alone. With a
+regularisation of weight γ towards prior bodies P_i⁰ = L Lᵀ,
+
+    + ½ γ Σ ½ ‖L⁻¹ P_i L⁻ᵀ - 1‖², and likewise for the drives,
+
+it is the Euclidean counterpart of the entropic prior of `calib.identification.physical_consistency.solve`: its
+expansion to second order. In these coordinates no weight between kg and kg m² is needed. Unlike the entropic prior, it
+does not keep bodies away from the limit of consistency.
 """
 
 from collections.abc import Iterator
@@ -50,8 +52,8 @@ class PriorBodies(Frozen):
 
     Attributes:
         parameters: (B, 10) standard parameters, all physically consistent.
-        drawn: (B,) False where only the order of magnitude is known.
-        cad: whether they are CAD values.
+        drawn: (B,) whether a body is regularised with the common weight; False if only the order of magnitude is known.
+        cad: whether the parameters are CAD values.
         source: text on the source.
         notes: texts on corrected bodies.
     """
@@ -64,18 +66,33 @@ class PriorBodies(Frozen):
 
 
 def find_prior_bodies(chain: Chain, model: IdentificationModel) -> Iterator[PriorBodies]:
-    """Yield the candidate priors, to be selected by evidence: CAD values alone, or rods with several total masses."""
+    """Yield the candidate priors, among which the evidence selects.
+
+    They are the CAD values alone, or without these, rods between the joints with several total masses.
+
+    Args:
+        chain: the arm, with its inertias if it has any.
+        model: its model, whose bodies get a prior.
+    """
     is_payload = model.bodies.coordinates < 0
     if chain.inertias is not None and chain.inertias[:, 9].max() > 0.0:
         yield _cad(chain, model, is_payload)
         return
     for total in TOTALS:
-        source = f"rods between the joints (the description has no masses), {total:.3g} kg in all by evidence"
+        source = (
+            f"rods between the joints (the description has no masses), of the most probable total mass, {total:.3g} kg"
+        )
         yield PriorBodies(rods(chain, model, total), ~is_payload, False, source)
 
 
 def _cad(chain: Chain, model: IdentificationModel, is_payload: np.ndarray) -> PriorBodies:
-    """Return the prior of a description's inertias, with inconsistent and missing ones replaced."""
+    """Return the prior of a description's inertias, with missing and inconsistent ones replaced.
+
+    Args:
+        chain: the arm with its inertias.
+        model: its model.
+        is_payload: (B,) mask of the bodies that are payloads.
+    """
     described = standard_parameters(chain).reshape(-1, 10)
     bodies = np.zeros((model.bodies.count, 10))
     bodies[: len(described)] = described
@@ -100,7 +117,7 @@ def _cad(chain: Chain, model: IdentificationModel, is_payload: np.ndarray) -> Pr
 
 
 def _thickened(body: np.ndarray) -> np.ndarray:
-    """Return a body's parameters with its mass spread by at least `THIN` in every direction about its centre."""
+    """Return a body's parameters with its mass spread increased to at least `THIN` in every direction."""
     pseudo = pseudo_inertia.from_standard(body)
     mass = pseudo[3, 3]
     centre = pseudo[:3, 3] / mass
@@ -113,16 +130,17 @@ def _thickened(body: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class BodyCost:
-    """The cost function as arrays; parameters without data and prior are fixed beforehand.
+    """The cost function as arrays; parameters with neither data nor prior are fixed beforehand.
 
     Attributes:
         factor: (k, p + 1) [R T, z].
-        bodies: number of bodies, with ten parameters each, before all other parameters.
-        references: (B, 4, 4) P⁰.
-        drawn: (B,) whether the common weight γ applies to a body; `WEAK` otherwise.
-        sizes: (p - 10 B,) x⁰ of positive drive terms; standard deviation of the free ones; 0 where fixed.
-        positive: (p - 10 B,) which terms must be positive.
-        fixed: (p - 10 B,) their values where fixed.
+        bodies: number B of bodies, with ten parameters each, before the drive terms.
+        references: (B, 4, 4) prior pseudo-inertias P⁰.
+        drawn: (B,) whether the common weight γ applies to a body; otherwise the weight is `WEAK`.
+        sizes: (p - 10 B,) prior values x⁰ of positive drive terms; standard deviations of other drive terms; 0 for
+            fixed terms.
+        positive: (p - 10 B,) whether each drive term must be positive.
+        fixed: (p - 10 B,) values of fixed drive terms.
         lift: factor of all priors; 1 except during the search for the optimum.
     """
 
@@ -137,16 +155,25 @@ class BodyCost:
 
     @property
     def free(self) -> np.ndarray:
-        """Which parameters are estimated (p,) bool."""
+        """Mask (p,) of the parameters that are estimated."""
         return np.concatenate([np.ones(10 * self.bodies, bool), self.sizes > 0.0])
 
     def weights(self, gamma: float) -> np.ndarray:
-        """Return the prior weight of each body (B,)."""
+        """Return the prior weight of each body (B,) for the common weight γ.
+
+        Args:
+            gamma: γ, weight of the divergence between a body and its prior.
+        """
         return self.lift * np.where(self.drawn, gamma, WEAK)
 
 
 def make_problem(information: Information, references: PriorBodies) -> BodyCost:
-    """Return the cost function of an identified model; prior sizes of drive terms come from the recorded torque."""
+    """Return the cost function of an identified model; the recorded torque gives prior sizes of drive terms.
+
+    Args:
+        information: identified model with the information of its data.
+        references: the prior bodies.
+    """
     model = information.dynamics.model
     inertial = 10 * model.bodies.count
     matrix = information.factor[:, :-1]
@@ -185,11 +212,12 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
 
     Args:
         problem: data, prior bodies and drive terms.
-        spared: a body (counted from 0, or from B on a term) that may be inconsistent.
-        pull: γ of the Euclidean prior; 0: none.
+        spared: index of a body (or the number of bodies plus the index of a drive term) that may be inconsistent; None:
+            none may.
+        pull: weight γ of the Euclidean prior towards the prior bodies; 0: no prior.
 
     Raises:
-        NotConverged: where Clarabel finds no optimum.
+        NotConverged: if Clarabel finds no optimum.
     """
     count = problem.bodies
     inertial = 10 * count
@@ -219,7 +247,12 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
 
 
 def _euclidean_prior(problem: BodyCost, pull: float) -> np.ndarray:
-    """Return the Euclidean prior as rows of [W y] in the coordinates of `_coordinates`."""
+    """Return the Euclidean prior of weight `pull` as rows of [W y], in the coordinates of `_coordinates`.
+
+    Args:
+        problem: data, prior bodies and drive terms.
+        pull: weight γ.
+    """
     basis = pseudo_inertia.UNITS.reshape(10, 16).T
     identity = np.eye(4).ravel()
     blocks, targets = [], []
@@ -236,7 +269,15 @@ def _euclidean_prior(problem: BodyCost, pull: float) -> np.ndarray:
 
 
 def blame(problem: BodyCost, information: Information, count: int = 3) -> tuple[tuple[str, float], ...]:
-    """Return the bodies and terms whose constraint costs most: name, and the distance without this constraint."""
+    """Return the `count` bodies and terms whose constraints cost most, each with the distance without its constraint.
+
+    The first entry of a pair is the name; distances are Mahalanobis distances from the data's optimum.
+
+    Args:
+        problem: data, prior bodies and drive terms.
+        information: identified model, which provides the names.
+        count: number of entries.
+    """
     model = information.dynamics.model
     constraints = [(f"body {label}", i) for i, label in enumerate(model.bodies.labels)]
     for k, term in enumerate(model.columns):
@@ -251,9 +292,13 @@ def blame(problem: BodyCost, information: Information, count: int = 3) -> tuple[
 
 
 def _coordinates(problem: BodyCost) -> np.ndarray:
-    """Return the matrix from [ξ_1; …; u] to χ (p,), with P_i = L Q_i Lᵀ, P_i⁰ = L Lᵀ, u in units of the terms' sizes.
+    """Return the matrix that maps coordinates [ξ_1; …; u] to standard parameters χ (p,).
 
-    ξ_i are the entries of Q_i by an orthonormal basis.
+    ξ_i are the entries of Q_i in an orthonormal basis, with P_i = L Q_i Lᵀ and P_i⁰ = L Lᵀ; u are the drive terms in
+    units of their prior sizes.
+
+    Args:
+        problem: data, prior bodies P_i⁰ and drive terms.
     """
     roots = np.linalg.cholesky(problem.references)[:, None]
     pseudo = roots @ pseudo_inertia.UNITS @ roots.transpose(0, 1, 3, 2)

@@ -1,8 +1,8 @@
 """Information of an identification's data on the standard parameters, without a prior: ‖R T χ - z‖².
 
-T regroups the p parameters χ of the model into the b that the motion identifies separately. R and z are the estimate β
-and its covariance Σ as rows, RᵀR = Σ⁻¹ and z = R β. Where a prior took part in the estimate, or constraints hold it,
-they are the data's own triangle instead (``information.csv``), so that what was known beforehand is not counted twice.
+T regroups the p standard parameters χ of the model into the b parameters β that the motion identifies. R and z express
+the estimate β with its covariance Σ as rows, RᵀR = Σ⁻¹ and z = R β. If the estimate includes a prior or constraints, R
+and z are instead the R factor of the data alone (``information.csv``), so that prior knowledge is not used twice.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ INFORMATION = "information.csv"
 
 @dataclass(frozen=True, eq=False)
 class Information(Frozen):
-    """An identified model with the information matrix of its data.
+    """An identified model with the information of its data.
 
     Attributes:
-        chain: the robot it was identified on.
-        dynamics: the model; its values hold base parameters.
-        names, units: b strings each.
-        values, covariance: (b,), (b, b) the estimate as identified, including a prior if one was used.
-        transform: T (b, p).
-        factor: (k, b + 1) the rows [R z].
+        chain: the robot of the identification.
+        dynamics: the model with its base parameters as values.
+        names, units: names and units of the b estimated parameters.
+        values, covariance: (b,) and (b, b), the estimate as identified, including a prior if one was used.
+        transform: regrouping matrix T (b, p).
+        factor: (k, b + 1) rows [R z] of the data.
     """
 
     chain: Chain
@@ -58,7 +58,7 @@ class Information(Frozen):
 
     @property
     def best(self) -> float:
-        """The minimum of ‖R β - z‖² over all β, physically inconsistent ones included."""
+        """Minimum of ‖R β - z‖² (data's rows `factor`) over all β (b,), including physically inconsistent ones."""
         matrix = self.factor[:, :-1]
         target = self.factor[:, -1]
         unit = np.linalg.norm(matrix, axis=0)
@@ -67,7 +67,7 @@ class Information(Frozen):
         return float(np.sum((scaled @ solution - target) ** 2))
 
     def distance(self, standard: np.ndarray) -> float:
-        """Return the Mahalanobis distance of standard parameters (p,) from the data's optimum, in sigmas."""
+        """Return the Mahalanobis distance of standard parameters (p,) from the data's optimum."""
         base_values = self.transform @ standard
         residual = self.factor[:, :-1] @ base_values - self.factor[:, -1]
         square = float(residual @ residual) - self.best
@@ -75,7 +75,7 @@ class Information(Frozen):
 
 
 def of(identification: Identification, chain: Chain) -> Information:
-    """Return the information of the data of an identification in memory."""
+    """Return the information of the data of an identification (result in memory) of the robot `chain`."""
     estimate = identification.fitted.estimate
     standard = identification.dynamics.model.names
     groups = regrouping(identification.base)
@@ -96,8 +96,8 @@ def of(identification: Identification, chain: Chain) -> Information:
 def _information(identification: Identification) -> np.ndarray:
     """Return the R factor [R z] (b + 1, b + 1) of an identification's data, without prior or constraints.
 
-    Rows count as their residuals' autocorrelation lets them. The ridge of richer friction stays in: those terms have
-    no other prior.
+    Rows are weighted according to their residuals' autocorrelation. The ridges of additional friction are included,
+    since these terms have no other prior.
     """
     from calib.identification.time_folds import estimate
 
@@ -122,10 +122,14 @@ def _information(identification: Identification) -> np.ndarray:
 
 
 def read(folder: str | Path, model: tuple[Chain, Dynamics] | None = None) -> Information:
-    """Return the information of the identification stored in `folder`; `model`: its robot and model, read already.
+    """Return the information of the identification stored in `folder`.
+
+    Args:
+        folder: folder of the identification.
+        model: robot and model of this folder, if they have been read already; None: they are read here.
 
     Raises:
-        RobotError: where the folder holds none, or one of a version that did not write how parameters regroup.
+        RobotError: if the folder contains no identification, or one of a version without the regrouping matrix.
     """
     folder = Path(folder)
     chain, dynamics = model or read_dynamics(folder)
@@ -135,7 +139,7 @@ def read(folder: str | Path, model: tuple[Chain, Dynamics] | None = None) -> Inf
     with refused_as(
         RobotError,
         (OSError, KeyError, ValueError),
-        f"{folder}: estimate.csv, covariance.csv and dynamics.json do not agree: {{}}",
+        f"{folder}: estimate.csv, covariance.csv and dynamics.json do not agree: {{}}; identify again",
     ):
         parameters = read_estimate(folder)
         names = tuple(parameter.name for parameter in parameters)
@@ -154,7 +158,13 @@ def read(folder: str | Path, model: tuple[Chain, Dynamics] | None = None) -> Inf
 
 
 def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], standard: tuple[str, ...]) -> np.ndarray:
-    """Return the regrouping matrix T (b, p) of standard parameters; rows of richer friction are unit rows."""
+    """Return the regrouping matrix T (b, p) from standard parameters; rows of additional friction are unit rows.
+
+    Args:
+        names: names of the b estimated parameters.
+        groups: for each base parameter, its standard parameters and their coefficients.
+        standard: names of the p standard parameters.
+    """
     column_of = {name: column for column, name in enumerate(standard)}
     transform = np.zeros((len(names), len(standard)))
     for row, name in enumerate(names):
@@ -165,5 +175,10 @@ def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], stan
 
 
 def write(identification: Identification, folder: Path) -> None:
-    """Write the R factor of an identification's data (`_information`)."""
+    """Write the R factor [R z] of an identification's data to ``information.csv`` in `folder`.
+
+    Args:
+        identification: the result in memory.
+        folder: an existing folder.
+    """
     files.write_numbers(folder / INFORMATION, (*identification.names, "target"), _information(identification))

@@ -94,12 +94,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class _Candidate:
-    """The optimum of a cost for one prior weight.
+    """The optimum of the cost for one prior weight.
 
     Attributes:
         evidence: log p(data | γ), up to a constant.
-        gamma: the weight.
-        problem: the cost, with the data's sigmas widened.
+        gamma: prior weight γ.
+        problem: the cost, with increased sigmas of the data.
         values: (p,) the optimum.
         references: the prior bodies.
     """
@@ -117,16 +117,17 @@ class PossibleBodies(Frozen):
 
     Attributes:
         dynamics: the identified model with all its parameters.
-        covariance: (p, p) from data and prior, by the curvature at the optimum; zero where fixed.
+        covariance: (p, p) covariance from data and prior, by the curvature at the optimum; zero for fixed parameters.
         weight: weight γ of the prior.
-        doubt: factor of the data's sigmas, above 1 where no physically consistent robot is within them.
-        margins: (B,) consistency margin of each body [m], see `pseudo_inertia.margin`.
-        distance: distance of these parameters from the data's optimum, in standard deviations (Mahalanobis).
-        nearest: distance of the nearest consistent robot; 0 where the estimate itself is consistent.
-        allowed: 95 % limit of that distance for a correct model: √χ²(b).
-        blamed: labels of the bodies or names of the drive terms that cost most of `nearest`, worst first, and the
-            distance without the constraint on each; empty where it is within `allowed`.
-        source: text on the source of P⁰.
+        doubt: factor by which the data's sigmas were increased; above 1 if no physically consistent robot is within
+            them.
+        margins: (B,) margin of physical consistency of each body [m], from `pseudo_inertia.margin`.
+        distance: Mahalanobis distance of these parameters from the data's optimum, in standard deviations.
+        nearest: distance of the nearest consistent robot; 0 if the estimate itself is consistent.
+        allowed: 95 % limit of the distance for a correct model: √χ²(b).
+        blamed: bodies or drive terms whose constraints contribute most to `nearest`, worst first, each with the
+            distance without its constraint; empty if `nearest` is within `allowed`.
+        source: text on the source of the prior bodies P⁰.
         prior: one of `PRIORS`.
         notes: remarks for the engineer.
     """
@@ -146,12 +147,12 @@ class PossibleBodies(Frozen):
 
     @property
     def possible(self) -> bool:
-        """Whether a physically consistent robot lies within the estimate's confidence region."""
+        """Whether a physically consistent robot is within the estimate's confidence region."""
         return self.nearest <= self.allowed
 
 
 def bound(b: int) -> float:
-    """Return the 95 % limit of the distance of b estimated parameters from the true ones: √χ²(b)."""
+    """Return the 95 % limit √χ²(b) of the Mahalanobis distance of b estimated parameters from the true ones."""
     from scipy.special import chdtri
 
     return float(np.sqrt(chdtri(b, 0.05)))
@@ -161,12 +162,14 @@ def find_possible(information: Information, weight: float | None = None, prior: 
     """Return the full, physically consistent standard parameters of an identified model.
 
     Args:
-        information: what was identified.
-        weight: γ; None: where the evidence of the entropic prior is largest, for both.
-        prior: ``entropic``, or ``euclidean``, its second order at P⁰, with which bodies may be on the border.
+        information: identified model with the information of its data.
+        weight: prior weight γ; None: the weight with the largest evidence of the entropic prior.
+        prior: ``entropic``, or ``euclidean``, its second-order expansion at P⁰, with which bodies may be at the limit
+            of consistency.
 
     Raises:
-        UsageError: for a model without bodies (motor side alone), or a prior that is none.
+        UsageError: for a model without bodies (motor side alone), or an unknown prior.
+        NotConverged: if a solver does not converge.
     """
     one_of(prior, PRIORS, "prior", UsageError)
     model = information.dynamics.model
@@ -227,7 +230,14 @@ def find_possible(information: Information, weight: float | None = None, prior: 
 
 
 def _candidates(references: PriorBodies, problem: BodyCost, weight: float | None, doubt: float) -> Iterator[_Candidate]:
-    """Yield the optimum for each prior weight with its evidence; the data's sigmas are widened by `doubt`."""
+    """Yield the optimum and evidence for each tested prior weight; the data's sigmas are multiplied by `doubt`.
+
+    Args:
+        references: the prior bodies.
+        problem: the cost.
+        weight: the only weight γ to be used; None: several are tested.
+        doubt: factor of the sigmas.
+    """
     factor = problem.factor / doubt
     widened = replace(problem, factor=factor)
     weights: Sequence[float] = WEIGHTS[4::3]
@@ -242,11 +252,16 @@ def _candidates(references: PriorBodies, problem: BodyCost, weight: float | None
 
 
 def solve(problem: BodyCost, gamma: float, start: np.ndarray | None = None) -> np.ndarray:
-    """Return argmin of the cost (p,) by Newton's method, staying inside the cone.
+    """Return the parameters (p,) with the smallest cost, by Newton's method inside the cone of consistent bodies.
 
-    It starts at the optimum for another weight, or at the references. From far off a weak barrier makes Newton's steps
-    short, so from there all priors are as strong as the data at first and let go by factors of ten, as interior-point
-    methods do.
+    The search starts from `start`, the optimum for another weight, or from the prior bodies. Far from the optimum, the
+    weak barrier of the priors makes Newton's steps short. A search from the prior bodies therefore begins with priors
+    as strong as the data and weakens them by factors of ten, as interior-point methods do.
+
+    Args:
+        problem: the cost.
+        gamma: prior weight γ.
+        start: (p,) first parameters; None: the prior bodies.
 
     Raises:
         NotConverged: with the last parameters.
@@ -262,14 +277,24 @@ def solve(problem: BodyCost, gamma: float, start: np.ndarray | None = None) -> n
 
 
 def _reference(problem: BodyCost) -> np.ndarray:
-    """Return the standard parameters (p,) at the centre of the priors."""
+    """Return the standard parameters (p,) at which all priors are smallest.
+
+    Args:
+        problem: the cost, with prior bodies and drive terms.
+    """
     free_terms = np.where(problem.positive, problem.sizes, 0.0)
     terms = np.where(problem.sizes > 0.0, free_terms, problem.fixed)
     return np.concatenate([pseudo_inertia.to_standard(problem.references).ravel(), terms])
 
 
 def _descend(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
-    """Return the optimum by Newton's method, with steps halved until the cost decreases (Armijo)."""
+    """Return the optimum (p,) by Newton's method from `values`, with steps halved until the cost decreases (Armijo).
+
+    Args:
+        problem: the cost.
+        gamma: prior weight γ.
+        values: (p,) physically consistent parameters to start from.
+    """
     free = problem.free
     settled = SETTLED if problem.lift == 1.0 else 0.1 * problem.lift
     current_cost = cost(problem, gamma, values)
@@ -294,7 +319,13 @@ def _descend(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
 
 
 def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
-    """Return the cost J(χ) of the module's equation; infinite outside the cone."""
+    """Return the cost J(χ), data term plus prior, by the module's docstring; infinite for inconsistent parameters χ.
+
+    Args:
+        problem: the cost.
+        gamma: prior weight γ.
+        values: (p,) standard parameters χ.
+    """
     residual = problem.factor[:, :-1] @ values - problem.factor[:, -1]
     pseudo = pseudo_inertia.from_standard(_bodies(problem, values))
     definite = np.linalg.eigvalsh(_scaled(problem, pseudo))[:, 0] > 0.0
@@ -315,7 +346,13 @@ def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
 
 
 def derivatives(problem: BodyCost, gamma: float, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gradient (p,) and Hessian (p, p) of the cost."""
+    """Return gradient (p,) and Hessian (p, p) of the cost at parameters `values` (p,).
+
+    Args:
+        problem: the cost.
+        gamma: prior weight γ.
+        values: (p,) standard parameters χ.
+    """
     columns = problem.factor[:, :-1]
     target = problem.factor[:, -1]
     slope = columns.T @ (columns @ values - target)
@@ -344,7 +381,13 @@ def derivatives(problem: BodyCost, gamma: float, values: np.ndarray) -> tuple[np
 
 
 def _evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
-    """Return log p(data | γ) by Laplace's approximation, up to a constant."""
+    """Return the evidence log p(data | γ) by Laplace's approximation at the optimum `values`, up to a constant.
+
+    Args:
+        problem: the cost.
+        gamma: prior weight γ.
+        values: (p,) optimum for this weight.
+    """
     free = problem.free
     _, curvature = derivatives(problem, gamma, values)
     curvature = curvature[np.ix_(free, free)]
@@ -362,7 +405,13 @@ def _evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
 
 
 def _covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
-    """Return the inverse of the cost's curvature (p, p), zero for fixed parameters."""
+    """Return the inverse of the cost's Hessian (p, p) at `values`; zero for fixed parameters.
+
+    Args:
+        problem: the cost.
+        gamma: prior weight γ.
+        values: (p,) optimum for this weight.
+    """
     free = np.ix_(problem.free, problem.free)
     _, curvature = derivatives(problem, gamma, values)
     covariance = np.zeros((len(values), len(values)))
@@ -374,10 +423,11 @@ def _covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarr
 def _solved(curvature: np.ndarray, target: np.ndarray) -> np.ndarray:
     """Return x of `curvature` x = `target` by Cholesky, after scaling `curvature` to a unit diagonal.
 
-    What rounding leaves indefinite gets the least ridge of `RIDGES` that helps; a step by it still leads downhill.
+    A matrix that is indefinite by rounding gets the smallest ridge of `RIDGES` with which Cholesky succeeds; the
+    resulting step is still a direction of descent.
 
     Raises:
-        NotConverged: where none does.
+        NotConverged: if no ridge suffices.
     """
     unit = np.sqrt(np.diag(curvature))
     normalised = curvature / np.outer(unit, unit)
@@ -386,24 +436,42 @@ def _solved(curvature: np.ndarray, target: np.ndarray) -> np.ndarray:
             root = scipy.linalg.cho_factor(normalised + ridge * np.eye(len(unit)))
             break
     else:
-        raise NotConverged("the consistent parameters cannot be distinguished to within rounding")
+        raise NotConverged(
+            "the consistent parameters cannot be distinguished to within rounding: record a richer motion"
+        )
     scale = unit if target.ndim == 1 else unit[:, None]
     return scipy.linalg.cho_solve(root, target / scale) / scale
 
 
 def _bodies(problem: BodyCost, values: np.ndarray) -> np.ndarray:
-    """Return the standard parameters (B, 10) of the bodies among all parameters (p,)."""
+    """Return the standard parameters (B, 10) of the bodies among all parameters (p,).
+
+    Args:
+        problem: the cost, which gives the number B of bodies.
+        values: (p,) all parameters.
+    """
     return values[: 10 * problem.bodies].reshape(-1, 10)
 
 
 def _scaled(problem: BodyCost, pseudo: np.ndarray) -> np.ndarray:
-    """Return the scaled pseudo-inertia L⁻¹ P L⁻ᵀ with P⁰ = L Lᵀ: definite where P is, and of order one."""
+    """Return scaled pseudo-inertias L⁻¹ P L⁻ᵀ (B, 4, 4), P⁰ = L Lᵀ, which are of order one and definite if P is.
+
+    Args:
+        problem: the cost, with prior pseudo-inertias P⁰.
+        pseudo: (B, 4, 4) pseudo-inertias P.
+    """
     inverse = np.linalg.inv(np.linalg.cholesky(problem.references))
     return inverse @ pseudo @ inverse.transpose(0, 2, 1)
 
 
 def _notes(model: IdentificationModel, problem: BodyCost, values: np.ndarray) -> Sequence[str]:
-    """Return remarks on bodies thinner than a millimetre."""
+    """Return remarks on bodies thinner than a millimetre.
+
+    Args:
+        model: the model, which provides the bodies' names.
+        problem: the cost.
+        values: (p,) parameters.
+    """
     notes = []
     for label, body in zip(model.bodies.labels, _bodies(problem, values)):
         if pseudo_inertia.margin(body) < THIN_MARGIN:
@@ -416,11 +484,10 @@ class Contradiction:
     """Distance of an estimate from the nearest physically consistent robot.
 
     Attributes:
-        distance: distance in standard deviations (Mahalanobis); up to `MAX_TIMES` times `allowed` only an
-            approximation.
+        distance: Mahalanobis distance in standard deviations; only approximate up to `MAX_TIMES` times `allowed`.
         allowed: 95 % limit of the distance for a correct model.
-        unexplained: share of the weighted torques that the nearest consistent robot leaves unexplained beyond the
-            estimate [%].
+        unexplained: share of the weighted torques that the nearest consistent robot leaves unexplained in addition to
+            the estimate [%].
     """
 
     distance: float
@@ -429,11 +496,13 @@ class Contradiction:
 
 
 def contradiction(identification: Identification, chain: Chain) -> Contradiction | None:
-    """Return the distance of an estimate from the nearest physically consistent robot; None where no solver converged.
+    """Return the distance of an estimate from the nearest physically consistent robot.
+
+    The result is None for a model without bodies, or if no solver converged.
 
     Args:
-        identification: the estimate, of torques.
-        chain: the robot it was identified on.
+        identification: the estimate.
+        chain: the robot of the identification.
     """
     model = identification.dynamics.model
     if not isinstance(model, IdentificationModel) or not model.torque_rows.has_bodies:

@@ -1,4 +1,4 @@
-"""The survey's methods, for comparisons only."""
+"""Further methods of the survey by Leboutet et al. (2021), for comparisons only."""
 
 from calib.identification.survey.bounded_errors import GTLS, SET_MEMBERSHIP
 from calib.identification.survey.filters import CDKF, EKF, SRCDKF, SREKF, SRUKF, UKF

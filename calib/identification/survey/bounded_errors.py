@@ -1,4 +1,4 @@
-"""Errors whose size is known beforehand: that of the columns of W (generalised TLS), or no more than a bound."""
+"""Methods for errors of known size: generalised TLS (noise in the columns of W), set membership (bounded errors)."""
 
 from dataclasses import dataclass, replace
 
@@ -18,19 +18,23 @@ from calib.identification.survey.simulated_robot import serial_arm
 
 @dataclass(frozen=True)
 class _GeneralisedTLS(Method):
-    """Total least squares with the covariance of each row's errors, from the noise of the encoders."""
+    """Generalised total least squares (TLS): each row's errors have the covariance that follows from encoder noise."""
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return x of Σ_k (W_kᵀ Ω⁻¹ W_k - C_k) x = Σ_k W_kᵀ Ω⁻¹ y_k.
 
-        C_k = E[ΔW_kᵀ Ω⁻¹ ΔW_k] = Σ_i D_kiᵀ G D_ki / σ_i², D_ki the slopes of row i of W by q, v, a, and G the
-        covariance of their noise (`maximum_likelihood.noise_of_states`). It is the smallest generalised singular vector
-        of [W y] at the torque noise that the residuals have (Van Huffel & Vandewalle 1989; Fuller 1987, section 2.2).
-        Covariance: theorem 2.2.1 there, with autocorrelated residuals. `ml` weighs each sample by its own noise and is
-        nearer the truth where that is large.
+        W_k and y_k are regressor and torques of sample k, Ω is the covariance of the torque noise. C_k = E[ΔW_kᵀ Ω⁻¹
+        ΔW_k] = Σ_i D_kiᵀ G D_ki / σ_i², where D_ki are the derivatives of row i of W by q, v, a, and G is the
+        covariance of their noise (`maximum_likelihood.noise_of_states`). x is the smallest generalised singular vector
+        of [W y] for the torque noise of the residuals (Van Huffel & Vandewalle 1989; Fuller 1987, section 2.2). The
+        covariance is that of theorem 2.2.1 there, with autocorrelated residuals. The method `ml` weights each sample by
+        its own noise and is more accurate if that noise is large.
+
+        Args:
+            problem: data and settings.
 
         Raises:
-            UsageError: for a model whose rows have no slopes by q, v and a.
+            UsageError: for a model whose rows have no derivatives by q, v and a.
         """
         model = serial_arm(problem, self)
         return attempted(self.name, problem, lambda: self._estimate(problem, model))
@@ -73,7 +77,12 @@ class _GeneralisedTLS(Method):
 
 
 def column_noise(states: NoisyStates, std: np.ndarray) -> np.ndarray:
-    """Return C = Σ_k E[ΔW_kᵀ Ω⁻¹ ΔW_k] (p, p) of the noise in q, v and a, Ω from std (rows,)."""
+    """Return C = Σ_k E[ΔW_kᵀ Ω⁻¹ ΔW_k] (p, p) due to the noise in q, v and a, where Ω = diag(std²), std (rows,).
+
+    Args:
+        states: all samples with noisy states; ΔW_k is the error of the regressor of sample k.
+        std: (rows,) standard deviations of the torques' noise [N m or N].
+    """
     p = states.matrix.shape[2]
     total = np.zeros((p, p))
     for part in states.parts:
@@ -96,14 +105,17 @@ ROUNDS = 4
 
 @dataclass(frozen=True)
 class _SetMembership(Method):
-    """Intervals of the parameters under which no torque error exceeds a bound, and their centres."""
+    """Set membership: parameter intervals for which no torque error exceeds a bound; estimates are the centres."""
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the centres of the parameters' intervals over {x : |y - W x| <= e}; σ is half an interval over √3.
 
-        e of each joint is the largest residual of weighted least squares, so that its estimate is one of the set (our
-        choice; Milanese & Belforte 1982 are given e). If no torque error is larger, the intervals hold the true values
-        for certain, and are wide for that: 20 to 130 σ of weighted least squares in white noise.
+        The bound e of each joint is the largest residual of weighted least squares, so that its estimate is in the set
+        (our choice; Milanese & Belforte 1982 assume a given e). If no torque error is larger, the intervals certainly
+        contain the true values; they are wide: 20 to 130 σ of weighted least squares in white noise.
+
+        Args:
+            problem: data and settings.
         """
         return attempted(self.name, problem, lambda: self._estimate(problem))
 
@@ -128,14 +140,17 @@ class _SetMembership(Method):
 
 
 def intervals(rows: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Return the lower and upper ends (p,) of every parameter over {x : |y - A x| <= 1}, and the number of rounds.
+    """Return the ends of every parameter's interval over {x : |y - A x| <= 1}, and the number of iterations.
 
-    Two linear programs per parameter, on rows that the last round's optima violate: what is left out makes the
-    intervals wider and never excludes a possible value.
+    There are two linear programs per parameter, with rows that the optima of the last iteration violate. Rows that are
+    not used make the intervals wider, but never exclude a possible value.
 
     Args:
         rows: A (r, p), in units of the bound.
-        ends: y (r,), |y| <= 1: x = 0 is in the set.
+        ends: y (r,) with |y| <= 1, so that x = 0 is in the set.
+
+    Returns:
+        lower ends (p,), upper ends (p,), and number of iterations.
     """
     from scipy.optimize import linprog
 
@@ -179,7 +194,7 @@ GTLS = _GeneralisedTLS(
 SET_MEMBERSHIP = _SetMembership(
     "set-membership",
     "no torque error is larger than the largest residual of wls; q, v and a are exact",
-    description="centres of the intervals that a bound on the errors leaves",
+    description="centres of the parameter intervals that agree with a bound on the torque errors",
     source="Milanese & Belforte 1982; Ramdani & Poignet 2005",
     tunes=("bound of the errors", f"{ROUNDS} rounds of linear programs"),
 )

@@ -1,18 +1,19 @@
 """The survey's nonlinear Kalman filters on the direct dynamic model, with parameters as states.
 
-    state x = [q, v, χ],   q, v ← one step under the measured torques with parameters χ,   χ ← χ,   seen: q
+    state x = [q, v, χ],   q, v ← one step under the measured torques with parameters χ,   χ ← χ,   measured: q
 
-(Gautier & Poignet 2001; Leboutet et al. 2021, section 6.1). One pass over all recordings; the robot alone is simulated,
-so no controller is asked for. Settings that the survey tunes by hand are determined by the data or follow from the
-model (our choices):
+(Gautier & Poignet 2001; Leboutet et al. 2021, section 6.1). The filter makes one pass over all recordings. The robot
+alone is simulated, so that no controller is needed. Settings that the survey tunes by hand are determined by the data
+or follow from the model (our choices):
 
-* noise of q: the level of each log's spectrum, the filtered log thinned to `rate_factor` times its cut-off; * process
-noise: that of the torques, by the residuals of weighted least squares, through ½ T² M⁻¹ and T M⁻¹; * parameters have
-none: they are constants, and a filter that knows its other noise needs none to converge; * they start where
-`simulated_robot.start_of` says, with a standard deviation of `start_sigmas` times that of least squares, or of their
-distance from least squares if that is larger: little information compared with that of a pass.
+* Noise of q: the level of each log's spectrum; the filtered log is decimated to `rate_factor` times its cut-off.
+* Process noise: that of the torques, from the residuals of weighted least squares, through ½ T² M⁻¹ and T M⁻¹.
+* Parameters have no process noise: they are constants, and a filter with correct other noise needs none to converge.
+* Start values of the parameters are those of `simulated_robot.start_of`. Their standard deviation is `start_sigmas`
+  times that of least squares, or their distance from least squares if that is larger: little information compared with
+  that of a pass.
 
-Where innovations are larger than the filter predicts, the covariance is widened by their mean square.
+If innovations are larger than the filter predicts, the covariance is multiplied by their mean square.
 """
 
 from collections.abc import Iterator
@@ -39,7 +40,7 @@ class _KalmanFilter(Method):
     """Identification by a Kalman filter whose states include the parameters.
 
     Attributes:
-        kind: rule of the filter and form of its covariance.
+        kind: rule of the filter, and form of its covariance.
     """
 
     needs_simulation: bool = field(default=True, kw_only=True)
@@ -49,10 +50,13 @@ class _KalmanFilter(Method):
     kind: Filter
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the parameters after the last sample.
+        """Return the estimate of the parameters after the last sample.
+
+        Args:
+            problem: data and settings.
 
         Raises:
-            UsageError: for a model that is no serial arm with motor torques.
+            UsageError: for a model other than a serial arm with motor torques.
         """
         plain = WLS.estimate(problem)
         if not plain.found:
@@ -83,7 +87,8 @@ class _KalmanFilter(Method):
         max_innovation = 30.0
         if not np.isfinite(innovation) or innovation > max_innovation:
             raise Diverged(
-                f"{self.name} diverged: its innovations are {np.sqrt(innovation):.3g} times the predicted ones",
+                f"{self.name} diverged: its innovations are {np.sqrt(innovation):.3g} times the predicted ones; use "
+                "another method",
                 state.mean,
             )
         covariance = max(1.0, innovation) * state.covariance
@@ -103,7 +108,15 @@ class _KalmanFilter(Method):
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Parameters and their covariance between recordings, with the sizes of past innovations."""
+    """Parameters of the filter between recordings.
+
+    Attributes:
+        robot: the simulated robot.
+        kind: rule of the filter, and form of its covariance.
+        mean, covariance: (p,) and (p, p) of the parameters.
+        sizes: sizes of past innovations.
+        count: number of segments processed.
+    """
 
     robot: BelievedRobot
     kind: Filter
@@ -114,7 +127,11 @@ class _State:
 
 
 def _inertia(problem: IdentificationProblem) -> np.ndarray:
-    """Return the mean inertia (n,) of each joint, from the regression of torques on accelerations."""
+    """Return the mean inertia (n,) of each joint, from the regression of its torque on its acceleration.
+
+    Args:
+        problem: data and settings, with the recordings.
+    """
     n = problem.cases[0].motion.n
     cross = np.zeros(n)
     size = np.full(n, 1e-12)
@@ -128,7 +145,16 @@ def _inertia(problem: IdentificationProblem) -> np.ndarray:
 
 
 def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndarray) -> None:
-    """Compute accelerations along the recordings; raise if the robot cannot be simulated."""
+    """Compute accelerations along the recordings, to check that a robot with parameters `values` can be simulated.
+
+    Args:
+        robot: model that is simulated.
+        problem: data and settings, with the recordings.
+        values: (p,) parameters.
+
+    Raises:
+        CalibError: if it cannot.
+    """
     for case in problem.cases:
         part = slice(None, None, max(1, len(case.motion) // 200))
         q = case.motion.q[part]
@@ -137,9 +163,14 @@ def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndar
 
 
 def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield each sample q (n,) of a segment, and the mean torques (s, n) of s equal steps since the last sample.
+    """Yield the samples that the filter uses, with the torques between them.
 
-    `max_step`: [s] of a step of the dynamics.
+    Each is a position q (n,), and the mean torques (s, n) in s equal time steps since the last sample.
+
+    Args:
+        case: the recording.
+        part: slice of a gap-free segment.
+        max_step: longest time step of the dynamics [s].
     """
     motion = case.motion
     thin = _thin(case)
@@ -166,7 +197,14 @@ def _thin(case: Case, rate_factor: float = 4.0) -> int:
 
 
 def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
-    """Return the state after a segment of a recording."""
+    """Return the filter's parameters after a segment of a recording; unchanged if the segment is too short.
+
+    Args:
+        before: parameters before the segment.
+        case: the recording.
+        part: slice of the segment.
+        noise: (n,) standard deviation of the torque noise of a sample [N m or N].
+    """
     motion = case.motion
     thin = _thin(case)
     n = case.motion.n
@@ -194,7 +232,12 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     for q, tau in _steps(case, part):
         belief = full.step(belief, np.ascontiguousarray(tau), period / len(tau), torque)
         belief, size = corrected(belief, q, n, position_noise)
-        require(np.isfinite(size), "the filter's estimate is no longer finite", Diverged, belief.mean)
+        require(
+            np.isfinite(size),
+            "the filter diverged: its estimate is not finite; use another method",
+            Diverged,
+            belief.mean,
+        )
         sizes.append(size / n)
     settled = sizes[len(sizes) // 4 :]
     mean = belief.mean[2 * n :]
@@ -205,7 +248,13 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
 
 
 def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
-    """Return a belief's spread (covariance or root) with its parameter block replaced by that of a covariance."""
+    """Return a belief's spread (covariance or its root) with the block of the parameters replaced.
+
+    Args:
+        belief: mean and covariance of the state.
+        parameters: (p, p) covariance of the parameters.
+        first: index of the first parameter in the state.
+    """
     spread = np.array(belief.spread)
     if belief.root:
         spread[first:, first:] = np.linalg.cholesky(parameters)
@@ -216,7 +265,16 @@ def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class _Stepping:
-    """One step of the robot for a filter, with n joints and the plant's parameters, of which `columns` are states."""
+    """Prediction step of a filter, with the simulated robot.
+
+    Attributes:
+        stepper: robot that is advanced in time.
+        kind: rule of the filter, and form of its covariance.
+        n: number of joints.
+        size: number of the simulated robot's parameters.
+        columns: indices of those parameters that are states.
+        carried: factors of these parameters: 0 for payloads that are not attached, otherwise 1.
+    """
 
     stepper: Stepper
     kind: Filter
@@ -228,8 +286,14 @@ class _Stepping:
     def step(self, before: Belief, tau: np.ndarray, period: float, torque: np.ndarray) -> Belief:
         """Return the predicted belief after torques tau (s, n), each held for one period.
 
+        Args:
+            before: belief before the step.
+            tau: (s, n) torques [N m or N].
+            period: duration of each torque [s].
+            torque: (n,) standard deviation of the torque noise [N m or N].
+
         Raises:
-            CannotSimulate: where not even points near the mean are robots.
+            CannotSimulate: if not even sigma points near the mean can be simulated.
         """
         n = self.n
         if self.kind.rule == "ekf":
@@ -266,13 +330,20 @@ class _Stepping:
         raise CannotSimulate(f"a robot with the filter's parameters cannot be simulated: {failure}", before.mean)
 
     def _values(self, states: np.ndarray) -> np.ndarray:
-        """Return the plant's parameters (K, p) of states (K, L)."""
+        """Return the simulated robot's parameters (K, p) for states (K, L) of the filter."""
         result = np.zeros((len(states), self.size))
         result[:, self.columns] = states[:, 2 * self.n :] * self.carried
         return result
 
     def _noise(self, gain: np.ndarray, period: float, torque: np.ndarray, size: int) -> np.ndarray:
-        """Return the effect N (L, n) of torque noise on the state in one step."""
+        """Return the effect N (L, n) of torque noise on the state during one step, with L = `size`.
+
+        Args:
+            gain: (n, n) M⁻¹, inverse of the inertia matrix.
+            period: duration of the step [s].
+            torque: (n,) standard deviation of the torque noise.
+            size: number L of components of the state.
+        """
         result = np.zeros((size, self.n))
         result[: self.n] = 0.5 * period**2 * gain * torque
         result[self.n : 2 * self.n] = period * gain * torque
@@ -292,14 +363,24 @@ _DESCRIPTIONS = {
 
 
 def _filter(rule: str, source: str) -> _KalmanFilter:
-    """Return the method of a rule that keeps the covariance."""
+    """Return the method of a rule in the form that stores the covariance.
+
+    Args:
+        rule: ``ekf``, ``ukf`` or ``cdkf``.
+        source: authors and year.
+    """
     tuned = (*_TUNED, "α = 0.1") if rule == "ukf" else _TUNED
     description = _DESCRIPTIONS[rule]
     return _KalmanFilter(rule, _ASSUMES, Filter(rule, False), source=source, description=description, tunes=tuned)
 
 
 def _root_filter(plain: _KalmanFilter, source: str) -> _KalmanFilter:
-    """Return the method of the same rule that keeps the root of the covariance."""
+    """Return the square-root form of a filter method, which stores the root of the covariance.
+
+    Args:
+        plain: the method that stores the covariance.
+        source: authors and year of the square-root form.
+    """
     root = Filter(plain.kind.rule, True)
     return replace(plain, name=f"sr{plain.name}", kind=root, source=source, description="the same, square-root form")
 

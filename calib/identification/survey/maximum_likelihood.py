@@ -1,19 +1,19 @@
-"""Maximum likelihood with noisy positions: errors in variables, each sample weighted by its propagated noise.
+"""Maximum likelihood with noisy positions (errors in variables): each sample is weighted by its propagated noise.
 
-What a sample leaves, r_k = y_k - W(x_k) β with x = (q, v, a) as measured, has to first order the covariance
+The residual of a sample, r_k = y_k - W(x_k) β with x = (q, v, a) as measured, has to first order the covariance
 
     S_k(β) = Σ_τ + B_k G B_kᵀ,    B_k = ∂(W β)/∂x at sample k,
 
-G the covariance of the filtered q, v, a of a joint, from the level σ_q of its white noise and the impulse responses of
-low-pass, differences and decimation. The true states are nuisance parameters; with them concentrated out, minus twice
-the logarithm of the likelihood is Σ_k r_kᵀ S_k(β)⁻¹ r_k, whose slope by β vanishes where
+where G is the covariance of the filtered q, v, a of a joint. G follows from the level σ_q of the white position noise
+and the impulse responses of low-pass, differences and decimation. The true states are nuisance parameters. After their
+elimination, minus twice the logarithm of the likelihood is Σ_k r_kᵀ S_k(β)⁻¹ r_k, whose gradient by β vanishes for
 
-    Σ_k W(x̂_k)ᵀ S_k⁻¹ (y_k - W(x_k) β) = 0,    x̂_k = x_k + G B_kᵀ S_k⁻¹ r_k    (Fuller 1987, section 3.2)
+    Σ_k W(x̂_k)ᵀ S_k⁻¹ (y_k - W(x_k) β) = 0,    x̂_k = x_k + G B_kᵀ S_k⁻¹ r_k    (Fuller 1987, section 3.2),
 
-with x̂ the states as the fit corrects them: weighted least squares puts W(x_k) there and shrinks what is noisy.
-(Leboutet et al. 2021, section 4.2, after Olsen, Swevers & Verdonck 2002, who are given the noise; here σ_q is read from
-each log's spectrum and Σ_τ is what makes Σ S_k⁻¹ r_k r_kᵀ S_k⁻¹ = Σ S_k⁻¹ on its diagonal, which is its own likelihood
-equation.)
+where x̂ are the states as corrected by the fit. (Weighted least squares uses W(x_k) instead, and so underestimates
+parameters of noisy columns.) The method is that of Leboutet et al. 2021, section 4.2, after Olsen, Swevers & Verdonck
+2002, who assume known noise. Here σ_q is estimated from each log's spectrum, and the diagonal Σ_τ from Σ S_k⁻¹ r_k r_kᵀ
+S_k⁻¹ = Σ S_k⁻¹ on the diagonal, which is its likelihood equation.
 """
 
 from dataclasses import dataclass, replace
@@ -43,14 +43,14 @@ class _MaximumLikelihood(Method):
     """Identification by maximum likelihood with errors in variables."""
 
     def takes(self, rows: TorqueRows) -> bool:
-        """Return whether it estimates from these torque rows: from those of the motors alone."""
+        """Return whether the method supports these torque rows: only motor torques are supported."""
         return rows.motors_alone
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the problem's columns, with the torque noise as weights.
+        """Return the estimate of the problem's columns, with the estimated torque noise as row weights.
 
         Raises:
-            UsageError: for a model whose rows have no slopes by q, v and a.
+            UsageError: for a model whose rows have no derivatives by q, v and a.
         """
         model = serial_arm(problem, self)
         return attempted(self.name, problem, lambda: self._estimate(problem, model))
@@ -74,12 +74,16 @@ class _MaximumLikelihood(Method):
             steps.append(float(np.max(relative_steps)))
             values = iteration.values
             if not np.all(np.isfinite(values)) or (count > 5 and steps[-1] > 10.0 * steps[0]):
-                raise Diverged("maximum likelihood diverged: too much position noise for a linear model", values)
+                raise Diverged(
+                    "maximum likelihood diverged: too much position noise for a linear model; use another method",
+                    values,
+                )
             if steps[-1] < tolerance:
                 break
         else:
             raise NotConverged(
-                f"maximum likelihood still changes by {steps[-1]:.2g} standard deviations after {max_steps} rounds",
+                f"maximum likelihood still changes by {steps[-1]:.2g} standard deviations after {max_steps} rounds; "
+                "use another method",
                 values,
             )
         solution = _packed(problem, iteration, noise)
@@ -98,13 +102,14 @@ class _MaximumLikelihood(Method):
 
 @dataclass(frozen=True, eq=False)
 class _Recording:
-    """States of one recording at the kept samples, with their noise.
+    """States of one recording at its decimated samples, with their noise.
 
     Attributes:
-        own: its samples among all.
-        q, v, a: (M, n) states at the kept samples, not filtered by the decimation.
-        noise: (n, 3, 3) G of each joint.
-        present: (p,) one for columns of bodies on board.
+        own: slice of the recording's samples among all samples.
+        q, v, a: (M, n) states, not filtered by the decimation.
+        noise: (n, 3, 3) covariance G of q, v, a of each joint.
+        carried: labels of the attached payloads.
+        present: (p,) factors of the columns: 0 for payloads that are not attached, otherwise 1.
     """
 
     own: slice
@@ -118,7 +123,17 @@ class _Recording:
 
 @dataclass(frozen=True, eq=False)
 class NoisyStates:
-    """All samples: matrix (M, n, p), target and rows in use (M, n), recordings, and differentiable columns."""
+    """All samples of a problem with noisy states.
+
+    Attributes:
+        model: model with all friction terms.
+        columns: (p,) indices of the model's columns.
+        smooth: (p,) mask of columns that can be differentiated by q, v and a.
+        matrix: (M, n, p) observation matrix.
+        target: (M, n) torques [N m or N].
+        present: (M, n) mask of rows in use.
+        parts: states of each recording.
+    """
 
     model: IdentificationModel
     columns: np.ndarray
@@ -130,7 +145,12 @@ class NoisyStates:
 
 
 def noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> NoisyStates:
-    """Return all samples of a problem, with the covariance of the noise in q, v and a."""
+    """Return all samples of a problem, with the covariance of the noise in q, v and a of each recording.
+
+    Args:
+        problem: data and settings.
+        model: model with all friction terms.
+    """
     samples, (model, columns) = samples_of(problem), with_friction(problem, model)
     is_smooth = [term is None or term.form.slopes for term in problem.terms]
     smooth = np.array(is_smooth, dtype=bool)
@@ -154,7 +174,12 @@ def noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> 
 def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
     """Return the covariance (n, 3, 3) of q, v, a of each joint, propagated from white position noise.
 
-    From the impulse response of low-pass, differences and decimation; the noise's level is that of the log's spectrum.
+    It is computed from the impulse responses of low-pass, differences and decimation; the noise level is that of the
+    log's spectrum.
+
+    Args:
+        motion: motion of one recording, with its filters.
+        decimator: filter and decimation of the rows.
     """
     result = np.empty((motion.n, 3, 3))
     cutoffs = np.stack([motion.cutoff, motion.velocity_cutoff], axis=1)
@@ -174,7 +199,13 @@ def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
 
 
 def _slopes(task: NoisyStates, part: _Recording, values: np.ndarray) -> np.ndarray:
-    """Return B (M, n, 3, n), the Jacobian of W β with respect to q, v and a of each joint."""
+    """Return B (M, n, 3, n): the derivatives of the torques W β (first n) by q, v and a of each joint (3, n).
+
+    Args:
+        task: all samples.
+        part: states of one recording, with M samples.
+        values: β (p,), parameters.
+    """
     differentiable = task.smooth & (part.present > 0.0)
     order = np.argsort(task.columns[differentiable])
     columns = task.columns[differentiable][order]
@@ -195,7 +226,13 @@ def _slopes(task: NoisyStates, part: _Recording, values: np.ndarray) -> np.ndarr
 
 
 def _residuals(task: NoisyStates, part: _Recording, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the residuals r (M, n), and G Bᵀ (M, 3, n, n) and B G Bᵀ (M, n, n), of a recording."""
+    """Return the residuals r (M, n) of a recording, with G Bᵀ (M, 3, n, n) and B G Bᵀ (M, n, n).
+
+    Args:
+        task: all samples.
+        part: states of one recording, with M samples.
+        values: (p,) parameters; B are the derivatives of the torques by q, v, a, and G is the covariance of these.
+    """
     by_state = _slopes(task, part, values)
     spread = np.einsum("kxj,mrxj->mkjr", part.noise.transpose(1, 2, 0), by_state)
     residual = task.target[part.own] - task.matrix[part.own] @ values
@@ -204,7 +241,13 @@ def _residuals(task: NoisyStates, part: _Recording, values: np.ndarray) -> tuple
 
 
 def _inverse(position_part: np.ndarray, noise: np.ndarray, in_use: np.ndarray) -> np.ndarray:
-    """Return the inverse (M, n, n) of S = Σ_τ + position_part for the rows in use (M, n); zero for other rows."""
+    """Return the inverse (M, n, n) of S = Σ_τ + B G Bᵀ for the rows in use; zero for other rows.
+
+    Args:
+        position_part: B G Bᵀ (M, n, n).
+        noise: (n,) diagonal of Σ_τ.
+        in_use: (M, n) mask of rows in use.
+    """
     pairs = in_use[:, :, None] & in_use[:, None, :]
     full = position_part + np.diag(noise)
     covariance = np.where(pairs, full, np.eye(len(noise)))
@@ -212,7 +255,14 @@ def _inverse(position_part: np.ndarray, noise: np.ndarray, in_use: np.ndarray) -
 
 
 def _torque_noise(task: NoisyStates, values: np.ndarray, noise: np.ndarray, minimum: np.ndarray) -> np.ndarray:
-    """Return the maximum likelihood torque noise Σ_τ (n,) for fixed parameters and position noise."""
+    """Return the most likely torque noise, the diagonal of Σ_τ (n,), for fixed parameters and position noise.
+
+    Args:
+        task: all samples.
+        values: (p,) parameters.
+        noise: (n,) first values.
+        minimum: (n,) lower bounds.
+    """
     residuals = []
     position_parts = []
     for part in task.parts:
@@ -238,7 +288,13 @@ def _torque_noise(task: NoisyStates, values: np.ndarray, noise: np.ndarray, mini
 
 @dataclass(frozen=True, eq=False)
 class _Round:
-    """One round: parameters (p,), (Σ W(x̂)ᵀ S⁻¹ W)⁻¹, and S^(-½) times W(x̂) (M, n, p) and r (M, n) of each recording."""
+    """Result of one iteration.
+
+    Attributes:
+        values: (p,) parameters.
+        bread: (p, p) inverse of Σ W(x̂)ᵀ S⁻¹ W.
+        white, residual: for each recording, S^(-½) times W(x̂) (M, n, p), and S^(-½) times r (M, n).
+    """
 
     values: np.ndarray
     bread: np.ndarray
@@ -247,13 +303,19 @@ class _Round:
 
     @property
     def sigma(self) -> np.ndarray:
-        """Standard deviations (p,) for white residuals."""
+        """Standard deviations (p,) of the parameters, as for white residuals."""
         squares = [np.sum((white @ self.bread.T) ** 2, axis=(0, 1)) for white in self.white]
         return np.sqrt(sum(squares))
 
 
 def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
-    """Return the next round of the iteration, from parameters (p,) and torque noise (n,)."""
+    """Return the next iteration's result, from parameters (p,) and torque noise (n,).
+
+    Args:
+        task: all samples.
+        values: (p,) parameters.
+        noise: (n,) variance of the torque noise.
+    """
     p = len(values)
     cross = np.zeros((p, p))
     score = np.zeros(p)
@@ -280,7 +342,15 @@ def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
 
 
 def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarray:
-    """Return W(x + error) - W(x) (M, n, p) at the kept samples, error (M, 3, n); zero where there is no derivative."""
+    """Return the change W(x + error) - W(x) (M, n, p) of the regressor W for errors of the states x.
+
+    It is zero in columns without derivative.
+
+    Args:
+        task: all samples.
+        part: states x of one recording, with M samples.
+        error: (M, 3, n) errors of q, v and a.
+    """
     out = np.zeros_like(task.matrix[part.own])
     smooth = np.flatnonzero(task.smooth)
     for start in range(0, len(part.q), BLOCK):
@@ -301,7 +371,13 @@ def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarra
 
 
 def _packed(problem: IdentificationProblem, iteration: _Round, noise: np.ndarray) -> LinearFit:
-    """Return the fit of the last round; its covariance allows for residuals correlated in time."""
+    """Return the fit of the last iteration; its covariance accounts for autocorrelated residuals.
+
+    Args:
+        problem: data and settings.
+        iteration: result of the last iteration.
+        noise: (n,) variance of the torque noise.
+    """
     std = np.sqrt(noise)
     plain = wls(problem.pooled, std)
     p = len(iteration.values)

@@ -1,10 +1,10 @@
-"""Least squares by two neural networks, as the survey has them: an adaptive linear neuron, and a Hopfield-Tank network.
+"""Least squares by two neural networks of the survey: an adaptive linear neuron, and a Hopfield-Tank network.
 
-Both go towards the minimum of ‖y - W x‖², ordinary least squares, by gradients that are not scaled, for a set number of
-steps, and do not arrive where W is badly conditioned: slow directions stay near the start. Both start from the
-problem's start values, or from zero without any. What remains between them and ordinary least squares, d = x - x_ols,
-is their error of training: the covariance is that of x_ols plus d dᵀ (an efficient estimate is uncorrelated with what
-another one differs by: Hausman 1978).
+Both approach the minimum of ‖y - W x‖² (ordinary least squares) by unscaled gradients for a set number of steps. If W
+is ill-conditioned they do not reach it: slowly converging directions remain near the start. Both begin with the
+problem's start values, or with zero without any. Their difference from ordinary least squares, d = x - x_ols, is the
+training error. The covariance is that of x_ols plus d dᵀ (an efficient estimate is uncorrelated with the difference of
+another estimate from it: Hausman 1978).
 """
 
 from dataclasses import dataclass, field, replace
@@ -28,14 +28,15 @@ def adaline(data: Samples, start: np.ndarray, rate: float = 1.0, steps: int = ST
 
         x ← x + η (rᵀ r) / ‖W_k r‖² r,    r = W_kᵀ (y_k - W_k x)
 
-    stochastic gradients with a line search for each sample (Widrow & Hoff 1960; Leboutet et al. 2021): the
-    last samples decide, and the weights keep moving with the noise.
+    These are stochastic gradients with a line search for each sample (Widrow & Hoff 1960; Leboutet et al. 2021). The
+    last samples have most influence, and the weights keep changing with the noise.
 
     Args:
         data: N samples.
-        start: (p,) initial weights.
+        start: (p,) first weights.
         rate: η; 1 minimises a sample's residual along its gradient.
-        steps: samples seen; each once before any comes back.
+        steps: number of samples used; each is used once before any is used again.
+        seed: seed of the random order.
     """
     matrix = np.where(data.present[:, :, None], data.matrix, 0.0)
     target = np.where(data.present, data.target, 0.0)
@@ -56,21 +57,24 @@ def adaline(data: Samples, start: np.ndarray, rate: float = 1.0, steps: int = ST
 def hopfield(
     factor: np.ndarray, start: np.ndarray, bound: float, rate: float = 1.0, steps: int = STEPS
 ) -> tuple[np.ndarray, int]:
-    """Return the outputs x (p,) of a Hopfield-Tank network, and the number of steps until it rests, at most `steps`.
+    """Return the outputs x (p,) of a Hopfield-Tank network, and the number of steps until it is at rest.
 
         u̇ = -Wᵀ W x + Wᵀ y,    x = α tanh(u / 5)
 
-    by Euler steps (Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004; Leboutet et al. 2021). At rest x is ordinary
-    least squares, if no neuron saturates. The survey tunes the step by robot, 3e-8 to 1e-6; here it is half of what is
-    stable, times `rate` (our choice).
+    by Euler steps, with W (r, p) the observation matrix and y (r,) the torques (Tank & Hopfield 1986; Atencia, Joya &
+    Sandoval 2004; Leboutet et al. 2021). At rest x is the ordinary least-squares estimate, if no neuron is saturated.
+    The survey tunes the step for each robot, 3e-8 to 1e-6; here it is half of the largest stable step, times `rate`
+    (our choice).
 
     Args:
-        factor: (p + 1, p + 1) triangle [R z; 0 ρ] of [W y], not weighted.
-        start: (p,) initial x.
-        bound: α, above all |x|.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of [W y], not weighted.
+        start: (p,) first x.
+        bound: α, larger than all |x|.
+        rate: factor of the step.
+        steps: largest number of steps.
 
     Raises:
-        NotConverged: where a neuron saturates: x is then a bound and no estimate.
+        NotConverged: if a neuron is saturated; x is then at the bound and no estimate.
     """
     p = len(start)
     weights = factor[:p, :p].T @ factor[:p, :p]
@@ -100,11 +104,11 @@ def hopfield(
 
 @dataclass(frozen=True)
 class _Network(Method):
-    """Identification by a network trained towards ordinary least squares.
+    """Identification by a network that is trained towards ordinary least squares.
 
     Attributes:
-        rate: step, times the survey's (adaline) or half the stable one (hopfield).
-        steps: at most.
+        rate: factor of the step: of the survey's step (adaline), or of half the largest stable one (hopfield).
+        steps: largest number of steps.
     """
 
     tunes: tuple[str, ...] = field(default=("learning rate", f"{STEPS:,} steps"), kw_only=True)
@@ -114,7 +118,11 @@ class _Network(Method):
     steps: int = STEPS
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the trained network; its covariance includes the error of training."""
+        """Return the estimate of the trained network; its covariance includes the training error.
+
+        Args:
+            problem: data and settings.
+        """
         return attempted(self.name, problem, lambda: self._estimate(problem))
 
     def _estimate(self, problem: IdentificationProblem) -> MethodEstimate:
@@ -135,7 +143,12 @@ class _Network(Method):
         )
 
     def trained(self, problem: IdentificationProblem, start: np.ndarray) -> tuple[np.ndarray, int]:
-        """Return the network's weights (p,) from a start, and its steps."""
+        """Return the network's weights (p,) after training from start values (p,), and the number of steps.
+
+        Args:
+            problem: data and settings.
+            start: (p,) first weights.
+        """
         raise NotImplementedError
 
 
@@ -158,7 +171,13 @@ class _Hopfield(_Network):
 
 
 def _off(fit: LinearFit, values: np.ndarray, group_std: np.ndarray) -> LinearFit:
-    """Return a fit moved to other values (p,), with its covariance enlarged by the distance."""
+    """Return a fit with other values (p,), with the outer product of their differences added to its covariance.
+
+    Args:
+        fit: the fit of ordinary least squares.
+        values: (p,) other values.
+        group_std: standard deviations of their residuals, by torque row.
+    """
     away = values - fit.estimate.values
     covariance = fit.estimate.covariance + np.outer(away, away)
     estimate = replace(fit.estimate, values=values, covariance=covariance)

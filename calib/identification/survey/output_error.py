@@ -1,20 +1,28 @@
-"""Output and input error of the simulated closed loop: the survey's CLOE and CLIE, with exact sensitivities.
+"""Output and input error of the simulated closed loop: the survey's CLOE and CLIE, with exact derivatives.
 
-    CLOE    min Σ_k ‖q_k - q_s,k(χ)‖²        the robot that moves as the real one does
-    CLIE    min Σ_k ‖tau_k - tau_s,k(χ)‖²    the robot whose controller asks for the same torques
+    CLOE    min Σ_k ‖q_k - q_s,k(χ)‖²        the simulated robot moves as the real one
+    CLIE    min Σ_k ‖tau_k - tau_s,k(χ)‖²    the simulated robot's controller requires the recorded torques
 
-With joint torque sensors (rows link, both) both compare their torques too, which are an output of the loop: simulated
-ones are those of the bodies and the link side along the simulated motion, filtered like the recorded one (our choice).
+q_s and tau_s are those of the simulated loop (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau
+1979; Gautier, Janot & Vandanjon 2013), and each joint is weighted by its residuals. With joint torque sensors (rows
+link, both) both methods also compare the sensors' torques, which are outputs of the loop: simulated torques are those
+of the bodies and the link side along the simulated motion, filtered like the recorded motion (our choice).
 
-q_s and tau_s of the loop simulated without noise (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau 1979;
-Gautier, Janot & Vandanjon 2013), each joint weighted by its residuals. Damped Gauss–Newton steps need ∂q_s/∂χ and
-∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`) where differences take one
-simulation per parameter, as they do for parallel robots. Torques of redundant actuators are compared on the platform's
-coordinates, as least squares takes them. The residuals are the effect of noise in the loop, correlated over time; the
-covariance H⁻¹ S H⁻¹ accounts for this, with S the scatter of the scores (`score_covariance`).
+Damped Gauss–Newton steps need ∂q_s/∂χ and ∂tau_s/∂χ. Here these are the tangents of the simulation, computed in one
+pass (`tangent_kernels`); differences, which parallel robots use, need one simulation per parameter. Torques of
+redundant actuators are compared in the platform's coordinates, as in least squares. The residuals are the effect of
+noise in the loop and autocorrelated; the covariance H⁻¹ S H⁻¹ accounts for this, with S the covariance of the gradient
+(`score_covariance`).
 
-What slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is the survey's DIDIM; so it is here.
+The source simulates without noise. If the torques show noise in the recording's loop (`sign_noise`), the mean of two
+runs with opposite noise is taken here, because an arm that shakes has less Coulomb friction in the mean (our choice).
+Robots without tangents are simulated without noise.
+
+The method that some slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is DIDIM in the survey and
+here.
 """
+
+from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
@@ -30,18 +38,22 @@ from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import condition_numbers, require_rank
 from calib.identification.closed_loop.loop_recordings import (
     ClosedLoops,
+    Loop,
     close_loops,
     followed,
     low_passed,
     simulated_samples,
 )
+from calib.identification.closed_loop.sign_noise import SEED, position_noise
 from calib.identification.closed_loop.simulated import attempted_in_loop
 from calib.identification.closed_loop.simulation import Plant, Sensing
+from calib.identification.loop import LoopController
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate
 from calib.identification.rows import Case, thinned
 from calib.identification.survey.score_covariance import scatter
 from calib.identification.survey.simulated_robot import BelievedRobot, Sensitivities, believed_robot, start_of
+from calib.records import field_values
 
 
 @dataclass(frozen=True)
@@ -60,17 +72,17 @@ class _OutputError(Method):
     torques: bool
 
     def takes(self, rows: TorqueRows) -> bool:
-        """Return whether it estimates from these torque rows.
+        """Return whether the method supports these torque rows.
 
-        For CLIE sensors' torques alone do not suffice, since they do not identify the motors' motion.
+        CLIE does not support sensor torques alone, since these do not identify the motion of the motors.
         """
         return super().takes(rows) and (not rows.sensed or rows.with_motors or not self.torques)
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the problem's parameters; one simulation gives motion and Jacobian.
+        """Return the estimate of the problem's parameters.
 
         Raises:
-            UsageError, MeasurementError: for a loop or recordings that no simulation can start from.
+            UsageError, MeasurementError: for a loop or recordings that cannot be simulated.
         """
         if problem.loop is None:
             raise UsageError(f"method '{self.name}' needs a [loop], and a robot that can be simulated")
@@ -85,13 +97,14 @@ class _OutputError(Method):
         task = _Comparison(problem, robot, loops, self.torques)
         return attempted_in_loop(self.name, problem, loops, lambda: self._estimate(problem, plain, task))
 
-    def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, task: "_Comparison") -> MethodEstimate:
+    def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, task: _Comparison) -> MethodEstimate:
         loops = task.loops
         with np.errstate(divide="ignore", invalid="ignore"):
             inertia = loops.controller.kd**2 / (2.0 * loops.controller.kp)
         inertia = np.where(np.isfinite(inertia) & (inertia > 0.0), inertia, 1.0)
         values = start_of(problem, plain.estimate.values, inertia, lambda x: task.simulated(task.whole(x, inertia)))
         values = task.whole(values, inertia)
+        task = task.with_noise(values)
         first, _ = task.linearised(values)
         std = task.spread(first, 0)
         count = 1
@@ -111,7 +124,9 @@ class _OutputError(Method):
         fit = _packed(task, plain, values, residual, slopes, std)
         step = np.linalg.norm(_gradient(residual / std, slopes / std[:, None]))
         if not solution.status.good and step > 0.5:
-            raise NotConverged(f"{self.name}: {solution.status.value} ({step:.2g} standard deviations from rest)", fit)
+            raise NotConverged(
+                f"{self.name}: {solution.status.value} ({step:.2g} standard deviations in the last step)", fit
+            )
         simulations = task.count[0]
         return replace(
             plain,
@@ -128,9 +143,18 @@ class _OutputError(Method):
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Signals to compare, positions or torques of the recordings' control loops; `count` counts the simulations.
+    """Comparison of simulated with recorded signals of all closed loops.
 
-    Rows (M, r) are those of the torque sensors, if the problem has any, then r = n of the positions or motor torques.
+    Residuals and Jacobians have r columns: first the torque sensors, if the problem has any, then n positions or motor
+    torques.
+
+    Attributes:
+        problem: data and settings.
+        robot: the simulated robot.
+        loops: closed loops of the recordings.
+        torques: whether motor torques are compared instead of positions.
+        count: number of simulations so far, in a list of one entry.
+        noise: (N, n) noise of the measured positions in each loop [rad or m], drawn once; None for loops without.
     """
 
     problem: IdentificationProblem
@@ -138,18 +162,21 @@ class _Comparison:
     loops: ClosedLoops
     torques: bool
     count: list[int] = field(default_factory=lambda: [0])
+    noise: tuple[np.ndarray | None, ...] = ()
 
     @property
     def rows(self) -> TorqueRows:
-        """Kind of the problem's torque rows."""
+        """Torque rows of the problem's model."""
         return self.problem.model.torque_rows
 
     def whole(self, values: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-        """Return the parameters (p + k,) of the simulated robot: the problem's and, without motor torques, its motors'.
+        """Return the parameters (p + k,) of the simulated robot.
+
+        They are the problem's parameters and, if the problem has no motor torques, k parameters of the motors.
 
         Args:
-            values: (p,) of the problem.
-            inertia: (n,) that the motors start with [kg m² or kg]; they start without friction.
+            values: (p,) parameters of the problem.
+            inertia: (n,) first inertias of the motors [kg m² or kg]; their first friction is zero.
         """
         motors = np.zeros(len(self.robot.columns) - len(values))
         stride = max(1, len(motors) // len(inertia))
@@ -157,7 +184,14 @@ class _Comparison:
         return np.append(values, motors)
 
     def simulated(self, values: np.ndarray) -> None:
-        """Simulate all loops with the parameters (p,); raise if that fails."""
+        """Simulate all loops with parameters (p,), to check that this is possible.
+
+        Args:
+            values: (p,) parameters of the problem.
+
+        Raises:
+            CalibError: if a loop cannot be simulated.
+        """
         for case, loop in self.loops.pairs:
             plant = self.robot.at(values, case)
             controller = loop.controller
@@ -168,10 +202,14 @@ class _Comparison:
             plant.run(controller, loop.reference, Sensing(every=loop.every))
 
     def linearised(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (M, r), zero at samples not compared, and the Jacobian (M, r, p) of simulated signals."""
+        """Return residuals (M, r), zero if not in use, and the Jacobian (M, r, p) of the simulated signals.
+
+        Args:
+            values: (p,) parameters, at which the signals are simulated.
+        """
         residuals = []
         slopes = []
-        for case, loop in self.loops.pairs:
+        for (case, loop), drawn in zip(self.loops.pairs, self.noise, strict=True):
             plant = self.robot.at(values, case)
             controller = loop.controller
             relative = None
@@ -179,8 +217,7 @@ class _Comparison:
                 diagonal = plant.inertia_diagonal(loop.reference.q[::200])
                 controller = controller.scaled(diagonal / loop.design)
                 relative = self._inertia_slopes(loop.reference.q[::200]) / diagonal[:, None]
-            self.count[0] += 1
-            run = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative)
+            run = self._mean_run(values, case, controller, loop, relative, drawn)
             index = simulated_samples(case, run.t, loop)
             motion = case.motion
             # Residuals and their slopes, in the order of the rows.
@@ -212,8 +249,58 @@ class _Comparison:
             slopes.append(np.where(in_use[:, :, None], slope, 0.0))
         return np.concatenate(residuals), np.concatenate(slopes)
 
+    def with_noise(self, values: np.ndarray) -> _Comparison:
+        """Return the comparison with the recordings' noise in the loop, as their torques answer it.
+
+        Args:
+            values: (p,) parameters with which the loops are simulated.
+        """
+        if self.robot.steps is not None:
+            return replace(self, noise=(None,) * len(self.loops.pairs))
+        noise = []
+        for case, loop in self.loops.pairs:
+            sigma = position_noise(self.robot.at(values), case, loop).loop
+            drawn = np.random.default_rng(SEED).normal(size=loop.reference.q.shape) * sigma
+            noise.append(drawn if np.any(sigma) else None)
+        return replace(self, noise=tuple(noise))
+
+    def _mean_run(
+        self,
+        values: np.ndarray,
+        case: Case,
+        controller: LoopController,
+        loop: Loop,
+        relative: np.ndarray | None,
+        drawn: np.ndarray | None,
+    ) -> Sensitivities:
+        """Return the mean of runs with noise `drawn` in the loop and with its opposite; one run where there is none.
+
+        Args:
+            values: (p,) parameters of the problem.
+            case: the recording, which has the payloads.
+            controller: controller of the robot.
+            loop: loop of the recording.
+            relative: (n, p) derivatives of the logarithm of the gains by the parameters; None: the gains are constant.
+            drawn: (N, n) noise of the measured positions [rad or m]; None for no noise.
+        """
+        self.count[0] += 1
+        first = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative, drawn)
+        if drawn is None:
+            return first
+        self.count[0] += 1
+        second = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative, -drawn)
+        means = {name: 0.5 * (value + getattr(second, name)) for name, value in field_values(first).items()}
+        return Sensitivities(**means)
+
     def _sensed(self, plant: Plant, case: Case, run: Sensitivities, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (N, n) of the sensors' torques [N m or N], and the Jacobian (N, n, p) of simulated ones."""
+        """Return residuals (N, n) of the sensors' torques [N m or N], and the Jacobian (N, n, p) of simulated torques.
+
+        Args:
+            plant: the simulated robot.
+            case: the recording.
+            run: simulated motion with its derivatives.
+            index: (N,) indices of the simulated samples at the recorded times.
+        """
         link = IdentificationModel(plant.bodies, plant.terms, LINK)
         link_columns = list(range(plant.inertial))
         link_columns += [column for column, term in enumerate(plant.terms, plant.inertial) if term in link.columns]
@@ -232,13 +319,23 @@ class _Comparison:
         return case.target[:, : case.motion.n] - regressor @ values, jacobian
 
     def _inertia_slopes(self, q: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (n, p) of the mean diagonal of the inertia matrix with respect to the parameters."""
+        """Return the derivatives (n, p) of the inertia matrix's diagonal by the parameters.
+
+        The diagonal is the mean over joint positions q (N, n).
+        """
         units = np.eye(len(self.robot.columns))
         diagonals = [self.robot.at(unit).inertia_diagonal(q) for unit in units]
         return np.array(diagonals).T
 
     def whitened(self, values: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (M r,) and Jacobian (M r, p) divided by std (r,); huge residuals if the simulation fails."""
+        """Return residuals (M r,) and Jacobian (M r, p), divided by std (r,).
+
+        If the simulation fails, the residuals are huge and the Jacobian is zero.
+
+        Args:
+            values: (p,) parameters, at which the signals are simulated.
+            std: (r,) standard deviations of the residuals.
+        """
         p = len(values)
         # residual of parameters that cannot be simulated: any step that can is better
         impossible = 1e60
@@ -250,7 +347,12 @@ class _Comparison:
         return (residual / std).ravel(), np.asfortranarray(scaled_slopes)
 
     def solved(self, values: np.ndarray, std: np.ndarray) -> nonlinear.Solution[np.ndarray]:
-        """Return the parameters that minimise the residuals divided by std (r,)."""
+        """Return the parameters that minimise the residuals divided by std (r,), with convergence.
+
+        Args:
+            values: (p,) first parameters.
+            std: (r,) standard deviations of the residuals.
+        """
         # at first
         first_damping = 1e-3
         # simulations with tangents per round
@@ -259,7 +361,11 @@ class _Comparison:
         step_tolerance = 0.05
 
         def linearise(x: np.ndarray) -> nonlinear.Reduced:
-            return nonlinear.triangle(*self.whitened(x, std))
+            residual, slopes = self.whitened(x, std)
+            rms = float(np.sqrt(np.mean(residual**2)))
+            compared = "torques" if self.torques else "positions"
+            self.problem.say(f"{compared} compared after {self.count[0]} simulations: residual {rms:.4g} σ")
+            return nonlinear.triangle(residual, slopes)
 
         def moved(x: np.ndarray, step: np.ndarray) -> np.ndarray:
             return x + step
@@ -269,7 +375,7 @@ class _Comparison:
         )
 
     def spread(self, residual: np.ndarray, p: int) -> np.ndarray:
-        """Return the standard deviation (r,) of each row's residuals."""
+        """Return the standard deviation (r,) of each column of residuals (M, r), after a fit of p parameters."""
         count = np.maximum(np.sum(residual != 0.0, axis=0), 1)
         share = max(1.0 - p / count.sum(), 0.1)
         std = np.sqrt(np.sum(residual**2, axis=0) / count / share)
@@ -284,7 +390,12 @@ class _Comparison:
 
 
 def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of white residuals."""
+    """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of the estimate for white residuals.
+
+    Args:
+        residual: (M, r) residuals divided by their standard deviations.
+        slopes: (M, r, p) their Jacobian.
+    """
     p = slopes.shape[2]
     flat = slopes.reshape(-1, p)
     orthonormal, _ = np.linalg.qr(flat)
@@ -299,10 +410,17 @@ def _packed(
     slopes: np.ndarray,
     std: np.ndarray,
 ) -> LinearFit:
-    """Return the fit for parameters, residuals and Jacobian, with the covariance H⁻¹ S H⁻¹.
+    """Return the fit of parameters, residuals and Jacobian, with the covariance H⁻¹ S H⁻¹.
+
+    Args:
+        task: the comparison.
+        plain: the least-squares estimate, for names and units.
+        values: (p,) parameters.
+        residual, slopes: (M, r) residuals and (M, r, p) Jacobian.
+        std: (r,) standard deviations of the residuals [rad, m, N m or N].
 
     Raises:
-        Unidentifiable: where the simulated motion does not distinguish parameters.
+        Unidentifiable: if the simulated motion does not distinguish parameters.
     """
     white = slopes / std[:, None]
     white_residual = residual / std

@@ -1,4 +1,4 @@
-"""Covariance of the scores of autocorrelated residuals, for methods whose estimate minimises correlated errors."""
+"""Covariance of the score Σ_k W_kᵀ r_k of autocorrelated residuals r, for methods that do not whiten them."""
 
 import numpy as np
 
@@ -7,18 +7,20 @@ from calib.records import shaped
 
 
 def scatter(white: np.ndarray, residual: np.ndarray, covariance: np.ndarray | None = None) -> np.ndarray:
-    """Return Σ_j σ_j² Σ_kl ρ_j(k - l) w_jk w_jlᵀ (p, p): the covariance of Σ_k W_kᵀ r_k.
+    """Return the covariance of the score Σ_k W_kᵀ r_k: Σ_j σ_j² Σ_kl ρ_j(k - l) w_jk w_jlᵀ (p, p).
 
-    σ_j², ρ_j are variance and autocorrelation of row j's residuals over one uninterrupted record, tapered linearly
-    (Bartlett 1946) so that the result is positive; its width is three times that of `whiteness.inflation`'s window.
-    Where noise was differentiated (accelerations) neighbours cancel and this is less than Σ σ_j² w wᵀ; where they are
-    alike, as in the error of a simulated motion, it is far more.
+    σ_j² and ρ_j are variance and autocorrelation of row j's residuals over one uninterrupted record. ρ_j is tapered
+    linearly (Bartlett 1946) so that the result is positive definite; the width of the taper is three times the window
+    of `whiteness.inflation`. For differentiated noise (accelerations), whose neighbouring samples cancel, the result is
+    smaller than Σ σ_j² w wᵀ; for similar neighbouring samples, as in the error of a simulated motion, it is much
+    larger.
 
     Args:
         white: W (N, rows, p).
         residual: r (N, rows); zero where a row is not in use.
-        covariance: C (p, p) of the estimate behind the residuals: σ_j² and ρ_j are then those of r and of what the fit
-            took out, E[e_k e_l] = r_k r_l + w_k C w_lᵀ; on a short record least of all is left where W is large.
+        covariance: C (p, p) of the estimate behind the residuals. σ_j² and ρ_j then also include the part of the errors
+            that the fit absorbed, E[e_k e_l] = r_k r_l + w_k C w_lᵀ, which matters in short records and where W is
+            large. None: of r alone.
     """
     shape = (None, None, None)
     white = shaped(white, shape, "rows")

@@ -1,6 +1,6 @@
-"""The simulated robot of an identification problem, and initial parameters of simulating methods.
+"""The simulated robot of an identification problem, and start parameters of methods that simulate.
 
-Closed loops with their slopes by parameters: a whole run at once, or states advanced one at a time.
+Closed loops are simulated with their derivatives by parameters: a whole motion at once, or single time steps.
 """
 
 from collections.abc import Callable
@@ -34,12 +34,12 @@ from calib.records import frozen, shaped
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """Simulated noise-free motion of M samples, and its derivatives with respect to c parameters.
+    """Simulated motion of M samples, and its derivatives by c parameters.
 
     Attributes:
-        t: (M,) [s].
-        q, v, torque: (M, n) [rad or m, per s, N m or N].
-        by_q, by_v, by_torque: (M, n, c) their slopes, per unit of each parameter.
+        t: (M,) times [s].
+        q, v, torque: (M, n) positions, velocities and torques [rad or m, per s, N m or N].
+        by_q, by_v, by_torque: (M, n, c) derivatives of q, v and torque, per unit of each parameter.
     """
 
     t: np.ndarray
@@ -58,28 +58,33 @@ def simulate_tangents(
     columns: np.ndarray,
     every: float = 1,
     relative: np.ndarray | None = None,
+    noise: np.ndarray | None = None,
 ) -> Sensitivities:
-    """Return a noise-free simulated motion along a reference, and its exact derivatives with respect to the parameters.
+    """Return a simulated motion along a reference, with exact derivatives by the parameters.
 
     Args:
-        plant: plant whose friction depends on position and velocity alone.
+        plant: robot whose friction depends on position and velocity alone.
+        controller: its controller.
+        reference: reference sampled at the controller's rate.
         columns: (c,) indices of the parameters.
         every: control periods per sample.
-        relative: (n, c) slopes of the logarithm of all gains of a joint by the parameters, where the gains follow them
-            (`calib.identification.closed_loop.loop_recordings.Loop.design`); None: the gains are constant.
+        relative: (n, c) derivatives of the logarithm of all gains of a joint by the parameters, if the gains depend on
+            them (`calib.identification.closed_loop.loop_recordings.Loop.design`); None: the gains are constant.
+        noise: (N, n) noise of the measured positions, on which the controller acts [rad or m]; None: none.
 
     Raises:
-        CalibError: where the inertia is not positive definite, friction too stiff, or of a kind without slopes.
-        NotConverged: where the loop is unstable.
+        CannotSimulate: if the inertia matrix is not positive definite, or friction too stiff.
+        CalibError: for friction without derivatives.
+        Diverged: if the loop is unstable.
     """
     from calib.identification.closed_loop import loop_kernels
     from calib.identification.survey import tangent_kernels
 
     for term in plant.terms:
         message = (
-            f"term '{term.name}' ({term.shape}): no derivatives of friction that hangs on past motion or on torques"
+            f"term '{term.name}' ({term.shape}): no derivatives of friction that depends on past motion or on torques"
         )
-        require(term.form.slopes, f"{message}; iv and didim take it")
+        require(term.form.slopes, f"{message}; methods iv and didim support it")
     n = plant.bodies.n
     count = len(reference.t)
     c = len(columns)
@@ -103,6 +108,7 @@ def simulate_tangents(
         controller.rows,
         scale,
         reference.sampled(controller.ahead),
+        np.empty((0, n)) if noise is None else np.ascontiguousarray(shaped(noise, reference.q.shape, "noise")),
         reference.period,
         controller.smoothing(reference.period),
         controller.delay,
@@ -134,11 +140,15 @@ def simulate_differences(
     steps: np.ndarray,
     every: float = 1,
 ) -> Sensitivities:
-    """Return the result of `simulate_tangents` for a robot without tangents, by one simulation per parameter.
+    """Return the result of `simulate_tangents` by differences, with one simulation per parameter.
 
     Args:
-        plant: result of a model's `plant`, with the mounted payloads.
-        steps: (c,) of the forward differences: so small that the motion is linear, see `BelievedRobot.steps`.
+        plant: simulated robot with the attached payloads.
+        controller: its controller.
+        reference: reference sampled at the controller's rate.
+        columns: (c,) indices of the parameters.
+        steps: (c,) steps of the forward differences, so small that the motion is linear in them.
+        every: control periods per sample.
     """
 
     def moved(parameters: np.ndarray) -> np.ndarray:
@@ -158,7 +168,12 @@ def simulate_differences(
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """Simulated robot prepared for single time steps with varying parameters and states."""
+    """Simulated robot prepared for single time steps with varying parameters and states.
+
+    Attributes:
+        parts: arrays of the kernels, from `packed`.
+        layout: index arrays of the kernels, from `layout_of`, and the column of each parameter in the Jacobian.
+    """
 
     parts: Packed
     layout: Packed
@@ -166,13 +181,16 @@ class Stepper:
     def points(
         self, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, period: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return q and v (K, n) one period later under one torque (n,), and M⁻¹ (n, n) of the first state.
+        """Return q and v (K, n) of K states one period later under a common torque, and M⁻¹ (n, n) of the first state.
 
         Args:
-            parameters: (K, p) of each state's robot.
+            parameters: (K, p) parameters of the robot for each state.
+            q, v: (K, n) states.
+            tau: (n,) drive torques [N m or N], held for the period.
+            period: duration [s].
 
         Raises:
-            CannotSimulate, Diverged: naming the first point that cannot be followed.
+            CannotSimulate, Diverged: if a state cannot be advanced; the message names the first one.
         """
         from calib.identification.closed_loop import loop_kernels
 
@@ -189,7 +207,18 @@ class Stepper:
     def linearised(
         self, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray, period: float, columns: int
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return q, v (n,) one period later, M⁻¹ (n, n), and their Jacobian with respect to q, v and parameters."""
+        """Return q, v (n,) one period later, M⁻¹ (n, n), and their Jacobian (2 n, 2 n + c) by q, v and c parameters.
+
+        Args:
+            parameters: (p,) parameters of the robot.
+            q, v: (n,) state.
+            tau: (n,) drive torques [N m or N], held for the period.
+            period: duration [s].
+            columns: number c of parameters in the Jacobian.
+
+        Raises:
+            CannotSimulate, Diverged: if the state cannot be advanced.
+        """
         from calib.identification.closed_loop import loop_kernels
         from calib.identification.survey import tangent_kernels
 
@@ -206,7 +235,12 @@ class Stepper:
 
 
 def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
-    """Return the stepper of a robot, with derivatives with respect to the parameters `columns` (c,)."""
+    """Return a robot prepared for single time steps, with derivatives by the parameters of indices `columns` (c,).
+
+    Args:
+        plant: the robot.
+        columns: (c,) indices of the parameters.
+    """
     find = np.full(len(plant.parameters), -1)
     numbers = 2 * plant.bodies.n + np.arange(len(columns))
     find[np.asarray(columns, dtype=int)] = numbers
@@ -221,14 +255,14 @@ SHARES = (1.0, 0.9, 0.75, 0.5, 0.25, 0.0)
 
 @dataclass(frozen=True, eq=False)
 class BelievedRobot:
-    """Robot model to be simulated with the parameters of an identification problem.
+    """Robot model that is simulated with the parameters of an identification problem.
 
     Attributes:
-        model: model including the problem's richer friction.
-        columns: (p,) place of each of the problem's parameters among the plant's; without motor torques, those of the
-            motors follow.
-        plant: plant with all parameters zero; for a model that is no serial arm, the result of its `plant`.
-        steps: (p,) of differences for a robot without tangents, 0.01 σ of least squares; None for a serial arm.
+        model: model including the problem's additional friction.
+        columns: (p,) index of each of the problem's parameters among those of the simulated robot; without motor
+            torques, the indices of the motors' parameters follow.
+        plant: simulated robot with all parameters zero.
+        steps: (p,) steps of differences for a robot without tangents, 0.01 σ of least squares; None for a serial arm.
     """
 
     model: Any
@@ -237,7 +271,12 @@ class BelievedRobot:
     steps: np.ndarray | None = None
 
     def at(self, values: np.ndarray, case: Case | None = None) -> Any:
-        """Return the robot with parameters (p,) and the payloads of a case."""
+        """Return the simulated robot with parameters (p,) and the payloads of a case; None: all payloads.
+
+        Args:
+            values: (p,) parameters of the problem.
+            case: recording with its payloads; None: all payloads are attached.
+        """
         parameters = np.zeros(len(self.plant.parameters))
         parameters[self.columns] = values
         plant = self.plant.with_parameters(parameters)
@@ -253,12 +292,25 @@ class BelievedRobot:
         reference: Reference,
         every: float,
         relative: np.ndarray | None = None,
+        noise: np.ndarray | None = None,
     ) -> Sensitivities:
-        """Return the simulated motion with parameters (p,) and its slopes by them; none by payloads not attached."""
+        """Return the simulated motion with parameters (p,) and its derivatives by them.
+
+        Derivatives by parameters of payloads that are not attached are zero.
+
+        Args:
+            values: (p,) parameters.
+            case: the recording, which has the payloads.
+            controller: controller of the robot.
+            reference: reference sampled at the controller's rate.
+            every: control periods per sample.
+            relative: (n, p) derivatives of the logarithm of the gains by the parameters; None: the gains are constant.
+            noise: (N, n) noise of the measured positions [rad or m]; ignored for a robot without tangents.
+        """
         plant = self.at(values, case)
         if self.steps is not None:
             return simulate_differences(plant, controller, reference, self.columns, self.steps, every)
-        sensitivities = simulate_tangents(plant, controller, reference, self.columns, every, relative)
+        sensitivities = simulate_tangents(plant, controller, reference, self.columns, every, relative, noise)
         carried = self.carried(case)
         by_q = sensitivities.by_q * carried
         by_v = sensitivities.by_v * carried
@@ -272,7 +324,11 @@ class BelievedRobot:
 
 
 def serial_arm(problem: IdentificationProblem, method: Method) -> IdentificationModel:
-    """Return the model of a problem; raise unless it is a serial arm with torque rows that the method takes.
+    """Return the model of a problem, which must be a serial arm with torque rows that the method supports.
+
+    Args:
+        problem: data and settings.
+        method: the method that simulates.
 
     Raises:
         UsageError: for any other model.
@@ -287,15 +343,17 @@ def serial_arm(problem: IdentificationProblem, method: Method) -> Identification
 def believed_robot(problem: IdentificationProblem, method: Method, steps: np.ndarray | None = None) -> BelievedRobot:
     """Return the robot model that simulates an identification problem.
 
-    Without motor torques (rows link) the problem does not identify the motors' motion: inertia, friction and offset of
-    each motor are appended as further parameters (our choice).
+    Without motor torques (rows link) the problem does not identify the motion of the motors. Inertia, friction and
+    offset of each motor are then appended as further parameters (our choice).
 
     Args:
-        steps: (p,) steps of differences for a model that is no serial arm; None: such a model is refused.
+        problem: data and settings.
+        method: the method that simulates.
+        steps: (p,) steps of differences for a model other than a serial arm; None: such a model is refused.
 
     Raises:
-        UsageError: for a model that cannot be simulated, or torque rows that the method does not take.
-        CannotSimulate: for friction that the simulator does not know, or an exact sign.
+        UsageError: for a model that cannot be simulated, or torque rows that the method does not support.
+        CannotSimulate: for friction that cannot be simulated, such as an exact sign.
     """
     if steps is not None and not isinstance(problem.model, IdentificationModel):
         columns = np.array(problem.base.kept)
@@ -324,7 +382,12 @@ def believed_robot(problem: IdentificationProblem, method: Method, steps: np.nda
 
 
 def with_friction(problem: IdentificationProblem, model: IdentificationModel) -> tuple[IdentificationModel, np.ndarray]:
-    """Return a problem's model with all friction terms, and the index (p,) of each parameter in it."""
+    """Return a problem's model with all friction terms, and the index (p,) of each of its parameters in this model.
+
+    Args:
+        problem: data and settings, with p parameters.
+        model: the problem's model with standard friction.
+    """
     extra = [term for term in problem.terms[problem.base.b :] if term is not None]
     model = model.with_terms(*extra)
     extra_columns = range(model.p - len(extra), model.p)
@@ -335,15 +398,16 @@ def with_friction(problem: IdentificationProblem, model: IdentificationModel) ->
 def start_of(
     problem: IdentificationProblem, plain: np.ndarray, inertia: np.ndarray, simulated: Callable[[np.ndarray], object]
 ) -> np.ndarray:
-    """Return initial parameters (p,): the given ones, or those nearest to least squares that can be simulated.
+    """Return start parameters (p,): the stated ones, or those nearest to least squares that can be simulated.
 
     Args:
+        problem: data and settings.
         plain: (p,) estimate by weighted least squares.
-        inertia: (n,) of a regular robot, which nothing couples [kg m² or kg].
-        simulated: raises `CalibError` where values cannot be simulated.
+        inertia: (n,) joint inertias of a regular robot, whose joints are not coupled [kg m² or kg].
+        simulated: function that raises `CalibError` if parameters (p,) cannot be simulated.
 
     Raises:
-        CannotSimulate: where no values can be simulated.
+        CannotSimulate: if no parameters between least squares and the regular robot can be simulated.
     """
     if problem.start is not None:
         return np.array(problem.start, dtype=float)
@@ -374,7 +438,12 @@ def start_of(
 
 
 def _hubs(model: IdentificationModel, inertia: np.ndarray) -> np.ndarray:
-    """Return parameters (p,) of bodies that have only the inertia (n,) about their joint axis, or the mass along it."""
+    """Return parameters (p,) of bodies with inertia about their joint axis only, or mass only for prismatic joints.
+
+    Args:
+        model: model of the robot.
+        inertia: (n,) these inertias or masses.
+    """
     result = np.zeros(model.p)
     for i, (coordinate, axis) in enumerate(zip(model.bodies.coordinates, model.bodies.axes)):
         if coordinate >= 0:

@@ -1,25 +1,25 @@
 """Compiled derivatives of the closed loop (numba): a simulated motion's Jacobian with respect to parameters.
 
-The exact derivative of what `loop_kernels` computes, step by step. With K = ∂tau/∂q, D = ∂tau/∂v and Y = ∂tau/∂χ of the
-inverse dynamics at a state and its accelerations,
+The kernels compute the exact derivative of the results of `loop_kernels`, step by step. With K = ∂tau/∂q, D = ∂tau/∂v
+and Y = ∂tau/∂χ of the inverse dynamics at a state and its accelerations,
 
     M δa = δtau - K δq - D δv - Y,
 
-c columns at a time, through the stages of Runge and Kutta, the controller and its memory. K and D come from composite
-quantities about the base's origin: with ψ̇_i = V_p × S_i and ψ̈_i = A_p × S_i + V_p × ψ̇_i,
+for c columns at a time, through the stages of the Runge-Kutta method, the controller and its memory. K and D follow
+from composite quantities about the base's origin: with ψ̇_i = V_p × S_i and ψ̈_i = A_p × S_i + V_p × ψ̇_i,
 
     K_ji = S_jᵀ (2 B_i ψ̇_i + I_i ψ̈_i + S_i ×* f_i),   K_ij = S_iᵀ (2 B_i ψ̇_j + I_i ψ̈_j),
-    D_ji = S_jᵀ (2 B_i S_i + 2 I_i ψ̇_i),               D_ij = S_iᵀ (2 B_i S_j + 2 I_i ψ̇_j),   j on the way to i
+    D_ji = S_jᵀ (2 B_i S_i + 2 I_i ψ̇_i),               D_ij = S_iᵀ (2 B_i S_j + 2 I_i ψ̇_j),   j between base and i
 
-(Singh, Russell & Wensing 2022, one degree of freedom per joint). About one origin 2 B m = [2 P w; 2 w × L] for a twist
-m with angular part w: P = -[ω]Σ - [h][ν] and L = m ν + ω × h add up along the tree as the inertias do.
+(Singh, Russell & Wensing 2022, one degree of freedom per joint). About a common origin 2 B m = [2 P w; 2 w × L] for a
+twist m with angular part w: P = -[ω]Σ - [h][ν] and L = m ν + ω × h add up along the tree as the inertias do.
 
-Arrays are those of `loop_kernels`; besides
+Arrays are those of `loop_kernels`, and
 
-    find     (p,): column of each parameter among the c, or -1
-    order, entries, shares, owners: see `loop_kernels.set_parameters`
-    more     (B + 1, 36): acceleration, ψ̇, ψ̈, wrench, P 24 … 32, L 33 … 35
-    own      (B, 10): inertia of each body alone
+    find      (p,): column of each parameter among the c columns, or -1
+    order, entries, shares, owners: index arrays of `loop_kernels.set_parameters`
+    extended  (B + 1, 36): acceleration, ψ̇, ψ̈, wrench, P in columns 24 … 32, L in columns 33 … 35
+    bodies_own  (B, 10): inertia of each body alone
 """
 
 import numpy as np
@@ -49,7 +49,15 @@ from calib.identification.closed_loop.loop_kernels import (
 
 @njit(**OPTIONS)
 def _outward(tree, body, v, a, work, bodies_own, extended):
-    """Write accelerations, ψ̇ and ψ̈, and each body's inertia, wrench, P and L; `work` is that of `dynamics`."""
+    """Write accelerations, ψ̇ and ψ̈, wrench, P and L of each body into `extended`, and its inertia into `bodies_own`.
+
+    `work` must contain the results of `dynamics`.
+
+    Args:
+        tree, body, work, bodies_own, extended: arrays described in the module's docstring and in that of
+            `loop_kernels`.
+        v, a: (n,) joint velocities and accelerations.
+    """
     count = tree.shape[0]
     for i in range(count):
         for r in range(10):
@@ -93,7 +101,14 @@ def _outward(tree, body, v, a, work, bodies_own, extended):
 
 @njit(**OPTIONS)
 def _slopes(tree, work, extended, by_q, by_v):
-    """Add the bodies' part of K and D (n, n), summing composite quantities from the tips to the base."""
+    """Add the bodies' part of K and D (n, n) to `by_q` and `by_v`.
+
+    Composite quantities are summed from the tips to the base.
+
+    Args:
+        tree, work, extended: arrays described in the module's docstring and in that of `loop_kernels`.
+        by_q, by_v: (n, n) K and D, the derivatives of the torques by q and v.
+    """
     count = tree.shape[0]
     for i in range(count - 1, -1, -1):
         p, c = tree[i, 0], tree[i, 2]
@@ -129,7 +144,12 @@ def _slopes(tree, work, extended, by_q, by_v):
 
 @njit(**OPTIONS)
 def _columns(tree, order, find, work, extended, out):
-    """Add the derivatives Y (n, c) with respect to the bodies' parameters that have a column."""
+    """Add the derivatives Y (n, c) by the bodies' parameters to `out`, for parameters that have a column.
+
+    Args:
+        tree, order, find, work, extended: arrays described in the module's docstring and in that of `loop_kernels`.
+        out: (n, c) derivatives of the torques by c parameters.
+    """
     count = tree.shape[0]
     for i in range(count):
         has_column = False
@@ -179,7 +199,17 @@ def _linearise(
     by_v,
     out,
 ):
-    """Write K, D (n, n) and Y (n, c) of the inverse dynamics at q, v, a; `work` is that of `dynamics`."""
+    """Write K, D (n, n) and Y (n, c) of the inverse dynamics at q, v, a into `by_q`, `by_v` and `out`.
+
+    Args:
+        tree, body, linear, kinds, acts, memory: arrays of the robot, described in the module `loop_kernels`.
+        order, entries, shares, owners, find: index arrays, described in the module's docstring.
+        q, v, a: (n,) joint positions, velocities and accelerations.
+        work: array of the bodies, with the results of `dynamics`.
+        bodies_own, extended: working arrays, described in the module's docstring.
+        by_q, by_v: (n, n) arrays to write.
+        out: (n, c) array to write.
+    """
     n = q.shape[0]
     by_q[:] = 0.0
     out[:] = 0.0
@@ -208,7 +238,14 @@ def _linearise(
 
 @njit(**OPTIONS)
 def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
-    """Write M⁻¹ (δtau - K δq - D δv - Y) into out (n, c); M is given factorised."""
+    """Write M⁻¹ (δtau - K δq - D δv - Y) into out (n, c); `matrix` contains the factors of M.
+
+    Args:
+        matrix: (n, n) factors of M.
+        by_q, by_v, columns: K, D (n, n) and Y (n, c).
+        dq, dv, dtau: (n, c) derivatives of position, velocity and drive torque by the parameters.
+        out: (n, c) derivatives of the acceleration.
+    """
     n, c = out.shape
     for j in range(n):
         for m in range(c):
@@ -235,7 +272,20 @@ def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
 def _advance_tangent(
     plant, layout, memory, loads, q, v, dq, dv, tau, dtau, period, slopes, dslopes, work, matrix, rooms
 ):
-    """Advance q, v (n,) and δq, δv (n, c) by one period as `loop_kernels.advance` does; `slopes[0]` is not used."""
+    """Advance q, v (n,) and δq, δv (n, c) by one period, as `loop_kernels._advance` advances q, v; return a status.
+
+    Args:
+        plant: arrays tree, body, linear, kinds, acts of `loop_kernels`.
+        layout: index arrays order, entries, shares, owners, find.
+        memory, loads, work: arrays described in the module `loop_kernels`.
+        q, v: (n,) state, overwritten.
+        dq, dv: (n, c) its derivatives by the parameters, overwritten.
+        tau, dtau: (n,) and (n, c) drive torques, and their derivatives.
+        period: duration [s].
+        slopes, dslopes: (4, n) and (4, n, c) working memory for accelerations; it need not contain those at the start.
+        matrix: (n, n) working memory.
+        rooms: working arrays of `_workspace`.
+    """
     tree, body, linear, kinds, acts = plant
     bodies_own, extended, by_q, by_v, columns, at, rate, dat, drate = rooms
     n, c = dq.shape
@@ -286,7 +336,13 @@ def _advance_tangent(
 
 @njit(**OPTIONS)
 def _workspace(bodies, n, c):
-    """Return the work arrays of `_advance_tangent`."""
+    """Return the working arrays of `_advance_tangent` for a number of bodies, n joints and c columns.
+
+    Args:
+        bodies: number of bodies.
+        n: number of joints.
+        c: number of columns.
+    """
     bodies_own, extended = np.empty((bodies, 10)), np.empty((bodies + 1, 36))
     square, wide = (np.empty((n, n)), np.empty((n, n))), np.empty((n, c))
     return (
@@ -304,10 +360,18 @@ def _workspace(bodies, n, c):
 
 @njit(**OPTIONS)
 def advance_linearised(plant, layout, values, q, v, tau, period, gain, dq, dv):
-    """Advance a state q, v (n,) by a period under one torque (n,); write its Jacobian into dq and dv.
+    """Advance a state q, v (n,) by one period under a constant torque (n,), and write its Jacobian; return a status.
 
-    dq, dv (n, 2 n + c): slopes by q, v and the c parameters of `layout`, whose columns start at 2 n. Writes M⁻¹ into
-    gain (n, n); returns a status.
+    Args:
+        plant: arrays tree, body, linear, kinds, acts of `loop_kernels`.
+        layout: index arrays order, entries, shares, owners, find; the columns of the c parameters in `find` start at 2
+            n.
+        values: (p,) parameters of the robot.
+        q, v: (n,) state, overwritten.
+        tau: (n,) drive torques.
+        period: duration [s].
+        gain: (n, n) array to which M⁻¹ of the first state is written.
+        dq, dv: (n, 2 n + c) arrays for the derivatives of the new state by q, v and the c parameters.
     """
     tree, body, linear, kinds, acts = plant
     order, entries, shares, owners, _ = layout
@@ -354,7 +418,23 @@ def _command_tangent(
     matrix,
     rooms,
 ):
-    """Write the derivatives (n, c) of the command before saturation; feedback (n,) is its feedback part."""
+    """Write the derivatives (n, c) of the command before saturation into `dwish`.
+
+    Args:
+        plant: arrays tree, body, linear, kinds, acts of `loop_kernels`.
+        layout: index arrays order, entries, shares, owners, find.
+        model: array `body` of the controller's model; 0 rows if there is none.
+        empty: empty array in place of `find` for the controller's model, whose parameters have no columns.
+        gains: (6, n) controller values, as in `loop_kernels.closed_loop`.
+        relative: (n, c) derivatives of the logarithm of each joint's gains by the parameters.
+        ahead: (n,) feedforward acceleration.
+        read, speed: (n,) measured position and velocity.
+        dread, dspeed, dintegral: (n, c) derivatives of measured position, measured velocity, and integral of the error.
+        feedback: (n,) feedback part of the command.
+        wish, work, matrix: working memory.
+        dwish: (n, c) array to write.
+        rooms: working arrays of `_workspace`.
+    """
     bodies_own, extended, by_q, by_v, columns, at, _, dat, _ = rooms
     tree, linear = plant[0], plant[2]
     n = len(dwish)
@@ -382,12 +462,28 @@ def _command_tangent(
 
 @njit(**OPTIONS)
 def closed_loop_tangent(
-    plant, layout, model, gains, relative, reference, period, smoothing, late, every, q, v, count, out, dout
+    plant, layout, model, gains, relative, reference, encoder, period, smoothing, late, every, q, v, count, out, dout
 ):
-    """Write the noise-free motion of `loop_kernels.closed_loop` with its tangents. Return (status, period reached).
+    """Write the motion of `loop_kernels.closed_loop` and its tangents; return a status and a period.
 
-    relative (n, c): slopes of the gains' common factor, joint by joint, over that factor; zero for gains that stay.
-    `out` (3, M, n): q, v, torque; `dout` (3, M, n, c) their tangents, every `every` periods.
+    The period is the index of the last one reached.
+
+    Args:
+        plant: arrays tree, body, linear, kinds, acts of `loop_kernels`.
+        layout: index arrays order, entries, shares, owners, find.
+        model: array `body` of the controller's model; 0 rows if there is none.
+        gains: (6, n) controller values, as in `loop_kernels.closed_loop`.
+        relative: (n, c) derivatives of the logarithm of each joint's gains by the parameters; zero for constant gains.
+        reference: (4, N, n) position, velocity, feedforward torque, feedforward acceleration.
+        encoder: (N, n) or (0, n), noise of the measured positions, on which the controller acts.
+        period: control period [s].
+        smoothing: weight of a new velocity sample in the controller's low-pass.
+        late: delay in control periods.
+        every: control periods per sample.
+        q, v: (n,) the state, which is overwritten.
+        count: number of control periods.
+        out: (3, M, n) q, v and torque at each sample.
+        dout: (3, M, n, c) their tangents, i.e. derivatives by the parameters.
     """
     tree, linear, kinds = plant[0], plant[2], plant[3]
     n, c = relative.shape
@@ -396,19 +492,22 @@ def closed_loop_tangent(
     rooms, empty = _workspace(tree.shape[0], n, c), np.empty(0, dtype=np.int64)
     memory, loads = np.zeros((kinds.shape[0], 2)), np.zeros(n)
     speed, before, integral, wish, feedback = np.zeros(n), np.empty(n), np.zeros(n), np.empty(n), np.empty(n)
-    tau, waiting = np.empty(n), np.zeros((late + 1, n))
+    tau, waiting, read = np.empty(n), np.zeros((late + 1, n)), np.empty(n)
     dq, dv, dspeed, dbefore = np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c))
     dintegral, dwish, dtau, dwaiting = np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c)), np.zeros((late + 1, n, c))
     sample = 0
     for k in range(count):
+        read[:] = q
+        if encoder.shape[0]:
+            read += encoder[k]
         if k == 0:
             speed[:] = v
         else:
             for j in range(n):  # rounded as in `loop_kernels.closed_loop`
-                speed[j] += smoothing * ((q[j] - before[j]) / period - speed[j])
+                speed[j] += smoothing * ((read[j] - before[j]) / period - speed[j])
             dspeed += smoothing * ((dq - dbefore) / period - dspeed)
-        before[:], dbefore[:] = q, dq
-        command(gains, reference[0, k], reference[1, k], q, speed, integral, period, feedback)
+        before[:], dbefore[:] = read, dq
+        command(gains, reference[0, k], reference[1, k], read, speed, integral, period, feedback)
         for j in range(n):
             if abs(integral[j]) < gains[5, j]:
                 dintegral[j] -= period * dq[j]
@@ -422,7 +521,7 @@ def closed_loop_tangent(
             gains,
             relative,
             reference[3, k],
-            q,
+            read,
             speed,
             dq,
             dspeed,
@@ -436,12 +535,12 @@ def closed_loop_tangent(
         )
         wish[:] = feedback
         if model.shape[0]:
-            linearise_command(tree, model, linear, reference[3, k], q, speed, work, matrix, wish)
+            linearise_command(tree, model, linear, reference[3, k], read, speed, work, matrix, wish)
         wish += reference[2, k]
         now, old = k % (late + 1), (k + 1) % (late + 1) if k >= late else 0
         for j in range(n):
             held = min(max(wish[j], -gains[4, j]), gains[4, j])
-            error = reference[0, k, j] - q[j]
+            error = reference[0, k, j] - read[j]
             if held != wish[j] and error * wish[j] > 0.0:
                 integral[j] -= period * error
                 dintegral[j] += period * dq[j]

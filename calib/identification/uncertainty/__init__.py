@@ -1,1 +1,1 @@
-"""Uncertainty of an identification: the share of the geometry, and intervals of predicted torques."""
+"""Uncertainty of an identification: contribution of the geometry, and intervals of predicted torques."""

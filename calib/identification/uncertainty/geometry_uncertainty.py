@@ -1,31 +1,32 @@
 """Effect of the geometry's uncertainty on the identified dynamics: sensitivities and the total covariance.
 
-The estimate on a geometry g (values of the chain's elements) minimises ‖(y - W(g) φ) / σ‖² (plus a prior's term, if
-there is one), so that at fixed torques y and weights
+The estimate φ on a geometry g (values of the chain's elements) minimises ‖(y - W(g) φ) / σ‖² (plus the term of a prior,
+if there is one), so that at fixed torques y and weights
 
     dφ/dg_k = A⁻¹ [ (∂W/∂g_k)ᵀ R⁻¹ (y - W φ) - Wᵀ R⁻¹ (∂W/∂g_k) φ ],     A = Wᵀ R⁻¹ W (+ the prior's information),
 
-with R the residuals' variances as the estimate weighed them, and W, ∂W/∂g_k φ, y low-passed and thinned alike. It is
-the implicit derivative of the normal equations; ∂W/∂g_k is a central difference of the regressor's kernel, element by
-element, good to nine digits. Errors of the geometric fit and of the torques are independent of each other, hence
+with R the variances that weighted the residuals, and with W, ∂W/∂g_k φ and y equally low-passed and decimated. This is
+the implicit derivative of the normal equations. ∂W/∂g_k is a central difference of the regressor's kernel, element by
+element, accurate to nine digits. Errors of the geometric fit and of the torques are independent of each other, hence
 
-    Σ = Σ_torque + S Σ_geometry Sᵀ.
+    Σ = Σ_torque + S Σ_geometry Sᵀ,    S = dφ/dg.
 
-What the intervals are about: φ* = T(g*) χ*, the standard parameters χ* of the real bodies in the link frames of the
-real geometry g*, regrouped there. Link frames are those of the fit's own convention: elements that it keeps at their
-nominal because they merge with the instrument's or the tool's frame have no error of their own, they are a choice of
-frames. The coefficients of T printed with an estimate are those of T(ĝ); that they are uncertain, too, widens no
-interval of φ*, for the estimate never uses them.
+The intervals refer to φ* = T(g*) χ*: the standard parameters χ* of the real bodies in the link frames of the real
+geometry g*, regrouped on this geometry. Link frames are those of the fit's convention: elements that the fit keeps at
+nominal values, because they merge with the frame of the instrument or tool, have no error, since they are a choice of
+frames. The coefficients of T printed with an estimate are those of T(ĝ). Their uncertainty does not widen any interval
+of φ*, since the estimate does not use them.
 
-Not part of S: the weights' and the prior's own dependence on g, and that of load-dependent friction's columns (which
-rest on the fitted torque, and that hardly changes with g). With instruments Z, Zᵀ R⁻¹ (y - W φ) = 0 gives
+S neglects the dependence on g of the weights, of the prior, and of the columns of load-dependent friction (which depend
+on the fitted torque, and this hardly changes with g). With instruments Z, Zᵀ R⁻¹ (y - W φ) = 0 gives
 
-    dφ/dg_k = -(Zᵀ R⁻¹ W)⁻¹ Zᵀ R⁻¹ (∂W/∂g_k) φ    [+ (Zᵀ R⁻¹ W)⁻¹ (dZ/dg_k)ᵀ R⁻¹ (y - W φ)],
+    dφ/dg_k = -(Zᵀ R⁻¹ W)⁻¹ Zᵀ R⁻¹ (∂W/∂g_k) φ    [+ (Zᵀ R⁻¹ W)⁻¹ (dZ/dg_k)ᵀ R⁻¹ (y - W φ)].
 
-the bracket left out: it vanishes with the residual, and in the mean, since no function of the reference is correlated
-with the noise. (`didim`: W is Z.) For other methods the sensitivity is that of WLS with their residuals' spread.
+The bracket is neglected: it vanishes with the residual, and on average, since no function of the reference is
+correlated with the noise. (For `didim`, W is Z.) For other methods the sensitivity is that of WLS with the standard
+deviations of their residuals.
 
-`compare` adds one identification on two geometries, the nominal and the calibrated one, from the same torques.
+`compare` adds a second identification from the same torques, on the nominal geometry.
 """
 
 from collections.abc import Callable, Sequence
@@ -73,10 +74,10 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class _Estimator:
-    """An estimate as a function of its rows: A φ = Wᵀ R⁻¹ y + pull, A = Wᵀ R⁻¹ W + LᵀL.
+    """An estimate φ as a function of its rows: A φ = Wᵀ R⁻¹ y + pull, A = Wᵀ R⁻¹ W + LᵀL.
 
     Attributes:
-        deviation: (rows,) R = diag(deviation²).
+        deviation: (rows,) standard deviations, R = diag(deviation²).
         beforehand: (k, p) L, whitened rows of the prior; (0, p) without one.
         pull: (p,) information of the prior times its mean, including the effect of bounds.
     """
@@ -87,7 +88,7 @@ class _Estimator:
 
 
 def estimator(identification: Identification[RegressorModel]) -> _Estimator:
-    """Return an identification's estimator: weights of its rows and prior."""
+    """Return an identification's estimator, i.e. the weights of its rows and its prior."""
     fitted = identification.fitted
     p = fitted.pooled.parameters
     deviation = np.array(fitted.std) if fitted.weighted else np.ones(len(fitted.std))
@@ -106,7 +107,12 @@ def estimator(identification: Identification[RegressorModel]) -> _Estimator:
 
 
 def estimate(estimator: _Estimator, all_rows: Sequence[ObservationRows]) -> tuple[np.ndarray, np.ndarray]:
-    """Return φ (p,) from rows, and A⁻¹ (p, p); by QR of the whitened rows."""
+    """Return φ (p,) and A⁻¹ (p, p) for given rows, by QR of the whitened rows.
+
+    Args:
+        estimator: weights of the rows, and prior.
+        all_rows: rows of all recordings.
+    """
     p = len(estimator.pull)
     no_target = np.zeros((len(estimator.beforehand), 1))
     factor = np.hstack([estimator.beforehand, no_target])
@@ -121,7 +127,13 @@ def estimate(estimator: _Estimator, all_rows: Sequence[ObservationRows]) -> tupl
 
 
 def rows_on(identification: Identification, chain: Chain, cases: Sequence[Case]) -> list[ObservationRows]:
-    """Return the rows of an identification recomputed for another geometry; friction columns are unchanged."""
+    """Return the rows of an identification, recomputed for another geometry; friction columns are unchanged.
+
+    Args:
+        identification: the model and its rows.
+        chain: the arm with the other geometry.
+        cases: training data of the identification.
+    """
     model = make_model(chain, identification.settings)
     decimator = common_decimator(cases, identification.settings)
     base_count = identification.base.b
@@ -137,7 +149,7 @@ def rows_on(identification: Identification, chain: Chain, cases: Sequence[Case])
 
 
 def cut(rows: ObservationRows, part: slice) -> ObservationRows:
-    """Return the part of the rows in a slice."""
+    """Return the rows of the samples in the slice `part`."""
     matrix = rows.matrix[part]
     target = rows.target[part]
     present = rows.present[part]
@@ -158,7 +170,7 @@ def cut(rows: ObservationRows, part: slice) -> ObservationRows:
 
 
 def inverted(upper: np.ndarray) -> np.ndarray:
-    """Return the inverse of an upper triangular matrix (p, p) whose columns have different units."""
+    """Return the inverse of an upper triangular matrix (p, p), computed with columns scaled to unit norm."""
     unit = np.linalg.norm(upper, axis=0)
     identity = np.eye(len(unit))
     inverse = np.asarray(scipy.linalg.solve_triangular(upper / unit, identity))
@@ -166,12 +178,18 @@ def inverted(upper: np.ndarray) -> np.ndarray:
 
 
 def stacked(rows: ObservationRows) -> np.ndarray:
-    """Return the matrix of the rows (M rows, p), sample by sample."""
+    """Return the observation matrix of the rows as (M · rows, p), sample by sample."""
     return rows.matrix.reshape(-1, rows.matrix.shape[2])
 
 
 def weights(estimator: _Estimator, rows: ObservationRows, divisor: np.ndarray | None = None) -> np.ndarray:
-    """Return the weight of each stacked row, 1 / deviation (or 1 / `divisor`); zero for rows not used in training."""
+    """Return the weight of each stacked row (M · rows,): 1 / deviation, or zero for rows not used in training.
+
+    Args:
+        estimator: the estimator.
+        rows: M samples.
+        divisor: (rows,) numbers by which weights are divided instead of the estimator's deviation; None: the deviation.
+    """
     if divisor is None:
         divisor = estimator.deviation
     return (rows.weight / divisor).ravel()
@@ -183,13 +201,14 @@ class GeometryUncertainty(Frozen):
 
     Attributes:
         names: names of the p estimated parameters.
-        elements, units: the K elements of the chain, then the tilts of gravity about the base's x and y axes.
+        elements, units: names and units of the K elements of the chain, then of the tilts of gravity about the base's x
+            and y axes.
         sensitivity: (p, K + 2) dφ/dg.
-        torque: (p, p) covariance from the torques' noise: the estimate's own.
+        torque: (p, p) covariance due to the torques' noise, i.e. the covariance of the estimate.
         deviations: (K + 2,) standard deviations of the geometry; NaN where unknown.
-        geometry: (p, p) S Σ_geometry Sᵀ; None where no covariance of the geometry is known.
+        geometry: (p, p) S Σ_geometry Sᵀ; None if the covariance of the geometry is unknown.
         felt, left: (K + 2,) rms change of the rigid torque over rows and samples per unit of each element [N m or N],
-            at fixed parameters, and after estimating them again.
+            with fixed parameters, and with parameters estimated again.
     """
 
     names: tuple[str, ...]
@@ -204,7 +223,7 @@ class GeometryUncertainty(Frozen):
 
     @property
     def covariance(self) -> np.ndarray:
-        """Total covariance (p, p): Σ_torque + S Σ_geometry Sᵀ."""
+        """Total covariance (p, p): Σ_torque (`torque`) + S Σ_geometry Sᵀ (`geometry`), with S the sensitivity."""
         return np.asarray(self.torque) if self.geometry is None else self.torque + self.geometry
 
     @property
@@ -221,17 +240,17 @@ class GeometryUncertainty(Frozen):
 
     @property
     def sigma(self) -> np.ndarray:
-        """Standard deviation (p,) of the parameters due to both."""
+        """Standard deviation (p,) of the parameters due to torque noise and geometry together."""
         return np.hypot(self.sigma_torque, self.sigma_geometry)
 
     @property
     def changed(self) -> np.ndarray:
-        """Parameters whose σ grows by more than `NOTHING` (p,) bool."""
+        """Mask (p,) of parameters whose σ grows by a share of more than `NOTHING` due to the geometry."""
         return self.sigma > (1.0 + NOTHING) * self.sigma_torque
 
     @property
     def dominated(self) -> np.ndarray:
-        """Parameters whose geometric part of σ exceeds the torque part (p,) bool."""
+        """Mask (p,) of parameters for which the geometry's part of σ exceeds the part of the torque noise."""
         return self.sigma_geometry > self.sigma_torque
 
 
@@ -241,14 +260,14 @@ def propagate(
     cases: Sequence[Case],
     progress: Progress | None = None,
 ) -> GeometryUncertainty:
-    """Return the share of the identified parameters' covariance that comes from the covariance of the geometry.
+    """Return the geometry's contribution to the covariance of the identified parameters.
 
     Args:
         identification: the model and its rows.
-        robot: the robot of the identification; without a covariance (K, K) its geometry is taken as exact. Where joint
+        robot: the robot of the identification; without a covariance (K, K) its geometry is taken as exact. If joint
             corrections move the links, the uncertainty of their coefficients is included.
         cases: training data of the identification.
-        progress: called with a short text at each part; None: not called.
+        progress: function that is called with a short text at each part; None: not called.
     """
     robot = as_calibrated(robot)
     chain, covariance = robot.chain, robot.covariance
@@ -286,9 +305,16 @@ def propagate(
 def sensitivity(
     identification: Identification, chain: Chain, cases: Sequence[Case], progress: Progress | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return dφ/dg (p, K + 2), and rms changes of the rigid torque per unit, with φ fixed or re-estimated (K + 2,).
+    """Return dφ/dg (p, K + 2), and two arrays (K + 2,) of rms changes of the rigid torque per unit of g.
 
-    The last two columns turn gravity about the base's x and y axes [per rad].
+    The first rms changes are with fixed parameters φ, the second with parameters estimated again. The last two columns
+    of dφ/dg are tilts of gravity about the base's x and y axes [per rad].
+
+    Args:
+        identification: the model and its rows, with p parameters φ.
+        chain: the arm; g are the values of its K elements [m or rad], then two tilts of gravity [rad].
+        cases: training data of the identification.
+        progress: function that is called with a short text at each part; None: not called.
     """
     if not identification.dynamics.model.torque_rows.has_bodies:
         # Without bodies, no geometry affects the rows.
@@ -306,15 +332,15 @@ def solve_sensitivity(
     samples: int,
     progress: Progress | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the results of `sensitivity` for any robot, K changes of whose geometry `differences` evaluates.
+    """Return the results of `sensitivity` for any robot with K changes of its geometry.
 
     Args:
         identification: the model and its rows.
         cases: its training data.
-        differences: takes a case, samples of it, R⁻¹ (y - W φ) and the decimator; returns ∂(W φ - y)/∂g (M, rows, K)
-            and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K).
-        samples: at the full rate; longer recordings are represented by pieces.
-        progress: called with a few words at each part.
+        differences: function of a case, a slice of its samples, R⁻¹ (y - W φ) (residuals of the estimate φ over their
+            variances R) and the decimator that returns ∂(W φ - y)/∂g (M, rows, K) and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K).
+        samples: largest number of samples at the full rate; longer recordings are represented by pieces.
+        progress: function that is called with a short text at each part; None: not called.
     """
     weighting = estimator(identification)
     p = len(weighting.pull)
@@ -378,7 +404,12 @@ def solve_sensitivity(
 
 
 def _neighbours(identification: Identification, chain: Chain) -> list[tuple[Bodies, Bodies]]:
-    """Return pairs of bodies with one geometric element or one tilt of gravity changed by `STEP` up and down."""
+    """Return pairs of bodies with one geometric element, or one tilt of gravity, changed by +`STEP` and -`STEP`.
+
+    Args:
+        identification: the model, with its payloads.
+        chain: the arm.
+    """
     settings = identification.settings
     values = np.array(chain.values)
     pairs = []
@@ -397,9 +428,14 @@ def _neighbours(identification: Identification, chain: Chain) -> list[tuple[Bodi
 
 
 def pieces(case: Case, decimator: Decimator, step: int = 1) -> list[tuple[slice, slice]]:
-    """Return (decimated rows, full-rate samples that they depend on) of every `step`-th piece of a case.
+    """Return every `step`-th piece of a case, as pairs of slices; with step 1 each segment is one piece.
 
-    With step 1 each segment is one piece.
+    The first slice selects decimated rows, the second the full-rate samples on which these depend.
+
+    Args:
+        case: the recording.
+        decimator: filter and decimation of the rows.
+        step: 1 for all samples; k for every k-th piece only.
     """
     factor = decimator.factor
     size = max(PIECE // factor, MIN_PIECE)
@@ -430,8 +466,12 @@ def _differences(
     """Return (∂W/∂g) φ (M, rows, K + 2), filtered and decimated, and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K + 2).
 
     Args:
-        pairs: bodies with a changed geometry, see `_neighbours`.
-        residual: (M, rows) R⁻¹ (y - W φ) of the rows that the samples in `span` make.
+        identification: the model and its rows.
+        pairs: bodies with a changed geometry, from `_neighbours`.
+        case: the recording.
+        span: slice of its full-rate samples.
+        residual: (M, rows) R⁻¹ (y - W φ) of the decimated rows that depend on these samples.
+        decimator: filter and decimation.
     """
     model = identification.dynamics.model
     base = identification.base
@@ -473,7 +513,11 @@ def _differences(
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
-    """Return the root mean square of each column."""
+    """Return the root mean square of each column.
+
+    Args:
+        values: (M, columns) numbers.
+    """
     return np.sqrt(np.mean(values**2, axis=0))
 
 
@@ -483,10 +527,11 @@ class GeometryComparison:
 
     Attributes:
         names, units: names and units of the p parameters.
-        values: (2, p) on the nominal (CAD) and on the calibrated geometry.
-        sigma: (2, p) of both: from torque noise alone on the nominal, total on the calibrated geometry.
-        difference: (p,) standard deviation of the difference: the geometry's part, and the small part of the noise that
-            the two estimates do not share.
+        values: (2, p) estimates on the nominal (CAD) and on the calibrated geometry.
+        sigma: (2, p) standard deviations: due to torque noise alone on the nominal geometry, total on the calibrated
+            geometry.
+        difference: (p,) standard deviation of the difference: the geometry's part, and the small part of the torque
+            noise that affects the two estimates differently.
     """
 
     names: tuple[str, ...]
@@ -497,7 +542,7 @@ class GeometryComparison:
 
     @property
     def relative(self) -> np.ndarray:
-        """Relative difference (p,): 100 (nominal - calibrated) / |calibrated| [%]; NaN at zero."""
+        """Relative difference (p,), 100 (nominal - calibrated) / |calibrated| [%]; NaN if calibrated is zero."""
         nominal, calibrated = self.values
         with np.errstate(divide="ignore", invalid="ignore"):
             percent = 100.0 * (nominal - calibrated) / np.abs(calibrated)
@@ -507,10 +552,16 @@ class GeometryComparison:
 def compare(
     identification: Identification, uncertainty: GeometryUncertainty, nominal: Chain, cases: Sequence[Case]
 ) -> GeometryComparison:
-    """Return the comparison of the estimate with one from the same torques on the nominal geometry.
+    """Return a comparison of the estimate with one from the same torques on the nominal geometry.
 
-    Both are estimated by weighted least squares with the same weights; the difference is added to the identification's
-    estimate.
+    Weighted least squares with equal weights is solved on both geometries. The estimate on the nominal geometry is the
+    identification's estimate plus the difference of these two solutions.
+
+    Args:
+        identification: the model and its rows.
+        uncertainty: contribution of the geometry to the covariance.
+        nominal: chain with the nominal geometry.
+        cases: training data.
     """
     fitted = identification.fitted
     weighting = estimator(identification)
@@ -540,17 +591,29 @@ def compare(
 
 
 def _gain(inverse: np.ndarray, weighting: _Estimator, rows: ObservationRows) -> np.ndarray:
-    """Return A⁻¹ Wᵀ R⁻¹ (p, M rows), the change of the estimate per unit of each row's torque."""
+    """Return A⁻¹ Wᵀ R⁻¹ (p, M · rows): the change of the estimate per unit of each row's torque.
+
+    Args:
+        inverse: A⁻¹ (p, p), with A = Wᵀ R⁻¹ W plus the prior's information.
+        weighting: weights of the rows.
+        rows: M samples.
+    """
     weight = weights(weighting, rows, weighting.deviation**2)
     return inverse @ (stacked(rows) * weight[:, None]).T
 
 
 def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases: Sequence[Case]) -> np.ndarray:
-    """Return the derivative (p, E) of the estimate by the joint corrections' coefficients; zero for unused ones.
+    """Return the derivatives (p, E) of the estimate by the coefficients of E joint corrections; zero for unused ones.
 
         dφ/dc = -(Wᵀ R⁻¹ W)⁻¹ Wᵀ R⁻¹ Σ_s ∂τ/∂s b_s,    s one of q, v, a of the joint, b_s the basis or its derivative
 
-    as in `sensitivity`, without the part that is proportional to the residual.
+    with W the observation matrix, R the variances of its rows, τ the torques; as in `sensitivity`, but without the part
+    that is proportional to the residual. A model without bodies (rows ``drive``) feels no deflection.
+
+    Args:
+        found: the identification.
+        robot: its robot, with joint corrections.
+        cases: training data of the identification, with the motion of the links.
     """
     terms = robot.deflection
     chain = robot.complete
@@ -563,6 +626,8 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
     base_values = found.fitted.estimate.values[: found.base.b]
     standard = found.base.to_standard(base_values)[: model.inertial]
     pull = np.zeros((len(inverse), len(terms.terms)))
+    if not model.inertial:
+        return pull
     seen = 0
     every = -(-sum(len(case.motion) for case in cases) // DEFLECTION_SAMPLES)
     for rows, case in zip(found.rows, cases):
@@ -590,7 +655,14 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
 
 
 def _torque_slopes(bodies: Bodies, values: np.ndarray, states: Sequence[np.ndarray], joint: int) -> np.ndarray:
-    """Return ∂τ/∂q_j, ∂τ/∂v_j and ∂τ/∂a_j (3, N, n) of one joint by central differences."""
+    """Return ∂τ/∂q_j, ∂τ/∂v_j and ∂τ/∂a_j (3, N, n) for one joint j, by central differences.
+
+    Args:
+        bodies: the robot's bodies.
+        values: (10 B,) standard parameters.
+        states: q, v, a, (N, n) each [rad or m, and per s, per s²].
+        joint: index of joint j, from 0.
+    """
     result = np.zeros((3, *states[0].shape))
     for order in range(3):
         for sign in (1.0, -1.0):

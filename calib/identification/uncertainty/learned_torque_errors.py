@@ -1,13 +1,14 @@
 """Estimation of the expected torque errors from a model's errors on held-out training time.
 
-κ, v and u of `calib.identification.uncertainty.torque_errors` are the most probable values given errors on held-out
-time: each block, and each half from the other. A few blocks of one joint identify the three badly, and κ = 0 would
-neglect the covariance: each joint's values are regularised towards those of all joints, and towards κ = 1. An error
-consists of the residual of the torque as recorded, ripple and noise above the band included, and of the change of the
-prediction when parameters are estimated without the held-out time. A joint at rest has a separate floor: errors at
-rest, each standstill counted once, and the variance F_c² / 3 of a friction that may be anything within ± F_c, worth
-`BORROWED` standstills. How much the sizes of errors in motion differ between blocks shows how much they may differ in
-other motion: 1.96 of the stated sigma cover 95 % of errors if the logarithm of their size has a t distribution.
+κ, v and u of `calib.identification.uncertainty.torque_errors` are the most probable values given the errors on held-out
+time: those of each block, and of each half predicted from the other. A few blocks of one joint identify the three
+poorly, and κ = 0 would neglect the covariance. Therefore each joint's values are regularised towards those of all
+joints, and towards κ = 1. An error consists of the residual of the recorded torque (including ripple and noise above
+the band), and of the change of the prediction if parameters are estimated without the held-out time. Joints at rest
+have a separate variance. It is estimated from errors at rest, each standstill counted once, and from the variance F_c²
+/ 3 of a friction evenly distributed within ± F_c, which counts as `BORROWED` standstills. The variation of the errors'
+size between blocks shows how much it may vary in other motion: 1.96 predicted sigmas cover 95 % of errors if the
+logarithm of their size has a t distribution.
 """
 
 from collections.abc import Sequence
@@ -74,7 +75,8 @@ class _HeldOut:
 
     Attributes:
         errors: (m, rows) errors of the torques [N m or N].
-        variance_terms: (m, rows, 3) variance due to the parameters, 1, and log(1 + d²).
+        variance_terms: (m, rows, 3) variance due to the parameters, 1, and log(1 + d²), with d the distance from the
+            training data.
         moves: (m, rows) whether the row's joint moves.
     """
 
@@ -90,8 +92,8 @@ def learn_torque_errors(
 
     Args:
         identification: the model and its rows.
-        cases: the recordings it was identified from.
-        covariance: (p, p) of its parameters; None: that of its estimate.
+        cases: the training recordings.
+        covariance: (p, p) covariance of the parameters; None: that of the estimate.
     """
     if not isinstance(identification.dynamics.model, IdentificationModel):
         return None
@@ -135,10 +137,16 @@ def learn_torque_errors(
 
 
 def _interval_factors(folds: Sequence[_HeldOut], weights: np.ndarray, run_count: int) -> np.ndarray:
-    """Return factors (rows,) of predicted sigmas, such that ± 1.96 sigma cover 95 % of errors on other motion.
+    """Return factors (rows,) of predicted sigmas with which ± 1.96 sigma cover 95 % of errors on other motion.
 
-    The size of a row's normalised errors differs from run to run. The variance of its logarithm over runs, regularised
-    towards the mean of all rows, says how large errors on one more run may be: Student's t with that variance.
+    The size of a row's normalised errors varies from run to run (a run is a set of time blocks held out together). The
+    variance of its logarithm over runs, regularised towards the mean of all rows, shows how large the errors of one
+    more run may be: Student's t distribution with that variance.
+
+    Args:
+        folds: held-out runs, then halves.
+        weights: (rows, 3) κ, v and u.
+        run_count: number of runs.
     """
     log_sizes, normalised = [], []
     for row, row_weights in enumerate(weights):
@@ -166,13 +174,12 @@ class _Samples:
 
     Attributes:
         states: (3, M, n) q, v and a.
-        torque, error: (M, rows) recorded torque, and its prediction error by the final model.
+        torque, error: (M, rows) recorded torque, and prediction error of the final model [N m or N].
         matrix: (M, rows, p) filtered columns.
-        block: (M,) number of the time block; -1 for samples not compared.
-        trajectory, trajectory_block: (K, 2 n) q and v at the full rate, or a sufficient part of it, and their time
-            blocks.
-        triangles: triangles of all rows, see `calib.identification.rows.triangulate`.
-        values: (p,) estimated from all rows.
+        block: (M,) number of the time block; -1 for samples that are not used.
+        trajectory, trajectory_block: (K, 2 n) q and v at up to the full rate, and their time blocks (K,).
+        triangles: R factors of all rows by time block and torque row.
+        values: (p,) parameters estimated from all rows.
     """
 
     states: np.ndarray
@@ -186,7 +193,10 @@ class _Samples:
     values: np.ndarray
 
     def training_range(self, selected: np.ndarray | slice = slice(None)) -> TorqueDiscrepancy:
-        """Return the range of the selected states with the standard deviation of all states; error terms are empty."""
+        """Return the range of the selected states, with the standard deviations of all states.
+
+        The error terms of the result are empty.
+        """
         states = self.states[:, selected]
         lower = tuple(map(tuple, states.min(axis=1).tolist()))
         upper = tuple(map(tuple, states.max(axis=1).tolist()))
@@ -196,7 +206,12 @@ class _Samples:
 
 
 def _collect_samples(identification: Identification, cases: Sequence[Case]) -> _Samples:
-    """Return motion and residuals of all recordings at their decimated samples."""
+    """Return motion and residuals of all recordings at their decimated samples.
+
+    Args:
+        identification: the model and its rows.
+        cases: the training recordings.
+    """
     dynamics = identification.dynamics
     decimator = common_decimator(cases, identification.settings)
     states = []
@@ -249,10 +264,14 @@ def _collect_samples(identification: Identification, cases: Sequence[Case]) -> _
 
 
 def _independent_runs(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarray]:
-    """Return the blocks to hold out together: each block with all blocks that repeat its motion.
+    """Return sets of blocks to hold out together ("runs"): each block with all blocks that repeat its motion.
 
-    A block is repeated by another that has been in half of its states (see `calib.data.signals.persistency.repeats`).
-    Where that leaves fewer than two runs, each block is a run of its own.
+    Another block repeats a block's motion if it passes through at least half of its states
+    (`calib.data.signals.persistency.repeats`). If this gives fewer than two runs, each block is a run.
+
+    Args:
+        samples: motion of all recordings.
+        blocks: numbers of the time blocks.
     """
     spread = np.maximum(samples.trajectory.std(axis=0), 1e-6)
     max_distance = SAME_STATE * np.sqrt(len(spread))
@@ -276,7 +295,13 @@ def _independent_runs(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarr
 
 
 def _estimate(identification: Identification, data: Triangles, blocks: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values (p,) estimated from some time blocks, and a root (p, k) of their covariance."""
+    """Return the parameters (p,) estimated from some time blocks, and a root (p, k) of their covariance.
+
+    Args:
+        identification: the model, with weights and prior.
+        data: R factors by time block and torque row.
+        blocks: numbers of the time blocks in use.
+    """
     fitted = identification.fitted
     base_count = identification.base.b
     friction_group = np.asarray(identification.friction.groups, dtype=int)
@@ -309,14 +334,25 @@ def _estimate(identification: Identification, data: Triangles, blocks: Sequence[
 
 
 def _coulomb_friction(identification: Identification) -> np.ndarray:
-    """Return Coulomb's friction (rows,) of the torque rows that hold a motor's; zero in others [N m or N]."""
+    """Return the Coulomb friction (rows,) of torque rows that contain a motor's friction, else zero [N m or N].
+
+    Args:
+        identification: the model with its parameter values.
+    """
     # Recordings that are weighed apart repeat the rows of the model.
     coulomb = identification.rows[0].coulomb[: identification.dynamics.model.rows]
     return np.sum(np.abs(identification.fitted.estimate.values) * coulomb, axis=1)
 
 
 def _standing_speeds(identification: Identification, friction: np.ndarray) -> np.ndarray:
-    """Return the speeds (n,) below which joints stand: Coulomb's sign is as wide; zero where no row has friction."""
+    """Return the speeds (n,) below which joints count as at rest, the width of Coulomb's sign [rad/s or m/s].
+
+    They are zero if no torque row contains friction.
+
+    Args:
+        identification: the model, with the width of Coulomb's sign.
+        friction: (rows,) Coulomb friction of the torque rows [N m or N].
+    """
     n = identification.dynamics.model.n
     if not friction.any():
         return np.zeros(n)
@@ -326,12 +362,15 @@ def _standing_speeds(identification: Identification, friction: np.ndarray) -> np
 def _hold_out(
     identification: Identification, samples: _Samples, run: Sequence[int] | np.ndarray, standing_speeds: np.ndarray
 ) -> _HeldOut:
-    """Return the errors on the blocks of a run, predicted by the parameters that all other blocks give.
+    """Return the errors on the blocks of a run, predicted with parameters estimated from all other blocks.
 
-    Errors are limited to the size of the torque: a fold that fails completely does not represent the final model.
+    Errors are limited to the rms torque: a fold that fails completely is not representative of the final model.
 
     Args:
-        standing_speeds: (n,) speeds below which a joint stands.
+        identification: the model and its rows.
+        samples: motion and residuals.
+        run: numbers of the held-out blocks.
+        standing_speeds: (n,) speeds below which a joint counts as at rest [rad/s or m/s].
     """
     block_count = samples.triangles.groups // len(identification.fitted.std)
     remaining = [block for block in range(block_count) if block not in run]
@@ -354,11 +393,11 @@ def _hold_out(
 
 
 def _rest_floors(folds: Sequence[_HeldOut], friction: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the variance of unmodelled effects of standing joints (rows,) [N² m² or N²].
+    """Return the variance (rows,) of unmodelled effects for joints at rest [N² m² or N²].
 
     Args:
         folds: held-out runs.
-        friction: (rows,) Coulomb's.
+        friction: (rows,) Coulomb friction [N m or N].
         weights: (rows, 3) κ, v and u in motion.
     """
     expected = weights[:, 1] + friction**2 / 3.0
@@ -377,11 +416,15 @@ def _rest_floors(folds: Sequence[_HeldOut], friction: np.ndarray, weights: np.nd
 
 
 def _variance_weights(folds: Sequence[_HeldOut], run_count: int) -> np.ndarray:
-    """Return the weights (rows, 3) of the error variance's terms in motion, regularised towards those of all rows.
+    """Return the weights κ, v, u (rows, 3) of the error variance in motion, regularised by all rows' errors.
 
     In units of a row's mean square error, κ and u / v are comparable between rows. A row's errors are supplemented by
-    those of all other rows, worth `BORROWED` blocks, and by two expectations: that the covariance is correct (worth a
-    block), and that errors grow beyond the training range, which folds hardly leave where motion repeats.
+    those of all other rows, which count as `BORROWED` blocks, and by two expectations: that the covariance is correct
+    (counting as one block), and that errors grow beyond the training range, which repeated motion hardly tests.
+
+    Args:
+        folds: held-out runs, then halves.
+        run_count: number of runs.
     """
     errors = np.concatenate([fold.errors for fold in folds])
     terms = np.concatenate([fold.variance_terms for fold in folds])
@@ -421,9 +464,15 @@ def _variance_weights(folds: Sequence[_HeldOut], run_count: int) -> np.ndarray:
 
 
 def _normalised_errors(folds: Sequence[_HeldOut], row: int, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return for one row the log rms of error over predicted sigma in each fold, and all errors over sigma and rms.
+    """Return the log sizes of a row's normalised errors in each fold, and all its errors divided by sigma and size.
 
-    Errors are those in motion, or at rest in a fold in which the row's joint does not move.
+    Normalised errors are errors over predicted sigma; their size is their rms. Errors are those in motion, or at rest
+    in a fold in which the row's joint does not move.
+
+    Args:
+        folds: held-out blocks.
+        row: torque row.
+        weights: (3,) κ, v and u of this row.
     """
     squares, variances = [], []
     for fold in folds:

@@ -1,13 +1,14 @@
-"""Expected errors of predicted torques: from the parameters' uncertainty, and from unmodelled effects.
+"""Expected errors of predicted torques: due to the parameters' uncertainty, and due to unmodelled effects.
 
     E e_j² = κ_j w_j Σ w_jᵀ + v_j + u_j log(1 + d_j²)
 
-with w_j the torque row's regressor, Σ the parameters' covariance, and d_j the distance of its joint's q, v, a from the
-training range, each in units of its standard deviation. The effect of the parameters far from the training range is in
-Σ; unmodelled effects (friction of another form, ripple) have a limited size and grow slowly with distance, hence the
-logarithm. κ, v and u come from errors on time left out (`calib.identification.uncertainty.learned_torque_errors`).
+where w_j is the torque row's regressor, Σ the covariance of the parameters, and d_j the distance of its joint's q, v, a
+from the training range, each in units of its standard deviation. The effect of the parameters far from the training
+range is in Σ. Unmodelled effects (friction of another form, ripple) have a limited size and grow slowly with distance,
+hence the logarithm. κ, v and u are estimated from errors on held-out time
+(`calib.identification.uncertainty.learned_torque_errors`).
 
-`Uncertainty` has the parameters' share alone: standard deviations of torques from the covariance.
+`Uncertainty` contains the parameters' part alone: standard deviations of torques from the covariance.
 """
 
 from collections.abc import Collection, Sequence
@@ -46,10 +47,10 @@ class Uncertainty:
     """An identified model with the covariance of its parameters.
 
     Attributes:
-        dynamics: the model; values of payloads that are not mounted are zero.
-        carried: labels of the mounted payloads.
+        dynamics: the model; values of payloads that are not attached are zero.
+        carried: labels of the attached payloads.
         columns: (k,) indices of the estimated columns of the regressor.
-        covariance: (k, k) of their parameters.
+        covariance: (k, k) covariance of the estimated parameters.
     """
 
     dynamics: Dynamics
@@ -58,14 +59,24 @@ class Uncertainty:
     covariance: np.ndarray
 
     def sigma(self, sampled: Sampled) -> np.ndarray:
-        """Return the largest standard deviation of each torque along a motion (n,): √(w Σ wᵀ) [N m or N]."""
+        """Return the largest standard deviation √(w Σ wᵀ) of each joint's torque along a motion (n,) [N m or N].
+
+        Args:
+            sampled: times, positions, velocities and accelerations of the motion; w is the torque's regressor, Σ the
+                covariance.
+        """
         state = sampled.q, sampled.v, sampled.a
         variances = parameter_variances(self.dynamics, self.columns, self.covariance, *state, self.carried)
         return np.sqrt(variances.max(axis=0))[-sampled.q.shape[1] :]
 
 
 def estimated_columns(dynamics: Dynamics, names: Sequence[str]) -> np.ndarray:
-    """Return the regressor columns (k,) of the estimated parameters.
+    """Return the regressor columns (k,) of the estimated parameters, by their names.
+
+    Args:
+        dynamics: the model.
+        names: names of the k estimated parameters; for a base parameter such as ``ZZ1R``, the column is that of
+            ``ZZ1``.
 
     Raises:
         ValueError: for a name that the model does not have.
@@ -84,12 +95,15 @@ def parameter_variances(
     carried: Collection[str] | None = None,
     states: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return the variances w Σ wᵀ (N, rows) of torques, for columns (k,) with covariance Σ (k, k) [N² m² or N²].
+    """Return the variances w Σ wᵀ (N, rows) of torques [N² m² or N²] due to the parameters' covariance.
 
     Args:
+        dynamics: the model.
+        columns: (k,) indices of the estimated columns.
+        covariance: Σ (k, k).
         q, v, a: (N, n) states.
-        carried: labels of the payloads on board; None: all.
-        states: (s, N) of friction with memory; None: q is one uninterrupted record.
+        carried: labels of the attached payloads; None: all.
+        states: (s, N) states of friction with hysteresis; None: computed here, with q as one uninterrupted record.
     """
     model = dynamics.model
     if states is None:
@@ -116,26 +130,37 @@ def parameter_variances(
 
 
 def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -> Uncertainty | None:
-    """Read the covariance of an identification's parameters from its folder; None without the file."""
+    """Return an identified model with the covariance of its parameters, read from its folder; None without the file.
+
+    Args:
+        folder: folder of the identification.
+        dynamics: the model of this folder.
+        carried: labels of the attached payloads.
+
+    Raises:
+        UsageError: if covariance and model do not match.
+    """
     if not (folder / COVARIANCE).is_file():
         return None
     names, covariance = read_covariance(folder)
-    with refused_as(UsageError, ValueError, f"{folder}/covariance.csv and dynamics.json do not match: {{}}"):
+    with refused_as(
+        UsageError, ValueError, f"{folder}/covariance.csv and dynamics.json do not match: {{}}; identify again"
+    ):
         columns = estimated_columns(dynamics, names)
     return Uncertainty(dynamics, tuple(carried), columns, covariance)
 
 
 @dataclass(frozen=True)
 class TorqueDiscrepancy:
-    """Variance model of the torque's errors, estimated on held-out time.
+    """Variance model of the torque errors, estimated on held-out time.
 
     Attributes:
         parameters: (rows,) κ, factor of the parameters' variance.
         floor: (rows,) v [N² m² or N²], variance of unmodelled effects.
-        beyond: (rows,) u, additional variance per log(1 + d²), d the distance from the training data.
-        lower, upper, scale: (3, n) least and largest q, v, a of the training data, and their standard deviations.
+        beyond: (rows,) u, additional variance per log(1 + d²), with d the distance from the training data.
+        lower, upper, scale: (3, n) smallest and largest q, v, a of the training data, and their standard deviations.
         rest: (rows,) variance that replaces v while a joint is at rest [N² m² or N²]; () in files of earlier versions.
-        standing: (n,) speeds below which a joint stands [rad/s or m/s]; () in files of earlier versions.
+        standing: (n,) speeds below which a joint counts as at rest [rad/s or m/s]; () in files of earlier versions.
     """
 
     parameters: tuple[float, ...]
@@ -148,7 +173,12 @@ class TorqueDiscrepancy:
     standing: tuple[float, ...] = ()
 
     def at_rest(self, v: np.ndarray, rows: int) -> np.ndarray:
-        """Return the mask (N, rows) of torque rows whose joint stands, from velocities (N, n)."""
+        """Return the mask (N, rows) of torque rows whose joint is at rest, from velocities v (N, n).
+
+        Args:
+            v: (N, n) joint velocities [rad/s or m/s].
+            rows: number of torque rows.
+        """
         if not self.rest:
             return np.zeros((len(v), rows), dtype=bool)
         stands = np.abs(v) < np.array(self.standing)
@@ -159,14 +189,29 @@ class TorqueDiscrepancy:
         return np.tile(stands, repetitions)
 
     def floors(self, v: np.ndarray, rows: int) -> np.ndarray:
-        """Return the variance of unmodelled effects (N, rows) at velocities (N, n) [N² m² or N²]."""
+        """Return the variance of unmodelled effects (N, rows) [N² m² or N²] for velocities v (N, n).
+
+        It is v_j in motion, and `rest` while the joint is at rest.
+
+        Args:
+            v: (N, n) joint velocities [rad/s or m/s].
+            rows: number of torque rows.
+        """
         moving = np.broadcast_to(np.array(self.floor), (len(v), rows))
         if not self.rest:
             return moving
         return np.where(self.at_rest(v, rows), np.array(self.rest), moving)
 
     def distance(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, rows: int) -> np.ndarray:
-        """Return log(1 + d²) (N, rows) of states q, v, a (N, n) each: of the row's joint, or of all joints."""
+        """Return log(1 + d²) (N, rows), with d the distance of states q, v, a (N, n) from the training range.
+
+        d has no unit: distances in q, v and a are divided by the standard deviations of the training data. It is that
+        of the row's joint; for rows of other torques than those of single joints, that of all joints together.
+
+        Args:
+            q, v, a: (N, n) states [rad or m, and per s, per s²].
+            rows: number of torque rows.
+        """
         scaled = self._excess(q, v, a) / np.array(self.scale)[:, None]
         square = np.sum(scaled**2, axis=0)
         repetitions, remainder = divmod(rows, square.shape[1])
@@ -176,12 +221,15 @@ class TorqueDiscrepancy:
         return np.log1p(np.tile(square, repetitions))
 
     def extrapolated(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the mask (3, N, n) of states outside the training range, by q, v, a and joint."""
+        """Return the mask (3, N, n) of q, v, a (first index) of each joint that are outside the training range."""
         training_range = np.array(self.upper) - np.array(self.lower)
         return self._excess(q, v, a) > MAX_OUTSIDE * training_range[:, None]
 
     def _excess(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return how far states are outside the training range (3, N, n); zero within it."""
+        """Return the distances (3, N, n) of q, v, a of each joint from the training range; zero within it.
+
+        They are in units of the standard deviations of the training data.
+        """
         states = np.stack([q, v, a])
         lower = np.array(self.lower)[:, None]
         upper = np.array(self.upper)[:, None]
@@ -194,8 +242,8 @@ class TorqueErrorModel:
 
     Attributes:
         columns: (k,) indices of the estimated columns of the model's regressor.
-        covariance: (k, k) of their parameters.
-        discrepancy: see `TorqueDiscrepancy`.
+        covariance: (k, k) covariance of the estimated parameters.
+        discrepancy: variance model of the errors.
     """
 
     columns: np.ndarray
@@ -211,13 +259,13 @@ class TorqueErrorModel:
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return standard deviations (N, rows) of the errors of predicted torques [N m or N]; 1.96 of them cover 95 %.
+        """Return standard deviations (N, rows) of errors of predicted torques [N m or N]; ± 1.96 of them cover 95 %.
 
         Args:
             dynamics: the model that predicts.
             q, v, a: (N, n) states [rad or m, and per s, per s²].
-            carried: labels of the payloads on board; None: all.
-            states: (s, N) of friction with memory; None: q is one uninterrupted record.
+            carried: labels of the attached payloads; None: all.
+            states: (s, N) states of friction with hysteresis; None: computed here, with q as one uninterrupted record.
         """
         discrepancy = self.discrepancy
         by_parameters = parameter_variances(dynamics, self.columns, self.covariance, q, v, a, carried, states)
@@ -229,15 +277,15 @@ class TorqueErrorModel:
 
 @dataclass(frozen=True, eq=False)
 class TorqueIntervals:
-    """Predicted error intervals of a model on one recording, and whether they contain the errors, at M samples.
+    """Predicted error intervals of a model at M samples of a recording, and whether they contain the errors.
 
     Attributes:
         index: (M,) indices of the samples.
         sigma: (M, rows) predicted standard deviations [N m or N].
         contains: (M, rows) whether the actual errors are within 1.96 predicted standard deviations.
         valid: (M,) False at lost samples, which are not counted.
-        standing: (M, rows) whether the row's joint stands.
-        extrapolated: (3, M, n) whether the motion leaves the training range, by q, v, a and joint.
+        standing: (M, rows) whether the row's joint is at rest.
+        extrapolated: (3, M, n) whether q, v, a (first index) of each joint are outside the training range.
     """
 
     index: np.ndarray
@@ -249,33 +297,33 @@ class TorqueIntervals:
 
     @property
     def covered(self) -> float:
-        """Share of all errors within their interval."""
+        """Share of all errors that are within their intervals."""
         return float(np.mean(self.contains[self.valid]))
 
     @property
     def joints(self) -> np.ndarray:
-        """Share of the errors within their interval, by torque row (rows,)."""
+        """Share of the errors of each torque row that are within their intervals (rows,)."""
         return np.asarray(np.mean(self.contains[self.valid], axis=0))
 
     @property
     def independent(self) -> np.ndarray:
-        """Number of independent errors (rows,), from the autocorrelation of `contains`."""
+        """Number of independent errors of each torque row (rows,), from the autocorrelation of `contains`."""
         contains = self.contains[self.valid].astype(float)
         return np.array([len(contains) / inflation(column) for column in contains.T])
 
     @property
     def median(self) -> np.ndarray:
-        """Median half width of interval in motion (rows,) [N m or N]; that at rest for a joint that does not move."""
+        """Median half width of the intervals in motion (rows,) [N m or N]; at rest for a joint that does not move."""
         moving = self._median(~self.standing)
         return np.where(np.isfinite(moving), moving, self._median(self.standing))
 
     @property
     def median_at_rest(self) -> np.ndarray:
-        """Median half width of the interval at rest (rows,) [N m or N]; NaN where a joint does not stand."""
+        """Median half width of the intervals at rest (rows,) [N m or N]; NaN for a joint that is never at rest."""
         return self._median(self.standing)
 
     def _median(self, selected: np.ndarray) -> np.ndarray:
-        """Return the median half width (rows,) over some samples (M, rows); NaN without any."""
+        """Return the median half width of each row (rows,) over the selected samples (M, rows); NaN without any."""
         medians = np.full(selected.shape[1], np.nan)
         for row in range(selected.shape[1]):
             sigma = self.sigma[selected[:, row], row]
@@ -285,11 +333,11 @@ class TorqueIntervals:
 
     @property
     def beyond(self) -> np.ndarray:
-        """Whether each sample extrapolates (M,) bool."""
+        """Mask (M,) of samples in which any joint is outside the training range."""
         return np.asarray(self.extrapolated.any(axis=(0, 2)))
 
     def coverage(self) -> IntervalCoverage:
-        """Return the record of the shares of errors within their intervals."""
+        """Return the record of the shares of errors that are within their intervals."""
         samples = int(self.valid.sum())
         beyond_percent = 100.0 * float(self.beyond.mean())
         return IntervalCoverage(
@@ -297,7 +345,10 @@ class TorqueIntervals:
         )
 
     def ways(self, joints: Sequence[str]) -> list[str]:
-        """Return texts on how the motion leaves the training range: by q, v or a, and at which of the named joints."""
+        """Return texts on how the motion leaves the training range: position, speed or acceleration, and which joints.
+
+        `joints` are the names of the joints.
+        """
         texts = []
         for text, by_joint in zip(EXTRAPOLATIONS, np.any(self.extrapolated, axis=1).tolist()):
             names = [name for name, extrapolated in zip(joints, by_joint) if extrapolated]
@@ -307,7 +358,14 @@ class TorqueIntervals:
 
 
 def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicted: np.ndarray) -> TorqueIntervals:
-    """Return a model's 95 % error bounds on a recording, and which errors of `predicted` (N, rows) lie within them."""
+    """Return a model's 95 % error intervals on a recording, and which errors are within them.
+
+    Args:
+        errors: model of the errors.
+        dynamics: the model that predicts.
+        case: the recording.
+        predicted: (N, rows) predicted torques [N m or N].
+    """
     motion = case.motion
     count = len(motion)
     index = evenly(count, MAX_INTERVAL_SAMPLES)

@@ -5,10 +5,10 @@ Newton's method on the closure equations of all legs at once, eliminated leg by 
     J_k δq_k = G_k t - e_k        tip velocity of leg k = rigid-body velocity of its attachment, e_k the gap
     δq_k = J_k⁺ (G_k t - e_k),    t = t_0 + D v    with v the independent parts of the platform's twist
 
-From encoders, v minimises the distance to all readings, so that redundant ones have equal weights (eq. 16 of Briot,
-Gautier & Krut 2013 is the same for velocities). Samples are solved together. Whatever the motion, a sample is reached
-from home along a straight line in steps too short to jump to another branch; a minor of each leg's Jacobian, and with
-as many actuators as freedoms that of the platform, must keep its sign along it.
+From encoders, v minimises the distance to all readings, so that redundant encoders have equal weights (for velocities:
+eq. 16 of Briot, Gautier & Krut 2013). All samples are solved at once. A sample is reached from home along a straight
+line, in steps too short to jump to another branch of the solution. At the samples a minor of each leg's Jacobian must
+have the sign that it has at home; without redundant actuators also the determinant of the platform's Jacobian.
 """
 
 from __future__ import annotations
@@ -30,7 +30,12 @@ from calib.records import frozen, shaped
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """N solutions: joints of the whole tree q (N, n_t) [rad or m], and poses of the platform (N, 4, 4)."""
+    """N postures of a robot.
+
+    Attributes:
+        q: (N, n_t) values of all joints of all legs [rad or m], leg after leg.
+        pose: (N, 4, 4) poses of the platform in the base.
+    """
 
     q: np.ndarray
     pose: np.ndarray
@@ -44,15 +49,15 @@ class Posture:
 
 @dataclass(frozen=True, eq=False)
 class LegLinks:
-    """One leg at N postures.
+    """Jacobians and gap of one leg at N postures.
 
     Attributes:
-        full: (N, 6, n) Jacobian of its end: velocity, angular velocity; jacobian: (N, c, n) its rows for the c closure
-            equations.
-        inverse: (N, n, c) J⁺.
+        full: (N, 6, n) Jacobian of the leg's end: velocity, then angular velocity, per rate of n joints.
+        jacobian: (N, c, n) J, the rows of `full` for the c closure equations.
+        inverse: (N, n, c) pseudoinverse J⁺.
         carried: (N, c, 6) G, which maps the platform's twist to the attachment's velocity.
-        gap: (N, c) distance of the leg's end from the attachment [m, rad].
-        lever: (N, 3) from the platform's origin to the attachment, in the base's axes.
+        gap: (N, c) displacement of the leg's end from the attachment [m, rad].
+        lever: (N, 3) vector from the platform's origin to the attachment, in the base's axes [m].
     """
 
     full: np.ndarray
@@ -64,11 +69,12 @@ class LegLinks:
 
 
 def leg_links(robot: ParallelRobot, posture: Posture) -> list[LegLinks]:
-    """Return every leg's Jacobian, attachment and gap at postures, by rigid-body relations alone."""
+    """Return the Jacobians and the gap of each leg at postures; the loops need not be closed."""
     starts = robot.starts
     links = []
     for leg, start, end in zip(robot.legs, starts, starts[1:]):
-        links.append(links_of(leg, posture.q[:, start:end], posture.pose))
+        q = posture.q[:, start:end]
+        links.append(links_of(leg, q, posture.pose))
     return links
 
 
@@ -89,7 +95,7 @@ def times(A: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 
 def links_of(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
-    """Return Jacobian, attachment and gap of a leg at joint values q (N, n) and platform poses (N, 4, 4)."""
+    """Return the Jacobians and the gap of a leg at joint values q (N, n) and platform poses (N, 4, 4)."""
     from calib.parallel.mechanism import closure_kernels
 
     count, n = q.shape
@@ -99,37 +105,55 @@ def links_of(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
     gap = np.zeros((count, leg.held))
     lever = np.zeros((count, 3))
     bodies, tail = compiled(leg)
-    # numba compiles per kind of array
+    # numba compiles a kernel once per memory layout of its arrays
     q = np.require(q, requirements=["C", "W"])
     pose = np.require(pose, requirements=["C", "W"])
     closure_kernels.legs(
         bodies.links, bodies.constants, tail, leg.attachment, q, pose, full, inverse, carried, gap, lever
     )
-    return LegLinks(full, full[:, : leg.held], inverse, carried, gap, lever)
+    jacobian = full[:, : leg.held]
+    return LegLinks(full, jacobian, inverse, carried, gap, lever)
 
 
 @lru_cache(maxsize=256)
 def compiled(leg: Leg) -> tuple[Bodies, np.ndarray]:
-    """Return a leg's arrays for the kernels: its bodies, and its end (4, 4) in its last body's turned frame."""
+    """Return a leg's arrays for the kernels.
+
+    Returns:
+        The leg's bodies, and the pose (4, 4) of its end in the last body's frame, turned so that z is the joint's axis.
+    """
     bodies = bodies_of(leg.chain)
     turn = upright_turn(int(bodies.axes[-1]))
     return bodies, frozen(turn.T @ leg.chain.tail)
 
 
-# gap and step [m or rad] below which a loop is closed
+# Gap and Newton step [m or rad] below which a loop counts as closed.
 CLOSED = 1e-10
-# of one step [rad or m]
+# Gap [m or rad] at home from which on a robot's file is refused.
+MAX_HOME_GAP = 1e3 * CLOSED
+# Largest Newton step [rad or m].
 BOUND = 0.5
-# reciprocal condition below which a posture is called singular (our choice)
+# Reciprocal condition below which a posture is called singular (our choice).
 SINGULAR = 1e-4
-# the same, where Newton's steps fail: that explains it (our choice)
+# Reciprocal condition below which a message attributes a failure of Newton's method to a singularity (our choice).
 WEAK = 0.02
-# samples of a record of which the first is reached from home, the others from it
+# Of a record every SPACING-th sample is reached from home, the samples between from the nearest of these.
 SPACING = 16
-# of a reading or coordinate between two solutions on the way from home [rad or m] (our choice)
+# Largest change of a reading or coordinate between two solutions on the way from home [rad or m] (our choice).
 MAX_STRIDE = 0.25
-# of Newton's method
+# Largest number of Newton steps, and of steps that are made in a rough solution on the way from home.
 MAX_STEPS = 60
+ROUGH_STEPS = 2
+# Number of steps by which each leg is closed at home, with the platform at rest.
+HOME_STEPS = 10
+# Number of random postures at which a leg that is singular at home is examined.
+EXAMINED_POSTURES = 4
+# Number of postures near home at which the platform's freedoms are counted, and their distance as a share of the box.
+FREEDOM_POSTURES = 4
+FREEDOM_DISTANCE = 0.05
+# Relative singular value below which a direction counts as free, and condition of freedoms that are not distinguished.
+RANK_TOLERANCE = 1e-9
+MAX_FREEDOM_CONDITION = 1e8
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +163,11 @@ class ClosedRobot:
     Attributes:
         robot: the robot's legs and platform.
         home: posture at home, with one sample.
-        minors: per leg, rows of its Jacobian; the sign of their determinant identifies the leg's branch.
-        signs: (L + 1,) signs of these determinants at home; last the sign for the encoders' rows (0 if they are
-            redundant).
-        fixed: whether the platform's possible twists are the named freedoms in the whole workspace.
+        minors: for each leg, indices of n rows of its Jacobian; the sign of their determinant identifies the leg's
+            branch.
+        signs: (L + 1,) signs of these determinants at home, then the sign of the platform's determinant (0 with
+            redundant actuators).
+        fixed: whether the named freedoms are the platform's possible twists in the whole workspace.
     """
 
     robot: ParallelRobot
@@ -156,28 +181,36 @@ class ClosedRobot:
 
         Args:
             readings: (N, n) [rad or m]; a record, whose samples follow one another, is solved faster.
-            start: nearby checked postures to start from, in which case the result is not checked again; None to start
-                from home.
+            start: nearby postures, already checked, at which the solution starts; the result is then not checked for
+                singularities. None: the solution starts at home.
 
         Raises:
             NoPosture: for samples out of reach, or at or beyond a singularity.
         """
         readings = shaped(readings, (None, self.robot.n), f"readings of '{self.robot.name}'")
-        return _reached(self, readings, self.home.q[0, self.robot.actuated], _from_readings, start)
+        at_home = self.home.q[0, self.robot.actuated]
+        return _reached(self, readings, at_home, _from_readings, start)
 
     def place(self, coordinates: np.ndarray, start: Posture | None = None) -> Posture:
-        """Return the postures at platform coordinates (N, r) [m, rad] relative to home; arguments and errors as in
-        `locate`.
+        """Return the postures for given coordinates of the platform.
+
+        Args:
+            coordinates: (N, r) coordinates relative to home [m, rad].
+            start: as in `locate`.
+
+        Raises:
+            NoPosture: for samples out of reach, or at or beyond a singularity.
         """
         coordinates = shaped(coordinates, (None, self.robot.r), f"platform coordinates of '{self.robot.name}'")
-        return _reached(self, coordinates, np.zeros(self.robot.r), _from_coordinates, start)
+        at_home = np.zeros(self.robot.r)
+        return _reached(self, coordinates, at_home, _from_coordinates, start)
 
 
 _Aim = Callable[[ClosedRobot, Sequence[LegLinks], np.ndarray, np.ndarray, Posture, np.ndarray], np.ndarray]
 
 
 def closed(robot: ParallelRobot) -> ClosedRobot:
-    """Return a robot with its loops closed at home; checking that its freedoms are those named.
+    """Return a robot with its loops closed at home, and check that its platform has the named freedoms.
 
     Raises:
         RobotError: if a loop does not close at home, home is singular, or the loops leave other freedoms than those
@@ -185,35 +218,41 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
     """
     home_q = np.concatenate([leg.home for leg in robot.legs])
     start = Posture(home_q[None], robot.home[None])
-    # each leg by itself, the platform at rest
-    for _ in range(10):
+    # Each leg is closed by itself, with the platform at rest.
+    for _ in range(HOME_STEPS):
         steps = [-times(link.inverse, link.gap) for link in leg_links(robot, start)]
-        step = np.clip(np.concatenate(steps, axis=1), -BOUND, BOUND)
+        step = np.concatenate(steps, axis=1)
+        step = np.clip(step, -BOUND, BOUND)
         start = Posture(start.q + step, start.pose)
-    gap = max(float(np.abs(link.gap).max()) for link in leg_links(robot, start))
-    # what the loops make of the platform's other coordinates
+    gaps = [float(np.abs(link.gap).max()) for link in leg_links(robot, start)]
+    # Loops that are still open determine the platform's coordinates that are not named as freedoms.
     with suppress(NoPosture, np.linalg.LinAlgError):
-        if gap > CLOSED:
+        if max(gaps) > CLOSED:
             free = ClosedRobot(robot, start, (), np.zeros(0), False)
-            start = _newton(free, start, np.zeros((1, robot.r)), _from_coordinates)
+            at_home = np.zeros((1, robot.r))
+            start = _newton(free, start, at_home, _from_coordinates)
     links = leg_links(robot, start)
     for leg, leg_link in zip(robot.legs, links):
         distance = float(np.abs(leg_link.gap).max())
-        if distance > 1e3 * CLOSED:
+        if distance > MAX_HOME_GAP:
             robot.refuse(
                 f"the loop of {leg.name} does not close at the platform's home: its end stays "
                 f"{1e3 * distance:.3g} mm (or mrad) from its attachment; check its home, base, attachment and lengths"
             )
         rcond = float(_leg_rcond(leg_link, leg_link)[0])
         if rcond < SINGULAR:
-            robot.refuse(f"{leg.name} {_why_singular(robot, start, leg)}: rcond {rcond:.1g}")
+            robot.refuse(f"{leg.name} {_why_singular(robot, start, leg)} (rcond {rcond:.1g}): correct home or lengths")
     minors = tuple(_best_rows(link.jacobian[0]) for link in links)
     fixed = _check_freedom(robot, start, links)
-    opened = ClosedRobot(robot, start, minors, np.zeros(len(links) + 1), fixed)
+    no_signs = np.zeros(len(links) + 1)
+    opened = ClosedRobot(robot, start, minors, no_signs, fixed)
     rows = _reading_rows(opened, links)
     rcond = float(_platform_rcond(opened, rows, rows)[0])
     if rcond < SINGULAR:
-        robot.refuse(f"home is singular (type 2): locked actuators do not hold it, rcond {rcond:.1g}")
+        robot.refuse(
+            f"home is singular (type 2): locked actuators do not hold the platform (rcond {rcond:.1g}); state "
+            "another home"
+        )
     signs = frozen(_determinants(opened, links)[0])
     return ClosedRobot(robot, start, minors, signs, fixed)
 
@@ -223,9 +262,9 @@ def _why_singular(robot: ParallelRobot, home: Posture, leg: Leg) -> str:
     rng = np.random.default_rng(0)
     k = robot.legs.index(leg)
     elsewhere = []
-    for _ in range(4):
-        turned_q = home.q + rng.uniform(-1.0, 1.0, home.q.shape)
-        elsewhere.append(Posture(turned_q, home.pose))
+    for _ in range(EXAMINED_POSTURES):
+        displacement = rng.uniform(-1.0, 1.0, home.q.shape)
+        elsewhere.append(Posture(home.q + displacement, home.pose))
     for posture in elsewhere:
         leg_link = leg_links(robot, posture)[k]
         if not float(_leg_rcond(leg_link, leg_link)[0]) < SINGULAR:
@@ -239,59 +278,85 @@ def _why_singular(robot: ParallelRobot, home: Posture, leg: Leg) -> str:
 def coordinates_of(mechanism: ClosedRobot, posture: Posture) -> np.ndarray:
     """Return the platform coordinates (N, r) of postures, relative to home: position, roll-pitch-yaw in base axes."""
     home = mechanism.robot.home
-    turned = posture.pose[:, :3, :3] @ home[:3, :3].T
+    rotation = posture.pose[:, :3, :3]
+    position = posture.pose[:, :3, 3]
+    turned = rotation @ home[:3, :3].T
     angles = Rotation.from_matrix(turned).as_euler("xyz")
-    shift = posture.pose[:, :3, 3] - home[:3, 3]
-    return np.hstack([shift, angles])[:, mechanism.robot.selected]
+    shift = position - home[:3, 3]
+    full = np.hstack([shift, angles])
+    return full[:, mechanism.robot.selected]
 
 
 def pose_of(mechanism: ClosedRobot, coordinates: np.ndarray) -> np.ndarray:
-    """Return platform poses (N, 4, 4) at coordinates (N, r); coordinates that the loops determine are zero."""
+    """Return platform poses (N, 4, 4) at coordinates (N, r); coordinates that are not freedoms are zero."""
+    home = mechanism.robot.home
     full = np.zeros((len(coordinates), 6))
     full[:, mechanism.robot.selected] = coordinates
-    pose = np.tile(mechanism.robot.home, (len(full), 1, 1))
-    pose[:, :3, 3] += full[:, :3]
     turn = Rotation.from_euler("xyz", full[:, 3:]).as_matrix()
-    pose[:, :3, :3] = turn @ mechanism.robot.home[:3, :3]
+    pose = np.tile(home, (len(full), 1, 1))
+    pose[:, :3, 3] += full[:, :3]
+    pose[:, :3, :3] = turn @ home[:3, :3]
     return pose
 
 
 def twists(
     mechanism: ClosedRobot, links: Sequence[LegLinks], shifts: Sequence[np.ndarray] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return D (N, 6, r) and t_0 (N, 6): platform twists t_0 + D v that all legs can follow, v the independent parts.
+    """Return D (N, 6, r) and t_0 (N, 6) such that all legs can follow the platform's twists t_0 + D v.
+
+    v (r,) are the components of the twist that are named as freedoms.
 
     Args:
-        shifts: (N, c) per leg, the right-hand side e in J q̇ = G t - e; None: zero.
+        mechanism: the robot.
+        links: Jacobians and gaps of the legs.
+        shifts: for each leg (N, c), the right-hand side e in J q̇ = G t - e; None: zero.
     """
     robot = mechanism.robot
     count = len(links[0].gap)
     if mechanism.fixed:
-        D = np.eye(6)[:, robot.selected]
-        return np.broadcast_to(D, (count, 6, robot.r)), np.zeros((count, 6))
+        freedoms = np.eye(6)[:, robot.selected]
+        D = np.broadcast_to(freedoms, (count, 6, robot.r))
+        return D, np.zeros((count, 6))
     rows = []
-    right = []
+    right_sides = []
     for k, link in enumerate(links):
-        across = np.eye(link.gap.shape[1]) - link.jacobian @ link.inverse
+        across = _across(link)
         rows.append(across @ link.carried)
         if shifts is None:
-            right.append(np.zeros_like(link.gap))
+            right_sides.append(np.zeros_like(link.gap))
         else:
-            right.append(times(across, shifts[k]))
-    U, s, Vt = np.linalg.svd(np.concatenate(rows, axis=1), full_matrices=False)
+            right_sides.append(times(across, shifts[k]))
+    matrix = np.concatenate(rows, axis=1)
+    right = np.concatenate(right_sides, axis=1)
+    U, s, Vt = np.linalg.svd(matrix, full_matrices=False)
     rank = 6 - robot.r
     free = Vt[:, rank:].transpose(0, 2, 1)
     D = free @ np.linalg.inv(free[:, robot.selected])
-    along = np.einsum("nkr,nk->nr", U[:, :, :rank], np.concatenate(right, axis=1)) / s[:, :rank]
+    along = np.einsum("nkr,nk->nr", U[:, :, :rank], right) / s[:, :rank]
     minimum = np.einsum("nrk,nr->nk", Vt[:, :rank], along)
-    return D, minimum - times(D, minimum[:, robot.selected])
+    t_0 = minimum - times(D, minimum[:, robot.selected])
+    return D, t_0
+
+
+def _across(link: LegLinks) -> np.ndarray:
+    """Return 1 - J J⁺ (N, c, c), which projects on the closure equations that the leg's joints cannot meet."""
+    return np.eye(link.gap.shape[1]) - link.jacobian @ link.inverse
 
 
 def _reading_rows(mechanism: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
-    """Return J_p^inv (N, n, r), which maps the twist's independent parts to encoder rates (eqs 5, 15; B_p = -1)."""
+    """Return J_p^inv (N, n, r), which maps the independent parts of the platform's twist to rates of the encoders.
+
+    Source: eqs 5 and 15 of Briot, Gautier & Krut (2013) with B_p = -1.
+    """
     D, _ = twists(mechanism, links)
-    joints = np.concatenate([link.inverse @ (link.carried @ D) for link in links], axis=1)
+    joints = joint_rates(links, D)
     return joints[:, mechanism.robot.actuated]
+
+
+def joint_rates(links: Sequence[LegLinks], D: np.ndarray) -> np.ndarray:
+    """Return the Jacobian (N, n_t, r) of all joints of the tree by the independent parts v of the twist D v."""
+    by_leg = [link.inverse @ (link.carried @ D) for link in links]
+    return np.concatenate(by_leg, axis=1)
 
 
 def _check_postures(mechanism: ClosedRobot, posture: Posture) -> None:
@@ -309,13 +374,15 @@ def _check_postures(mechanism: ClosedRobot, posture: Posture) -> None:
         weak = _leg_rcond(link, home_link) < SINGULAR
         _refuse(mechanism, posture, weak, f"{leg.name} is singular (type 1: stretched or folded)")
         _refuse(mechanism, posture, other_branch[:, k], f"{leg.name} is on another branch than at home")
-    rows, home_rows = _reading_rows(mechanism, links), _reading_rows(mechanism, home)
+    rows = _reading_rows(mechanism, links)
+    home_rows = _reading_rows(mechanism, home)
     weak = _platform_rcond(mechanism, rows, home_rows) < SINGULAR
     _refuse(mechanism, posture, weak, "the platform is singular (type 2: locked actuators do not hold it)")
     _refuse(mechanism, posture, other_branch[:, -1], "the platform is beyond a type 2 singularity from home")
 
 
 def _refuse(mechanism: ClosedRobot, posture: Posture, bad: np.ndarray, message: str) -> None:
+    """Raise NoPosture with a message if any sample is bad; the message names the first such sample."""
     if not bad.any():
         return
     indices = np.flatnonzero(bad)
@@ -326,19 +393,32 @@ def _refuse(mechanism: ClosedRobot, posture: Posture, bad: np.ndarray, message: 
 
 
 def _where(mechanism: ClosedRobot, posture: Posture) -> str:
+    """Return the platform's coordinates at one posture as text."""
     (values,) = coordinates_of(mechanism, posture)
-    return ", ".join(f"{name} = {value:.4g}" for name, value in zip(mechanism.robot.freedom, values))
+    coordinates = [f"{name} = {value:.4g}" for name, value in zip(mechanism.robot.freedom, values)]
+    return ", ".join(coordinates)
 
 
 def _reached(
     mechanism: ClosedRobot, goals: np.ndarray, coordinates: np.ndarray, aim: _Aim, start: Posture | None
 ) -> Posture:
-    """Return the postures at targets (N, k), found by Newton's method on a straight line from the values at home."""
+    """Return the postures at given readings or coordinates, by Newton's method in steps from home.
+
+    Args:
+        mechanism: the robot.
+        goals: (N, k) readings or coordinates to be reached.
+        coordinates: (k,) their values at home.
+        aim: function that returns the platform's twist towards the goals.
+        start: nearby postures at which Newton's method starts; None: home.
+    """
     if not len(goals):
         return mechanism.home[:0]
     if start is not None:
         return _newton(mechanism, start, goals, aim)
-    is_record = len(goals) > 2 * SPACING and np.abs(np.diff(goals, axis=0)).max() < MAX_STRIDE / SPACING
+    is_record = False
+    if len(goals) > 2 * SPACING:
+        changes = np.abs(np.diff(goals, axis=0))
+        is_record = bool(changes.max() < MAX_STRIDE / SPACING)
     if is_record:
         first = _reached(mechanism, goals[::SPACING], coordinates, aim, None)
         nearest = (np.arange(len(goals)) + SPACING // 2) // SPACING
@@ -346,7 +426,8 @@ def _reached(
         posture = _newton(mechanism, first[nearest], goals, aim)
     else:
         travel = goals - coordinates
-        count = max(1, int(np.ceil(np.abs(travel).max() / MAX_STRIDE)))
+        strides = np.abs(travel).max() / MAX_STRIDE
+        count = max(1, int(np.ceil(strides)))
         posture = mechanism.home[np.zeros(len(goals), dtype=int)]
         for share in np.arange(1, count) / count:
             posture = _newton(mechanism, posture, coordinates + share * travel, aim, rough=True)
@@ -356,23 +437,45 @@ def _reached(
 
 
 def _newton(mechanism: ClosedRobot, start: Posture, goals: np.ndarray, aim: _Aim, rough: bool = False) -> Posture:
-    """Return the postures near `start` that meet the targets, by Newton's method (two steps if `rough`)."""
+    """Return the postures near `start` at the goals, by Newton's method.
+
+    Args:
+        mechanism: the robot.
+        start: N postures at which the method starts.
+        goals: (N, k) readings or coordinates to be reached.
+        aim: function that returns the platform's twist towards the goals.
+        rough: whether `ROUGH_STEPS` steps suffice.
+
+    Raises:
+        NoPosture: if a loop cannot be closed.
+    """
     q = np.array(start.q)
     pose = np.array(start.pose)
     open_rows = np.arange(len(q))
-    for _ in range(2 if rough else MAX_STEPS):
+    max_steps = MAX_STEPS
+    if rough:
+        max_steps = ROUGH_STEPS
+    for _ in range(max_steps):
         posture = Posture(q[open_rows], pose[open_rows])
         links = leg_links(mechanism.robot, posture)
         D, t = twists(mechanism, links, [link.gap for link in links])
         independent = aim(mechanism, links, D, t, posture, goals[open_rows])
         twist = t + times(D, independent)
-        leg_steps = [times(link.inverse, times(link.carried, twist) - link.gap) for link in links]
+        leg_steps = []
+        leg_gaps = []
+        for link in links:
+            gap_after = times(link.carried, twist) - link.gap
+            leg_steps.append(times(link.inverse, gap_after))
+            leg_gaps.append(np.abs(link.gap).max(axis=1))
         steps = np.concatenate(leg_steps, axis=1)
-        size = np.maximum(np.abs(steps).max(axis=1), np.abs(twist).max(axis=1))
-        share = np.minimum(1.0, BOUND / np.maximum(size, 1e-300))[:, None]
+        joint_step = np.abs(steps).max(axis=1)
+        platform_step = np.abs(twist).max(axis=1)
+        size = np.maximum(joint_step, platform_step)
+        share = BOUND / np.maximum(size, 1e-300)
+        share = np.minimum(1.0, share)[:, None]
         q[open_rows] += share * steps
         pose[open_rows] = _moved(posture.pose, share * twist)
-        gap = np.max([np.abs(link.gap).max(axis=1) for link in links], axis=0)
+        gap = np.max(leg_gaps, axis=0)
         is_closed = np.maximum(size, gap) < CLOSED
         open_rows = open_rows[~is_closed]
         if not len(open_rows):
@@ -386,11 +489,14 @@ def _tell_unreached(mechanism: ClosedRobot, posture: Posture, unreached: np.ndar
     """Raise NoPosture for samples whose loops Newton's method does not close, with the likely reason."""
     first = posture[unreached[:1]]
     home = leg_links(mechanism.robot, mechanism.home)
-    largest_gap, farthest_leg, weak_leg = -np.inf, "", ""
+    largest_gap = -np.inf
+    farthest_leg = ""
+    weak_leg = ""
     for leg, link, home_link in zip(mechanism.robot.legs, leg_links(mechanism.robot, first), home):
         gap = float(np.abs(link.gap).max())
         if gap > largest_gap:
-            largest_gap, farthest_leg = gap, leg.name
+            largest_gap = gap
+            farthest_leg = leg.name
         if not weak_leg and float(_leg_rcond(link, home_link)[0]) < WEAK:
             weak_leg = leg.name
     gap_mm = 1e3 * largest_gap
@@ -412,12 +518,15 @@ def _from_readings(
     mechanism: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, goals: np.ndarray
 ) -> np.ndarray:
     """Return the independent twist components (N, r) that bring the encoder readings closest to their targets."""
-    by_twist = np.concatenate([link.inverse @ link.carried for link in links], axis=1)
-    gap_steps = np.concatenate([times(link.inverse, link.gap) for link in links], axis=1)
+    leg_rates = [link.inverse @ link.carried for link in links]
+    leg_steps = [times(link.inverse, link.gap) for link in links]
+    by_twist = np.concatenate(leg_rates, axis=1)
+    gap_steps = np.concatenate(leg_steps, axis=1)
     steps = gap_steps - times(by_twist, t)
     actuated = mechanism.robot.actuated
     errors = goals - posture.q[:, actuated] + steps[:, actuated]
-    return times(pseudo_inverse(by_twist[:, actuated] @ D), errors)
+    by_independent = by_twist[:, actuated] @ D
+    return times(pseudo_inverse(by_independent), errors)
 
 
 def _from_coordinates(
@@ -425,25 +534,33 @@ def _from_coordinates(
 ) -> np.ndarray:
     """Return the independent twist components (N, r) that move the platform to target coordinates (N, r)."""
     target = pose_of(mechanism, goals)
-    rotation = target[:, :3, :3] @ posture.pose[:, :3, :3].transpose(0, 2, 1)
+    present = posture.pose
+    inverse_rotation = present[:, :3, :3].transpose(0, 2, 1)
+    rotation = target[:, :3, :3] @ inverse_rotation
     turn = Rotation.from_matrix(rotation).as_rotvec()
-    shift = target[:, :3, 3] - posture.pose[:, :3, 3]
-    return np.hstack([shift, turn])[:, mechanism.robot.selected]
+    shift = target[:, :3, 3] - present[:, :3, 3]
+    twist = np.hstack([shift, turn])
+    return twist[:, mechanism.robot.selected]
 
 
 def _moved(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
+    """Return poses (N, 4, 4) displaced by v and rotated by the rotation vector ω of twists [v; ω] (N, 6)."""
     result = np.array(pose)
+    turn = twist[:, 3:]
     result[:, :3, 3] += twist[:, :3]
-    if twist[:, 3:].any():
-        result[:, :3, :3] = Rotation.from_rotvec(twist[:, 3:]).as_matrix() @ pose[:, :3, :3]
+    if turn.any():
+        rotation = Rotation.from_rotvec(turn).as_matrix()
+        result[:, :3, :3] = rotation @ pose[:, :3, :3]
     return result
 
 
 def _leg_rcond(links: LegLinks, home: LegLinks) -> np.ndarray:
-    """Return reciprocal conditions (N,) of a leg's Jacobian; lengths are scaled by its longest lever at home."""
+    """Return reciprocal conditions (N,) of a leg's Jacobian; lengths are divided by the leg's longest lever at home."""
     travel = np.linalg.norm(home.full[0, :3], axis=0)
-    turns = np.linalg.norm(home.full[0, 3:], axis=0) > 0.5
-    length = max(float(travel[turns].max(initial=0.0)), 1e-6)
+    rotation = np.linalg.norm(home.full[0, 3:], axis=0)
+    turns = rotation > 0.5
+    longest_lever = float(travel[turns].max(initial=0.0))
+    length = max(longest_lever, 1e-6)
     is_position = np.arange(links.jacobian.shape[1]) < 3
     row_length = np.where(is_position, length, 1.0)
     by_row = row_length[:, None] / np.where(turns, 1.0, length)
@@ -451,10 +568,17 @@ def _leg_rcond(links: LegLinks, home: LegLinks) -> np.ndarray:
 
 
 def _platform_rcond(mechanism: ClosedRobot, rows: np.ndarray, home: np.ndarray) -> np.ndarray:
-    """Return reciprocal conditions (N,) of J_p^inv; translations and rotations are scaled by their maxima at home."""
+    """Return reciprocal conditions (N,) of J_p^inv; translations and rotations are divided by their maxima at home.
+
+    Args:
+        mechanism: the robot.
+        rows: (N, n, r) J_p^inv.
+        home: (1, n, r) J_p^inv at home.
+    """
     turns = mechanism.robot.selected > 2
     size = np.linalg.norm(home[0], axis=0)
-    turn_size, shift_size = size[turns].max(initial=0.0), size[~turns].max(initial=0.0)
+    turn_size = size[turns].max(initial=0.0)
+    shift_size = size[~turns].max(initial=0.0)
     scale = np.where(turns, turn_size, shift_size)
     row_size = np.linalg.norm(home[0] / scale, axis=1)
     scaled = rows / scale / row_size[:, None]
@@ -463,24 +587,30 @@ def _platform_rcond(mechanism: ClosedRobot, rows: np.ndarray, home: np.ndarray) 
 
 def _rcond(J: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Return 1 / (|J| |J⁻|) (N,) in Frobenius norms, a lower bound of the reciprocal condition number."""
-    size = np.linalg.norm(J, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2))
-    return np.where(np.isfinite(size), 1.0 / np.maximum(size, 1e-300), 0.0)
+    matrix_norm = np.linalg.norm(J, axis=(1, 2))
+    inverse_norm = np.linalg.norm(inverse, axis=(1, 2))
+    condition = matrix_norm * inverse_norm
+    reciprocal = 1.0 / np.maximum(condition, 1e-300)
+    return np.where(np.isfinite(condition), reciprocal, 0.0)
 
 
 def _determinants(mechanism: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
-    """Return the signs (N, L + 1) of the legs' minors, and of the platform's determinant if J_p^inv is square."""
+    """Return signs (N, L + 1) of determinants: of a minor of each leg's Jacobian, and of J_p^inv (0 if not square)."""
     signs = []
     for link, minor in zip(links, mechanism.minors):
-        signs.append(np.sign(np.linalg.det(link.jacobian[:, minor])))
+        determinant = np.linalg.det(link.jacobian[:, minor])
+        signs.append(np.sign(determinant))
     last = np.zeros(len(links[0].gap))
     if not mechanism.robot.redundant:
-        last = np.sign(np.linalg.det(_reading_rows(mechanism, links)))
+        rows = _reading_rows(mechanism, links)
+        last = np.sign(np.linalg.det(rows))
     return np.column_stack([*signs, last])
 
 
 def _best_rows(J: np.ndarray) -> np.ndarray:
     """Return the indices of n rows of J (c, n) whose determinant is far from zero."""
-    pivots = np.asarray(scipy.linalg.qr(J.T, mode="r", pivoting=True)[-1])
+    factors = scipy.linalg.qr(J.T, mode="r", pivoting=True)
+    pivots = np.asarray(factors[-1])
     return np.sort(pivots[: J.shape[1]])
 
 
@@ -494,35 +624,39 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
     fixed = True
     rng = np.random.default_rng(0)
     free = ClosedRobot(robot, home, (), np.zeros(0), False)
-    for trial in range(4):
-        rows = []
-        for link in links:
-            projection = np.eye(link.gap.shape[1]) - link.jacobian @ link.inverse
-            rows.append(projection @ link.carried)
+    for trial in range(FREEDOM_POSTURES):
+        rows = [_across(link) @ link.carried for link in links]
         constraints = np.concatenate(rows, axis=1)[0]
         _, singular, axes = np.linalg.svd(constraints)
-        remaining = 6 - int((singular > 1e-9 * max(1.0, singular[0])).sum())
+        min_singular = RANK_TOLERANCE * max(1.0, singular[0])
+        rank = int((singular > min_singular).sum())
+        remaining = 6 - rank
         free_motions = axes[6 - remaining :]
         if remaining != robot.r:
             robot.refuse(
                 f"its platform has {remaining} freedoms, but the key 'freedom' lists {robot.r} "
                 f"({', '.join(robot.freedom)}); its free motions are {_motions(free_motions)}"
             )
-        if np.linalg.cond(free_motions[:, robot.selected]) > 1e8:
+        if np.linalg.cond(free_motions[:, robot.selected]) > MAX_FREEDOM_CONDITION:
             motions = _motions(free_motions)
-            robot.refuse(f"the platform can move in {motions}; freedom lists {', '.join(robot.freedom)}")
-        fixed = fixed and float(np.abs(constraints @ freedoms).max()) < 1e-9
-        if trial == 3:
+            robot.refuse(
+                f"the platform can move in {motions}, but the key 'freedom' lists {', '.join(robot.freedom)}: "
+                "correct it"
+            )
+        violation = float(np.abs(constraints @ freedoms).max())
+        fixed = fixed and violation < RANK_TOLERANCE
+        if trial == FREEDOM_POSTURES - 1:
             break
-        # a little away from home, where a special posture does not hide what the loops leave
-        step = 0.05 * (robot.upper - robot.lower) * rng.uniform(-1.0, 1.0, robot.r)
+        # Home may be a special posture: the freedoms are also counted a little away from it.
+        direction = rng.uniform(-1.0, 1.0, robot.r)
+        step = FREEDOM_DISTANCE * (robot.upper - robot.lower) * direction
         neighbour = _newton(free, home, step[None], _from_coordinates)
         links = leg_links(robot, neighbour)
     return fixed
 
 
 def _motions(rows: np.ndarray) -> str:
-    """Return the names of a twist's components that are nonzero in rows (k, 6)."""
+    """Return, as text, the names of the components of twists (k, 6) that are not zero in all of them."""
     sizes = np.linalg.norm(rows, axis=0)
     names = [name for name, size in zip(COORDINATES, sizes) if size > 1e-6]
     return ", ".join(names) or "none"

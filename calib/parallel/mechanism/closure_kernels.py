@@ -1,9 +1,10 @@
-"""Compiled kernels (numba) of closed loops: the legs at given postures.
+"""Compiled kernels (numba) of closed loops: Jacobians and gaps of the legs at given postures.
 
-A leg is read from the arrays of its `Bodies`, ``links`` and ``constants``, every frame turned so that its joint's axis
-is z; ``tail`` (4, 4) takes its last frame to its end. The platform is at ``pose`` (4, 4); c of a leg's six equations
-are held. Loops over elements instead of array expressions: numba takes several times as long to compile the latter, and
-every array has one kind (C order, of the widest leg), so that each kernel is compiled once.
+A leg is given by the arrays ``links`` and ``constants`` of its `Bodies`, whose frames are turned so that the joint's
+axis is z; ``tail`` (4, 4) is the pose of the leg's end in its last frame. ``pose`` (4, 4) is the platform's pose; c of
+a leg's six closure equations are used. The kernels loop over elements, because numba takes several times as long to
+compile array expressions. All arrays have one memory layout (C order, size of the largest leg), so that each kernel is
+compiled once.
 """
 
 import numpy as np
@@ -11,12 +12,19 @@ from numba import njit
 
 from calib.dynamics.kernels import OPTIONS
 
-KIND, SCALE, REVOLUTE = 1, 12, 1
+# Column of `links` with the kind of the joint, and the kind of revolute joints.
+KIND = 1
+REVOLUTE = 1
+# Column of `constants` with the factor on the joint's value.
+SCALE = 12
 
 
 @njit(**OPTIONS)
 def invert(A, out):
-    """Write A⁻¹ (n, n) by Gauss and Jordan with row pivots, overwriting A; a zero pivot is made tiny."""
+    """Write A⁻¹ (n, n) into `out` by Gauss–Jordan elimination with row pivots; A is overwritten.
+
+    A zero pivot is replaced by a tiny one, so that the inverse of a singular matrix has huge entries.
+    """
     n = A.shape[0]
     for i in range(n):
         for j in range(n):
@@ -46,15 +54,22 @@ def invert(A, out):
 
 @njit(**OPTIONS)
 def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, carried, gap, lever, frame):
-    """Write one leg at one posture; see `calib.parallel.mechanism.closure.LegLinks`.
+    """Write Jacobians and gap of one leg at one posture; see `calib.parallel.mechanism.closure.LegLinks`.
+
+    All arrays may be larger than stated.
 
     Args:
-        held: c.
-        full: (6, n), inverse (n, c), carried (c, 6), zero on entry, gap (c,), lever (3,), or wider;
-            frame (4, 6 + 3 n) to work in, or wider.
+        links, constants, tail, attachment: arrays of the leg, see the module.
+        held: number c of closure equations.
+        q: (n,) joint values.
+        pose: (4, 4) pose of the platform.
+        full, inverse, carried, gap, lever: (6, n), (n, c), (c, 6), (c,), (3,) results; `carried` is zero on entry.
+        frame: (4, 6 + 3 n) memory for intermediate results.
     """
     n = q.shape[0]
-    r, o, place = frame[:3, :3], frame[3, :3], frame[:3, 3:6]
+    r = frame[:3, :3]
+    o = frame[3, :3]
+    place = frame[:3, 3:6]
     for i in range(3):
         o[i] = 0.0
         for k in range(3):
@@ -71,35 +86,45 @@ def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, ca
         for i in range(3):
             frame[i, 6 + j] = o[i]
         if links[j, KIND] == REVOLUTE:
-            cosine, sine = np.cos(amount), np.sin(amount)
+            cosine = np.cos(amount)
+            sine = np.sin(amount)
             for i in range(3):
                 r[i, 0] = cosine * place[i, 0] + sine * place[i, 1]
                 r[i, 1] = cosine * place[i, 1] - sine * place[i, 0]
                 r[i, 2] = place[i, 2]
-                full[i, j], full[3 + i, j] = 0.0, constants[j, SCALE] * place[i, 2]
+                full[i, j] = 0.0
+                full[3 + i, j] = constants[j, SCALE] * place[i, 2]
         else:
             for i in range(3):
                 for k in range(3):
                     r[i, k] = place[i, k]
                 o[i] += amount * place[i, 2]
-                full[i, j], full[3 + i, j] = constants[j, SCALE] * place[i, 2], 0.0
+                full[i, j] = constants[j, SCALE] * place[i, 2]
+                full[3 + i, j] = 0.0
     for i in range(3):
         lever[i] = pose[i, 0] * attachment[0, 3] + pose[i, 1] * attachment[1, 3] + pose[i, 2] * attachment[2, 3]
         o[i] += r[i, 0] * tail[0, 3] + r[i, 1] * tail[1, 3] + r[i, 2] * tail[2, 3]
         gap[i] = o[i] - pose[i, 3] - lever[i]
         carried[i, i] = 1.0
-    carried[0, 4], carried[1, 5], carried[2, 3] = lever[2], lever[0], lever[1]
-    carried[0, 5], carried[1, 3], carried[2, 4] = -lever[1], -lever[2], -lever[0]
+    carried[0, 4] = lever[2]
+    carried[1, 5] = lever[0]
+    carried[2, 3] = lever[1]
+    carried[0, 5] = -lever[1]
+    carried[1, 3] = -lever[2]
+    carried[2, 4] = -lever[0]
     for j in range(n):
         if links[j, KIND] == REVOLUTE:
-            x, y, z = o[0] - frame[0, 6 + j], o[1] - frame[1, 6 + j], o[2] - frame[2, 6 + j]
+            x = o[0] - frame[0, 6 + j]
+            y = o[1] - frame[1, 6 + j]
+            z = o[2] - frame[2, 6 + j]
             full[0, j] = full[4, j] * z - full[5, j] * y
             full[1, j] = full[5, j] * x - full[3, j] * z
             full[2, j] = full[3, j] * y - full[4, j] * x
     if held == 6:
         for i in range(3):
             carried[3 + i, 3 + i] = 1.0
-        for i in range(3):  # orientations: ends in `place`, attachment in `r`, then the skew part of end · attachmentᵀ
+        # orientations: the end's in `place`, the attachment's in `r`; the gap is the skew part of end · attachmentᵀ
+        for i in range(3):
             for k in range(3):
                 place[i, k] = r[i, 0] * tail[0, k] + r[i, 1] * tail[1, k] + r[i, 2] * tail[2, k]
         for i in range(3):
@@ -108,7 +133,8 @@ def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, ca
                 for m in range(3):
                     r[i, k] += pose[i, m] * attachment[m, k]
         for i in range(3):
-            a, b = (i + 1) % 3, (i + 2) % 3
+            a = (i + 1) % 3
+            b = (i + 2) % 3
             total = 0.0
             for m in range(3):
                 total += place[b, m] * r[a, m] - place[a, m] * r[b, m]
@@ -135,7 +161,7 @@ def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, ca
 
 @njit(**OPTIONS)
 def legs(links, constants, tail, attachment, q, pose, full, inverse, carried, gap, lever):
-    """Write one leg at N postures: q (N, n), pose (N, 4, 4); arrays as in `one_leg`, with a leading axis N."""
+    """Write Jacobians and gap of one leg at N postures; arrays as in `one_leg`, with a leading axis of length N."""
     frame = np.empty((4, 6 + 3 * q.shape[1]))
     for s in range(q.shape[0]):
         one_leg(

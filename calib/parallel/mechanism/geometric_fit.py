@@ -1,16 +1,16 @@
 """Geometric calibration of a parallel robot from its closure: from platform poses, or from redundant encoders alone.
 
     poses       r = q - q(P; g)                 encoders against the legs' joints at the measured pose
-    encoders    r = Nᵀ (q - q(x̂; g))            what n encoders of r freedoms contradict each other by; x̂ fits them
-    best
+    encoders    r = Nᵀ (q - q(x̂; g))            contradictions of redundant encoders, with the best-fitting pose x̂
 
     ∂q/∂g = -J⁺ ∂gap/∂g                         of the closure J δq = G t - gap(g), so no forward kinematics is
                                                 differentiated (self-calibration: Wampler, Hollerbach & Arai 1995)
 
-g: the constants of every leg's rows, its place in the base, its attachment, and the zeros of the encoders (they are the
-thetas, or r of prismatic joints). A parameter that would open a loop for good (an axis tilted out of a planar robot's
-plane) is left out. Parameters that depend on each other, gauge included, are regularised towards the nominal robot by a
-prior of `SPREAD`, and keep its covariance where the data do not identify them.
+g: the constants of the rows of each leg, the leg's pose in the base, its attachment, and the zeros of the encoders
+(theta of a row, or r of a prismatic joint). A parameter whose change would open a loop in all postures (such as an axis
+tilted out of a planar robot's plane) is not fitted. Linearly dependent parameters, choices of frames among them, are
+regularised towards the nominal robot by a prior with σ = `SPREAD`; parameters that the data do not identify keep the
+prior's covariance.
 """
 
 from __future__ import annotations
@@ -29,16 +29,19 @@ from calib.parallel.mechanism.velocities import loop_jacobians, preload_directio
 from calib.records import frozen
 from calib.transforms import displace
 
-# of differences by a parameter [m or rad]
+# Step of the differences by a parameter [m or rad].
 STEP = 1e-6
-# of a parameter's effect on a gap that no joint and no freedom can follow (our choice)
+# Share of a parameter's effect on a gap that joints and freedoms may be unable to follow (our choice).
 OPENS = 1e-6
+# Largest number of Gauss–Newton steps.
 LIMIT = 30
-# standard deviation of a parameter before anything is measured [m or rad] (our choice)
+# Standard deviation of a parameter before any measurement [m or rad] (our choice).
 SPREAD = 0.01
-# name of rows that folds of a fit left out in turn
+# Share of SPREAD above which the σ of a parameter counts as not reduced by the data.
+VAGUE_SHARE = 0.5
+# Name of the set of cross-validated rows.
 LEFT_OUT = "left out"
-# of a column that no other explains, at unit norm: counts what the poses could tell
+# Norm of the part of a column of unit norm that other columns do not explain, below which it counts as dependent.
 TOLERANCE = 1e-6
 
 
@@ -60,9 +63,10 @@ class LoopFit:
 
     Attributes:
         mechanism: the calibrated robot, its loops closed.
-        parameters: constants that may change; estimate: changes from the nominal robot, with covariance.
-        vague: names of parameters whose σ remains above half that of the prior.
-        before, after: rms of the encoders' residuals [rad or m], nominal and calibrated.
+        parameters: the fitted constants.
+        estimate: changes of the constants from the nominal robot [m, rad], with covariance.
+        vague: names of parameters whose σ remains above half the σ of the prior.
+        before, after: rms of the encoders' residuals [rad or m] of the nominal and of the calibrated robot.
         iterations: number of Gauss–Newton iterations.
     """
 
@@ -89,7 +93,7 @@ class LoopCovariance:
 
     @classmethod
     def fitted(cls, fit: LoopFit) -> LoopCovariance:
-        """Return the covariance of a fit, without the part that is a choice of frames."""
+        """Return the covariance of a fit; directions that are choices of frames have no variance."""
         directions = visible_directions(fit.mechanism, fit.parameters)
         across = directions @ directions.T
         names = tuple(parameter.name for parameter in fit.parameters)
@@ -104,12 +108,14 @@ class LoopCovariance:
         by_name = {parameter.name: parameter for parameter in loop_parameters(mechanism)}
         missing = [name for name in self.names if name not in by_name]
         if missing:
-            refuse_robot(mechanism.robot.name, f"none of its loops has '{missing[0]}', which its covariance is of")
+            refuse_robot(
+                mechanism.robot.name, f"its covariance has the parameter '{missing[0]}', which none of its loops has"
+            )
         return tuple(by_name[name] for name in self.names)
 
 
 def loop_parameters(mechanism: ClosedRobot) -> tuple[LoopParameter, ...]:
-    """Return the geometric constants of a robot that may change without opening a loop for good."""
+    """Return the geometric constants of a robot whose change joints and platform can follow with closed loops."""
     robot = mechanism.robot
     links = leg_links(robot, mechanism.home)
     jacobians = loop_jacobians(mechanism, mechanism.home)
@@ -140,7 +146,7 @@ def fit_loops(
         readings: (m, n) of the actuated joints [rad or m].
         coordinates: (m, r) measured platform coordinates from home [m, rad]; None: readings alone, of a robot with more
             encoders than freedoms.
-        held: names of parameters that stay.
+        fixed: names of parameters that are not fitted.
         loss: relative change of the residuals' sum of squares below which the fit has converged.
 
     Raises:
@@ -180,23 +186,30 @@ def fit_loops(
         changes = changes + np.linalg.lstsq(rows, np.concatenate([residual, -pull * changes]), rcond=None)[0]
         mechanism = closed(changed(nominal.robot, parameters, changes))
     else:
-        raise NotConverged(f"the geometry of '{robot.name}' does not settle within {LIMIT} steps", mechanism)
+        raise NotConverged(f"the geometry of '{robot.name}' has not converged after {LIMIT} steps", mechanism)
     # Rows of the measurements, and of what was known of the parameters beforehand.
     white = np.vstack([W / max(std, 1e-12), np.eye(count) / SPREAD])
     inverse = np.linalg.inv(np.linalg.qr(white, mode="r"))
     covariance = inverse @ inverse.T
     sigmas = np.sqrt(np.diag(covariance))
-    vague = tuple(parameter.name for parameter, sigma in zip(parameters, sigmas) if sigma > 0.5 * SPREAD)
+    max_sigma = VAGUE_SHARE * SPREAD
+    vague = tuple(parameter.name for parameter, sigma in zip(parameters, sigmas) if sigma > max_sigma)
     names = tuple(parameter.name for parameter in parameters)
     units = tuple(parameter.unit for parameter in parameters)
     estimate = Estimate(names, units, changes, covariance, std, len(residual) - rank)
-    return LoopFit(mechanism, parameters, estimate, vague, before, float(np.sqrt(np.mean(residual**2))), iteration)
+    after = float(np.sqrt(np.mean(residual**2)))
+    return LoopFit(mechanism, parameters, estimate, vague, before, after, iteration)
 
 
 def visible_directions(mechanism: ClosedRobot, parameters: Sequence[LoopParameter], postures: int = 100) -> np.ndarray:
-    """Return orthonormal directions (p, k) of the constants that relate encoders to the platform somewhere in its box.
+    """Return orthonormal directions (p, k) in which changes of the constants affect readings at given platform poses.
 
-    Changes of the constants orthogonal to these directions have no effect: they are choices of frames.
+    Changes orthogonal to all these directions have no effect: they are choices of frames.
+
+    Args:
+        mechanism: the robot.
+        parameters: p constants.
+        postures: number of random platform poses in the robot's box at which the effect is computed.
     """
     robot = mechanism.robot
     coordinates = np.random.default_rng(0).uniform(robot.lower, robot.upper, (postures, robot.r))
@@ -264,10 +277,11 @@ def _gap_slope(robot: ParallelRobot, posture: Posture, parameter: LoopParameter)
 
 
 def _candidates(leg: Leg, k: int) -> list[LoopParameter]:
+    """Return all constants of leg number k: those of its elements, and displacements of its base and attachment."""
     candidates = []
     for index, element in enumerate(leg.chain.elements):
         candidates.append(LoopParameter(f"{leg.name}.{element.name}", element.unit, k, "element", index))
-    # A leg that ends in a point holds the platform's attachment by its position alone.
+    # A spherical end constrains the position of the attachment only, so that its orientation has no effect.
     for part, count in (("base", len(COORDINATES)), ("attachment", leg.held)):
         for index, axis in enumerate(COORDINATES[:count]):
             unit = "m" if index < 3 else "rad"
@@ -276,6 +290,7 @@ def _candidates(leg: Leg, k: int) -> list[LoopParameter]:
 
 
 def _changed_leg(leg: Leg, parameter: LoopParameter, value: float) -> Leg:
+    """Return a leg with one constant changed by `value` [m or rad]."""
     if parameter.part == "attachment":
         return replace(leg, attachment=displace(leg.attachment, value * np.eye(6)[parameter.index]))
     elements = list(leg.chain.elements)

@@ -2,9 +2,9 @@
 
     M(x) v̇ + h(x, v) = J_p^invᵀ tau,    v̇ of the platform's coordinates, tau held for one control period,
 
-M and h with all legs, drives and payloads (`simulation_kernels`): the robot that `ParallelModel` describes. Each
-actuator has a controller of its own (`calib.identification.closed_loop.controllers`); those of redundant ones share the
-force as their errors have it.
+where M and h contain all legs, drives and payloads of the `ParallelModel` (`simulation_kernels`). Each actuator has a
+separate controller (`calib.identification.closed_loop.controllers`), so that the errors of redundant actuators
+determine how they share the force.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from calib.parallel.mechanism.closure import compiled
 from calib.parallel.mechanism.velocities import loop_jacobians
 from calib.records import frozen
 
-# [rad or m] between encoders and reference at which a run has diverged
+# Distance [rad or m] of encoders from the reference at which a run has diverged.
 FAR = 0.3
-# drive terms that can be simulated, and their places
+# Drive terms that can be simulated, and their columns in the kernels' array.
 SHAPES = {"acceleration": 0, "velocity": 1, "sign": 2, "one": 3}
 
 
@@ -37,8 +37,9 @@ class ParallelPlant:
     """A parallel robot to simulate, in place of a serial arm's `calib.identification.closed_loop.simulation.Plant`.
 
     Attributes:
-        model: `ParallelModel` of the robot with its drive terms; parameters: (p,) values of the model's parameters.
-        carried: payloads carried; None: all.
+        model: `ParallelModel` of the robot with its drive terms.
+        parameters: (p,) values of the model's parameters.
+        carried: labels of the payloads on board; None: all.
     """
 
     model: Any
@@ -58,16 +59,15 @@ class ParallelPlant:
         """Return the robot with these payloads on board."""
         return replace(self, carried=carried)
 
-    def joint_noise(self, noise: np.ndarray) -> np.ndarray:
-        """Return the velocity noise (n_t,) of all joints from that of the actuated ones; see `ParallelModel`."""
-        return self.model.joint_noise(noise)
-
     def inertia_diagonal(self, q: np.ndarray) -> np.ndarray:
         """Raise an error: gains proportional to inertia are not supported for parallel robots."""
         raise UsageError("[loop] design is for serial arms only; state the gains as they are")
 
     def feed_forward(self, reference: Reference) -> np.ndarray:
-        """Return the actuators' torques (N, n) along a reference, of redundant ones of least norm with the preload."""
+        """Return the actuators' torques (N, n) along a reference.
+
+        Torques of redundant actuators are those of least norm, plus the model's preload.
+        """
         motion = self.model.moved(reference.q, reference.v, reference.a)
         return self.model.actuator_torques(self.parameters, motion, self.carried)
 
@@ -82,8 +82,12 @@ class ParallelPlant:
         """Return the simulated motion of the robot that follows a reference of its actuators.
 
         Args:
-            sensing: white noise of encoders and logged torques, and control periods per sample.
-            mixing: (N, n, n) by which the feedback of all actuators is multiplied: a controller in other coordinates.
+            controller: controller of the actuators.
+            reference: motion of the actuated joints, with a sample per control period.
+            sensing: white noise of encoders and logged torques, and control periods per sample; None: the default.
+            seed: seed of the noise.
+            mixing: (N, n, n) matrices by which the feedback of all actuators is multiplied, for a controller in other
+                coordinates; None: none.
 
         Raises:
             NotConverged: if the loop is unstable; `CannotSimulate` for an inertia matrix that is not positive definite.
@@ -98,7 +102,9 @@ class ParallelPlant:
         encoder = rng.normal(size=shape) * sensing.sigma_q
         heard = rng.normal(size=shape) * sensing.sigma_tau
         start = mechanism.locate(reference.q[:1])
-        rate = np.linalg.pinv(loop_jacobians(mechanism, start).readings[0]) @ reference.v[0]
+        jacobians = loop_jacobians(mechanism, start)
+        rate_by_reading = np.linalg.pinv(jacobians.readings[0])
+        rate = rate_by_reading @ reference.v[0]
         out = np.empty((3, *shape))
         period = reference.period
         if mixing is None:
@@ -123,48 +129,66 @@ class ParallelPlant:
             raise failure(status, reached * period)
         tick = sample_ticks(len(out[0]), sensing.every)
         ticks = tick.astype(int)
-        spline = CubicSpline(np.arange(len(out[0])), out[0])
+        periods = np.arange(len(out[0]))
+        spline = CubicSpline(periods, out[0])
         q = spline(tick, 0) / period**0
         v = spline(tick, 1) / period**1
         a = spline(tick, 2) / period**2
         t = reference.t[0] + tick * period
         measured = q + encoder[ticks]
         torque = out[2, ticks]
-        return SimulatedRun(t, frozen(q), v, a, frozen(measured), frozen(torque + heard[ticks]), torque)
+        logged = torque + heard[ticks]
+        return SimulatedRun(t, frozen(q), v, a, frozen(measured), frozen(logged), torque)
 
     def _values(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the parameters of legs, platform and drives as `simulation_kernels.run` takes them."""
         model = self.model
         values = self.parameters
-        drives = np.zeros((int(model.mechanism.robot.starts[-1]), 5))
+        joint_count = int(model.mechanism.robot.starts[-1])
+        drives = np.zeros((joint_count, 5))
         drives[:, 4] = 1.0
-        # Without terms the slice is of all parameters, and the loop has no round.
-        for term, value in zip(model.terms, model.spread(values)[-len(model.terms) :]):
-            require(term.shape in SHAPES, f"term '{term.name}' ({term.shape}) cannot be simulated", UsageError)
+        standard = model.spread(values)
+        term_values = standard[len(standard) - len(model.terms) :]
+        for term, value in zip(model.terms, term_values):
+            require(
+                term.shape in SHAPES, f"term '{term.name}' ({term.shape}) cannot be simulated: remove it", UsageError
+            )
             drives[term.joint, SHAPES[term.shape]] += value
             if term.shape == "sign":
-                require(term.settings[0] > 0.0, f"'{term.name}' cannot be simulated without v0 above 0", CannotSimulate)
+                require(
+                    term.settings[0] > 0.0,
+                    f"term '{term.name}' cannot be simulated: state its v0, above 0",
+                    CannotSimulate,
+                )
                 drives[term.joint, 4] = term.settings[0]
-        legs = zip(model.legs, model.leg_parameters(values))
-        bodies_values = [rigid_body.kernel_parameters(bodies, parameters) for (bodies, *_), parameters in legs]
+        bodies_values = []
+        for (bodies, *_), parameters in zip(model.legs, model.leg_parameters(values)):
+            bodies_values.append(rigid_body.kernel_parameters(bodies, parameters))
         return _stacked(bodies_values), model.platform_parameters(values, self.carried), drives
 
 
 def _robot(model: Any) -> tuple:
     """Return the arrays that describe a robot to `simulation_kernels.run`."""
     robot = model.mechanism.robot
-    legs = [compiled(leg) for leg in robot.legs]
-    links = _stacked([bodies.links for bodies, _ in legs])
-    constants = _stacked([bodies.constants for bodies, _ in legs])
-    tails = _stacked([tail for _, tail in legs])
-    attachments = _stacked([leg.attachment for leg in robot.legs])
+    links = []
+    constants = []
+    tails = []
+    attachments = []
+    equations = []
+    for leg in robot.legs:
+        bodies, tail = compiled(leg)
+        links.append(bodies.links)
+        constants.append(bodies.constants)
+        tails.append(tail)
+        attachments.append(leg.attachment)
+        equations.append(leg.held)
     return (
-        frozen(links, np.int64),
-        frozen(constants),
-        frozen(tails),
-        frozen(attachments),
+        frozen(_stacked(links), np.int64),
+        frozen(_stacked(constants)),
+        frozen(_stacked(tails)),
+        frozen(_stacked(attachments)),
         robot.starts,
-        np.array([leg.held for leg in robot.legs]),
+        np.array(equations),
         robot.selected,
         robot.actuated,
         robot.gravity,
@@ -174,7 +198,10 @@ def _robot(model: Any) -> tuple:
 
 def _stacked(arrays: list[np.ndarray]) -> np.ndarray:
     """Return arrays stacked along a new first axis, each padded with zeros to the largest shape."""
-    result = np.zeros((len(arrays), *np.max([array.shape for array in arrays], axis=0)))
+    shapes = [array.shape for array in arrays]
+    largest = np.max(shapes, axis=0)
+    result = np.zeros((len(arrays), *largest))
     for k, array in enumerate(arrays):
-        result[(k, *map(slice, array.shape))] = array
+        filled = tuple(slice(length) for length in array.shape)
+        result[k][filled] = array
     return result

@@ -6,13 +6,15 @@
 
     W = [J_tᵀ W_legs, Dᵀ W_platform, J_tᵀ W_drives]
 
-(Briot, Gautier & Krut 2013.) Bodies are numbered as there: joint j of leg k is jk, the platform comes after the legs'
-last joints, payloads on it after that. χ: ten standard parameters of each body, then the drives' terms.
-`PlatformRegressor` has the same rows as functions of platform coordinates x(t), with gradients for motion design.
+(Briot, Gautier & Krut 2013.) Bodies are labelled as in that paper: joint j of leg k is jk, the platform has the number
+after the legs' last joints; payloads have their own labels. χ are the ten standard parameters of each body (legs,
+platform, payloads), followed by the drives' terms. `PlatformRegressor` gives the rows as functions of platform
+coordinates x(t), with gradients for the design of motions.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
@@ -31,7 +33,15 @@ from calib.dynamics.torque_rows import MOTOR, POWER, Projection, TorqueRows, pro
 from calib.errors import CalibError, UsageError, require
 from calib.parallel.mechanism.closure import ClosedRobot, Posture
 from calib.parallel.mechanism.parallel_robot import COORDINATES, FORCES
-from calib.parallel.mechanism.velocities import LoopMotion, cross, distributed, loop_jacobians, of_platform, of_readings
+from calib.parallel.mechanism.velocities import (
+    LoopJacobians,
+    LoopMotion,
+    cross,
+    distributed,
+    loop_jacobians,
+    of_platform,
+    of_readings,
+)
 
 
 def wrench_regressor(pose: np.ndarray, twist: np.ndarray, change: np.ndarray, gravity: np.ndarray) -> np.ndarray:
@@ -39,8 +49,9 @@ def wrench_regressor(pose: np.ndarray, twist: np.ndarray, change: np.ndarray, gr
 
     Args:
         pose: (N, 4, 4) of the platform.
-        twist, change: (N, 6) velocity of its origin and angular velocity, and their derivatives.
-        gravity: (3,) [m/s²].
+        twist: (N, 6) velocity of the platform's origin and angular velocity.
+        change: (N, 6) derivative of the twist.
+        gravity: (3,) gravity in the base's axes [m/s²].
     """
     R = pose[:, :3, :3]
     # acceleration, angular velocity and its derivative in the platform's axes
@@ -52,25 +63,34 @@ def wrench_regressor(pose: np.ndarray, twist: np.ndarray, change: np.ndarray, gr
     regressor[:, :3, 9] = a
     regressor[:, :3, 6:9] = _skew(b) + spin @ spin
     regressor[:, 3:, 6:9] = -_skew(a)
-    regressor[:, 3:, :6] = _inertia_columns(b) + spin @ _inertia_columns(w)
-    return np.concatenate([R @ regressor[:, :3], R @ regressor[:, 3:]], axis=1)
+    gyroscopic = spin @ _inertia_columns(w)
+    regressor[:, 3:, :6] = _inertia_columns(b) + gyroscopic
+    force = R @ regressor[:, :3]
+    moment = R @ regressor[:, 3:]
+    return np.concatenate([force, moment], axis=1)
 
 
 def energy_columns(pose: np.ndarray, twist: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Return kinetic and potential energy (N, 10) per unit of each standard parameter; see `wrench_regressor`."""
+    """Return kinetic plus potential energy (N, 10) of a body per unit of each standard parameter.
+
+    The arguments are those of `wrench_regressor`.
+    """
     R = pose[:, :3, :3]
     u = np.einsum("nji,nj->ni", R, twist[:, :3])
     w = np.einsum("nji,nj->ni", R, twist[:, 3:])
     result = np.empty((len(R), 10))
-    result[:, :6] = 0.5 * np.einsum("ni,nik->nk", w, _inertia_columns(w))
+    momentum = _inertia_columns(w)
+    result[:, :6] = 0.5 * np.einsum("ni,nik->nk", w, momentum)
     down = np.einsum("nji,j->ni", R, gravity)
     # u · (w × s) = s · (u × w)
     result[:, 6:9] = cross(u, w) - down
-    result[:, 9] = 0.5 * np.sum(u**2, axis=1) - pose[:, :3, 3] @ gravity
+    height = pose[:, :3, 3] @ gravity
+    result[:, 9] = 0.5 * np.sum(u**2, axis=1) - height
     return result
 
 
 def _skew(x: np.ndarray) -> np.ndarray:
+    """Return the matrices (N, 3, 3) of the cross products x × of vectors (N, 3)."""
     result = np.zeros((len(x), 3, 3))
     result[:, [2, 0, 1], [1, 2, 0]] = x
     result[:, [1, 2, 0], [2, 0, 1]] = -x
@@ -87,8 +107,10 @@ def _inertia_columns(w: np.ndarray) -> np.ndarray:
     return result
 
 
-# of random states: m/s or rad/s, and per s (as `IdentificationModel.sample`)
+# Largest speed [m/s or rad/s] and acceleration [m/s² or rad/s²] of random states (as `IdentificationModel.sample`).
 RATE = 3.0
+# Largest entry of a regressor below which a column has no effect on a row.
+NO_EFFECT = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +119,11 @@ class ParallelModel:
 
     Attributes:
         mechanism: the robot, its loops closed.
-        terms: drive terms; their joint indices refer to the tree.
+        terms: drive terms; their joint indices count the joints of all legs (the tree).
         torque_rows: ``platform``, ``motor`` or ``power`` rows (`rows_named`).
         payloads: labels of bodies that the platform may carry.
-        identical_legs: whether all legs have common inertial parameters and motor inertias, named after the first leg.
-            Friction and offsets differ by joint.
+        identical_legs: whether all legs have common inertial parameters and motor inertias, named after the first leg;
+            friction and offsets are always separate parameters of each joint.
         preload: (n - r,) mean overconstraint of redundant actuators (`velocities.overconstraint`) [N m or N]; (): 0.
     """
 
@@ -114,13 +136,15 @@ class ParallelModel:
 
     def __post_init__(self) -> None:
         legs = self.mechanism.robot.legs
+        first = legs[0]
         if self.identical_legs:
-            kinds = [joint.kind for joint in legs[0].chain.joints]
+            kinds = [joint.kind for joint in first.chain.joints]
             for leg in legs:
                 leg_kinds = [joint.kind for joint in leg.chain.joints]
-                if leg.bodies != legs[0].bodies or leg_kinds != kinds:
-                    raise UsageError(f"identical_legs: {leg.name} is built unlike {legs[0].name}")
-        doubled = sorted({name for name in self.names if self.names.count(name) > 1})
+                if leg.bodies != first.bodies or leg_kinds != kinds:
+                    raise UsageError(f"identical_legs: {leg.name} is built unlike {first.name}; remove identical_legs")
+        counts = Counter(self.names)
+        doubled = sorted(name for name, count in counts.items() if count > 1)
         if doubled:
             raise CalibError(f"parameter '{doubled[0]}' occurs twice; give the payload or term another name")
 
@@ -140,15 +164,16 @@ class ParallelModel:
 
     @cached_property
     def single(self) -> ParallelModel:
-        """The model in which each leg has parameters of its own."""
+        """The model with separate parameters of each leg; the model itself unless legs are identical."""
         if self.identical_legs:
             return replace(self, identical_legs=False)
         return self
 
     @cached_property
     def _first(self) -> np.ndarray:
-        """For each parameter of `single` (p_1,), the index of the parameter that represents it: itself, or the first
-        leg's.
+        """For each parameter of `single` (p_1,), the index in `single` of the parameter that replaces it.
+
+        A parameter of identical legs is replaced by that of the first leg; others are replaced by themselves.
         """
         first = np.arange(self._bodies + len(self.terms))
         if self.identical_legs:
@@ -159,8 +184,9 @@ class ParallelModel:
             for k, term in enumerate(self.terms, self._bodies):
                 if term.name.startswith("Ia") and term.joint is not None:
                     motors[term.joint] = k
+            leg_joints = int(starts[1])
             for joint, k in motors.items():
-                first[k] = motors.get(joint % int(starts[1]), k)
+                first[k] = motors.get(joint % leg_joints, k)
         return first
 
     @cached_property
@@ -187,6 +213,7 @@ class ParallelModel:
         return result
 
     def _chosen(self, entries: Sequence[Any]) -> tuple[Any, ...]:
+        """Return the entries of this model's parameters from those of the parameters of `single`."""
         return tuple(entries[k] for k in self._kept)
 
     @property
@@ -204,12 +231,17 @@ class ParallelModel:
 
     @cached_property
     def _names(self) -> tuple[str, ...]:
-        bodies = (name + label for label in self.labels for name in STANDARD)
-        return self._chosen((*bodies, *(term.name for term in self.terms)))
+        names: list[str] = []
+        for label in self.labels:
+            names += [name + label for name in STANDARD]
+        names += [term.name for term in self.terms]
+        return self._chosen(names)
 
     @property
     def units(self) -> tuple[str, ...]:
-        return self._chosen((*UNITS * len(self.labels), *(term.unit for term in self.terms)))
+        units = [*UNITS] * len(self.labels)
+        units += [term.unit for term in self.terms]
+        return self._chosen(units)
 
     @property
     def p(self) -> int:
@@ -221,7 +253,9 @@ class ParallelModel:
 
     @cached_property
     def _columns(self) -> tuple[DriveTerm, ...]:
-        return self._chosen((*[None] * self._bodies, *self.terms))[self.inertial :]
+        no_terms = [None] * self._bodies
+        columns = self._chosen([*no_terms, *self.terms])
+        return columns[self.inertial :]
 
     @property
     def rows(self) -> int:
@@ -231,7 +265,8 @@ class ParallelModel:
     def legs(self) -> tuple[tuple[Bodies, slice, slice], ...]:
         """For each leg: its bodies, its joints' indices in the tree, and its bodies' columns."""
         robot = self.mechanism.robot
-        ends = 10 * np.cumsum([0, *(leg.bodies for leg in robot.legs)])
+        counts = [leg.bodies for leg in robot.legs]
+        ends = 10 * np.cumsum([0, *counts])
         legs = []
         for k, leg in enumerate(robot.legs):
             joints = slice(*robot.starts[k : k + 2])
@@ -248,12 +283,20 @@ class ParallelModel:
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return W (N, rows, p) at the encoders' q, v, a (N, n); other arguments as `IdentificationModel.regressor`."""
-        return self.along(self.moved(q, v, a), carried)
+        """Return W (N, rows, p) at positions, velocities and accelerations (N, n) of the actuated joints.
+
+        Args:
+            q, v, a: (N, n) of the actuated joints.
+            load, states: not used.
+            carried: labels of the payloads on board; None: all.
+        """
+        motion = self.moved(q, v, a)
+        return self.along(motion, carried)
 
     def along(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
         """Return W (N, rows, p) along a motion of the whole robot."""
-        return self.on_rows(self.platform_regressor(motion, carried), motion)
+        regressor = self.platform_regressor(motion, carried)
+        return self.on_rows(regressor, motion)
 
     def torque(
         self,
@@ -267,10 +310,14 @@ class ParallelModel:
         """Return the torques, forces or power (N, rows) for parameters (p,), computed without the regressor."""
         motion = self.moved(q, v, a)
         force = self.platform_force(values, motion, carried)
-        return self.on_rows(force[:, :, None], motion)[:, :, 0]
+        rows = self.on_rows(force[:, :, None], motion)
+        return rows[:, :, 0]
 
     def moved(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, start: Posture | None = None) -> LoopMotion:
-        """Return the whole robot's motion from the encoders' q, v, a (N, n); `start`: postures near the new ones."""
+        """Return the motion of all joints and the platform from q, v, a (N, n) of the actuated joints.
+
+        `start`: postures near those at q, for a faster solution; None: home.
+        """
         posture = self.mechanism.locate(q, start)
         v = np.asarray(v, dtype=float)
         a = np.asarray(a, dtype=float)
@@ -280,9 +327,12 @@ class ParallelModel:
         """Return the regressor W (N, r, p) in platform coordinates, stored in the order (p, r, N)."""
         robot = self.mechanism.robot
         J = motion.jacobians
-        out = np.zeros((self._bodies + len(self.terms), robot.r, len(motion.v)))
+        count = self._bodies + len(self.terms)
+        out = np.zeros((count, robot.r, len(motion.v)))
         for bodies, joints, columns in self.legs:
-            q, v, a = motion.posture.q[:, joints], motion.v[:, joints], motion.a[:, joints]
+            q = motion.posture.q[:, joints]
+            v = motion.v[:, joints]
+            a = motion.a[:, joints]
             W = rigid_body.regressor(bodies, q, v, a)
             W = W[:, :, : columns.stop - columns.start]
             out[columns] = np.einsum("njr,njc->crn", J.joints[:, joints], W, optimize=True)
@@ -312,12 +362,13 @@ class ParallelModel:
     def actuator_torques(
         self, values: np.ndarray, motion: LoopMotion, carried: Collection[str] | None = None
     ) -> np.ndarray:
-        """Return the torques (N, n) of the actuators for parameters (p,): of redundant ones with the preload."""
+        """Return the torques (N, n) of the actuators for parameters (p,); of redundant actuators with `preload`."""
         forces = self.platform_force(values, motion, carried)
-        return distributed(self.mechanism, motion.jacobians, forces, np.array(self.preload or [0.0]))
+        preload = np.array(self.preload or [0.0])
+        return distributed(self.mechanism, motion.jacobians, forces, preload)
 
     def tree_torque(self, values: np.ndarray, motion: LoopMotion) -> np.ndarray:
-        """Return the torques (N, n_t) of the opened legs with their drives, without the platform."""
+        """Return the torques (N, n_t) of all joints that legs and drives need if the platform is detached."""
         q = motion.posture.q
         v = motion.v
         a = motion.a
@@ -343,20 +394,29 @@ class ParallelModel:
         return parameters
 
     def platform_parameters(self, values: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
-        """Return the ten standard parameters of the platform together with the payloads on board."""
-        bodies = self.spread(values)[self.legs[-1][2].stop : self._bodies].reshape(-1, 10)
-        present = [True, *(carried is None or label in carried for label in self.payloads)]
+        """Return the ten standard parameters of the platform together with the payloads on board.
+
+        `carried`: labels of the payloads on board; None: all.
+        """
+        first = self.legs[-1][2].stop
+        standard = self.spread(values)[first : self._bodies]
+        bodies = standard.reshape(-1, 10)
+        on_board = [carried is None or label in carried for label in self.payloads]
+        present = [True, *on_board]
         return bodies[present].sum(axis=0)
 
     def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
-        """Return the energy regressor h (N, p) at encoder q, v (N, n), like `IdentificationModel.energy_columns`."""
-        return self.energies(self.moved(q, v, np.zeros_like(v)), carried)
+        """Return the energy regressor h (N, p) at positions and velocities q, v (N, n) of the actuated joints."""
+        motion = self.moved(q, v, np.zeros_like(v))
+        return self.energies(motion, carried)
 
     def energies(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
-        """Return the columns h (N, p) of kinetic and potential energy; zero for friction (eq. 3 of the power paper)."""
-        out = np.zeros((self._bodies + len(self.terms), len(motion.v)))
+        """Return the columns h (N, p) of kinetic plus potential energy; columns of friction are zero."""
+        count = self._bodies + len(self.terms)
+        out = np.zeros((count, len(motion.v)))
         for bodies, joints, columns in self.legs:
-            leg_energies = rigid_body.energies(bodies, motion.posture.q[:, joints], motion.v[:, joints])
+            q = motion.posture.q[:, joints]
+            leg_energies = rigid_body.energies(bodies, q, motion.v[:, joints])
             out[columns] = leg_energies[:, : columns.stop - columns.start].T
         platform = energy_columns(motion.posture.pose, motion.twist, self.mechanism.robot.gravity)
         self._fill_platform(out, platform.T, carried)
@@ -364,21 +424,23 @@ class ParallelModel:
         return self._merged(out).T
 
     def _fill_platform(self, out: np.ndarray, platform: np.ndarray, carried: Collection[str] | None) -> None:
-        """Write the ten columns of the platform, and ten columns for each payload on board."""
-        for first, label in zip(range(self.legs[-1][2].stop, self._bodies, 10), (None, *self.payloads)):
+        """Write the columns `platform` (10, …) into `out`: for the platform, and for each payload on board."""
+        firsts = range(self.legs[-1][2].stop, self._bodies, 10)
+        for first, label in zip(firsts, (None, *self.payloads)):
             if label is None or carried is None or label in carried:
                 out[first : first + 10] = platform
 
     def acting(self) -> np.ndarray:
         states = self.sample(4, np.random.default_rng(0))
         regressor = self.regressor(states.q, states.v, states.a)
-        return np.asarray((np.abs(regressor) > 1e-12).any(axis=0)).T
+        has_effect = np.abs(regressor) > NO_EFFECT
+        return np.asarray(has_effect.any(axis=0)).T
 
     def preference(self) -> np.ndarray:
-        """Return the columns in the order of selection: platform, first moments, inertias, drives, masses, payloads.
+        """Return the columns in the order in which they are preferred as base parameters.
 
-        Inertia and mass of bodies next to the platform regroup on the platform and on the links before (Khalil &
-        Ibrahim 2007).
+        Order: platform, first moments, inertias, drives, masses, payloads. Inertia and mass of bodies next to the
+        platform are regrouped with parameters of the platform and of the previous links (Khalil & Ibrahim 2007).
         """
         orders = []
         leg_kinds = []
@@ -388,39 +450,47 @@ class ParallelModel:
             leg_kinds.append(bodies.kinds[:count])
         order = np.concatenate(orders)
         kinds = np.concatenate(leg_kinds)
-        ranks: dict[str, list[int]] = {"moments": [], "inertias": [], "late": []}
+        moments: list[int] = []
+        inertias: list[int] = []
+        last_columns: list[int] = []
         for i, (body_order, kind) in enumerate(zip(order, kinds)):
-            last = KEPT_LAST["prismatic" if kind == PRISMATIC else "revolute"]
+            last = KEPT_LAST["revolute"]
+            if kind == PRISMATIC:
+                last = KEPT_LAST["prismatic"]
             for c in range(10):
+                column = 10 * i + int(body_order[c])
                 if c in last or c == 9:
-                    rank = "late"
+                    last_columns.append(column)
+                elif c > 5:
+                    moments.append(column)
                 else:
-                    rank = "moments" if c > 5 else "inertias"
-                ranks[rank].append(10 * i + int(body_order[c]))
+                    inertias.append(column)
         platform = 10 * len(order)
         drive = range(self._bodies, self._bodies + len(self.terms))
         first = range(platform, platform + 10)
         payloads = range(platform + 10, self._bodies)
-        columns = [*first, *ranks["moments"], *ranks["inertias"], *drive, *ranks["late"], *payloads]
+        columns = [*first, *moments, *inertias, *drive, *last_columns, *payloads]
         distinct = dict.fromkeys(self.owners[columns])
         return np.array(list(distinct), dtype=int)
 
     def plant(self, values: np.ndarray, terms: Sequence[DriveTerm] = ()) -> Any:
-        """Return the robot to simulate with values of its parameters and of further terms of the actuated joints."""
-        # stands on this module
+        """Return the robot to simulate.
+
+        Args:
+            values: values of the model's parameters, followed by those of `terms`.
+            terms: further drive terms, whose joints count the actuated joints.
+        """
+        # imports this module
         from calib.parallel.mechanism.mechanism_simulation import ParallelPlant
 
         actuated_terms = []
         for term in terms:
-            joint = int(self.mechanism.robot.actuated[term.acts[0][0]])
-            actuated_terms.append(replace(term, acts=((joint, ((joint, 1.0),)),)))
-        return ParallelPlant(replace(self, terms=(*self.terms, *actuated_terms)), values)
-
-    def joint_noise(self, noise: np.ndarray) -> np.ndarray:
-        """Return the velocity noise (n_t,) of all joints at home from that of the actuated ones (n,)."""
-        at_home = loop_jacobians(self.mechanism, self.mechanism.home)
-        by_reading = at_home.joints[0] @ np.linalg.pinv(at_home.readings[0])
-        return np.sqrt(by_reading**2 @ noise**2)
+            actuator = term.acts[0][0]
+            joint = int(self.mechanism.robot.actuated[actuator])
+            acts = ((joint, ((joint, 1.0),)),)
+            actuated_terms.append(replace(term, acts=acts))
+        model = replace(self, terms=(*self.terms, *actuated_terms))
+        return ParallelPlant(model, values)
 
     def load_cases(self) -> Loads:
         if self.payloads:
@@ -430,25 +500,37 @@ class ParallelModel:
     def sample(
         self, count: int, rng: np.random.Generator, lower: np.ndarray | None = None, upper: np.ndarray | None = None
     ) -> States:
-        """Draw random states: the platform uniform in its box, its twist and the twist's derivative within ±3."""
+        """Return random states: the platform uniformly in its box, its twist and the twist's derivative within ±3.
+
+        `lower` and `upper` are not used.
+        """
         robot = self.mechanism.robot
         coordinates = rng.uniform(robot.lower, robot.upper, (count, robot.r))
         posture = self.mechanism.place(coordinates)
         rate, change = rng.uniform(-RATE, RATE, (2, count, robot.r))
         motion = of_platform(self.mechanism, posture, rate, change)
         actuated = robot.actuated
-        return States(posture.q[:, actuated], motion.v[:, actuated], motion.a[:, actuated])
+        q = posture.q[:, actuated]
+        v = motion.v[:, actuated]
+        a = motion.a[:, actuated]
+        return States(q, v, a)
 
     def known_parameters(self) -> np.ndarray | None:
-        """Return the inertial parameters of the robot's file (inertial,), zero for payloads; None if it has none.
-        Identical legs have the mean of the file's.
+        """Return the inertial parameters (inertial,) that the robot's file states; None if it does not state all.
+
+        Parameters of payloads are zero. Parameters of identical legs are the mean over the file's legs.
         """
         robot = self.mechanism.robot
-        parts = [leg.chain.inertias[: leg.bodies] for leg in robot.legs if leg.chain.inertias is not None]
-        if len(parts) < len(robot.legs) or robot.platform is None:
+        if robot.platform is None:
             return None
+        parts = []
+        for leg in robot.legs:
+            if leg.chain.inertias is None:
+                return None
+            parts.append(leg.chain.inertias[: leg.bodies])
         payloads = np.zeros((len(self.payloads), 10))
-        parameters = np.concatenate([*parts, robot.platform[None], payloads]).ravel()
+        bodies = np.concatenate([*parts, robot.platform[None], payloads])
+        parameters = bodies.ravel()
         owners = self.owners[: self._bodies]
         return np.bincount(owners, parameters) / np.bincount(owners)
 
@@ -457,15 +539,19 @@ class ParallelModel:
         if self.torque_rows.name == PLATFORM:
             return W
         if self.torque_rows.name == POWER.name:
-            return np.einsum("nr,nrp->pn", motion.rate, W).T[:, None, :]
-        return np.linalg.solve(motion.jacobians.readings.transpose(0, 2, 1), W)
+            power = np.einsum("nr,nrp->pn", motion.rate, W)
+            return power.T[:, None, :]
+        projection = motion.jacobians.readings.transpose(0, 2, 1)
+        return np.linalg.solve(projection, W)
 
 
 PLATFORM = "platform"
 
 
 def rows_named(mechanism: ClosedRobot, name: str = "") -> TorqueRows:
-    """Return the rows of the option ``platform``, ``motor`` or ``power``; by default those possible for a robot.
+    """Return the torque rows of a name: ``platform``, ``motor`` or ``power``.
+
+    By default, rows of redundant actuators are ``platform``, those of other robots ``motor``.
 
     Raises:
         UsageError: for motor rows of redundant actuators, whose torques no model determines; for other names.
@@ -474,7 +560,8 @@ def rows_named(mechanism: ClosedRobot, name: str = "") -> TorqueRows:
     name = name or (PLATFORM if robot.redundant else MOTOR.name)
     if name == PLATFORM:
         units = tuple(FORCES[COORDINATES.index(coordinate)] for coordinate in robot.freedom)
-        return projected(PLATFORM, Projection(robot.freedom, units, partial(_to_platform, mechanism)))
+        to_platform = partial(_to_platform, mechanism)
+        return projected(PLATFORM, Projection(robot.freedom, units, to_platform))
     if name == POWER.name:
         return POWER
     require(name == MOTOR.name, f"rows = '{name}': for a parallel robot expected platform, motor or power", UsageError)
@@ -498,10 +585,13 @@ def make_parallel_model(
     """Return the identification model of a robot: bodies, drive terms of actuated joints, friction of passive joints.
 
     Args:
-        sets: names out of `calib.dynamics.drives.standard`, one text per actuated joint or one for all; none: Ia Fv Fc
-            off.
+        mechanism: the robot, its loops closed.
+        sets: names of drive terms (`calib.dynamics.drives.standard`), one text per actuated joint or one for all;
+            empty: Ia Fv Fc off.
         v0: smoothing of the Coulomb sign [rad/s or m/s].
-        passive: names for all passive joints, e.g. ``Fv Fc``.
+        rows: torque rows; None: the default of `rows_named`.
+        payloads: labels of bodies that the platform may carry.
+        passive: names of the drive terms of all passive joints, e.g. ``Fv Fc``; "": none.
         identical_legs: see `ParallelModel`.
     """
     robot = mechanism.robot
@@ -517,9 +607,12 @@ def make_parallel_model(
     for j, text in zip(robot.actuated, drive_sets):
         texts[j] = text
     linear = [joint.kind == "prismatic" for joint in joints]
-    plain = drives.standard(texts, v0, linear)
-    terms = tuple(replace(term, name=_renamed(term, robot.labels)) for term in plain)
-    return ParallelModel(mechanism, terms, rows or rows_named(mechanism), tuple(payloads), identical_legs)
+    terms = []
+    for term in drives.standard(texts, v0, linear):
+        name = _renamed(term, robot.labels)
+        terms.append(replace(term, name=name))
+    torque_rows = rows or rows_named(mechanism)
+    return ParallelModel(mechanism, tuple(terms), torque_rows, tuple(payloads), identical_legs)
 
 
 def _renamed(term: DriveTerm, labels: Sequence[str]) -> str:
@@ -530,22 +623,27 @@ def _renamed(term: DriveTerm, labels: Sequence[str]) -> str:
 
 def _to_platform(mechanism: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return J_p^invᵀ (N, r, n), which maps actuator torques to platform coordinates."""
-    return loop_jacobians(mechanism, mechanism.locate(q)).readings.transpose(0, 2, 1)
+    posture = mechanism.locate(q)
+    jacobians = loop_jacobians(mechanism, posture)
+    return jacobians.readings.transpose(0, 2, 1)
 
 
-# of the differences by x, v and a
+# Steps of the differences by x [m or rad], v [per s] and a [per s²].
 STEPS = (1e-6, 1e-3, 1.0)
 
 
 def along(mechanism: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> LoopMotion:
     """Return the motion of all joints for platform coordinates x (N, r) and their derivatives v, a."""
-    return of_platform(mechanism, mechanism.place(x), *_twist_of(mechanism, x, v, a))
+    posture = mechanism.place(x)
+    rate, change = _twist_of(mechanism, x, v, a)
+    return of_platform(mechanism, posture, rate, change)
 
 
 def _twist_of(mechanism: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the independent parts of the platform's twist and their derivatives, each (N, r).
 
-    Position's are v and a themselves; ω = ψ̇ z + φ̇ Rz y + ρ̇ Rz Ry x of roll ρ, pitch φ, yaw ψ about the base's axes.
+    For coordinates of position these are v and a. The angular velocity is ω = ψ̇ z + φ̇ Rz y + ρ̇ Rz Ry x with roll ρ,
+    pitch φ and yaw ψ about the base's axes.
     """
     selected = mechanism.robot.selected
     if not (selected > 2).any() or ((selected > 2).sum() == 1 and 5 in selected):
@@ -554,55 +652,76 @@ def _twist_of(mechanism: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarra
     full[:, :, selected] = x, v, a
     angles, rates, changes = full[:, :, 3:]
     Rz = Rotation.from_euler("z", angles[:, 2:]).as_matrix()
-    Rzy = Rz @ Rotation.from_euler("y", angles[:, 1:2]).as_matrix()
-    vertical = np.broadcast_to([0.0, 0.0, 1.0], (len(x), 3))
-    axes = np.stack([Rzy[:, :, 0], Rz[:, :, 1], vertical], axis=2)
+    Ry = Rotation.from_euler("y", angles[:, 1:2]).as_matrix()
+    Rzy = Rz @ Ry
+    roll_axis = Rzy[:, :, 0]
+    pitch_axis = Rz[:, :, 1]
+    yaw_axis = np.broadcast_to([0.0, 0.0, 1.0], (len(x), 3))
+    axes = np.stack([roll_axis, pitch_axis, yaw_axis], axis=2)
     yaw = rates[:, 2:] * axes[:, :, 2]
     pitch = rates[:, 1:2] * axes[:, :, 1]
     roll = rates[:, :1] * axes[:, :, 0]
     full[1, :, 3:] = yaw + pitch + roll
     by_changes = np.einsum("nij,nj->ni", axes, changes)
-    full[2, :, 3:] = by_changes + np.cross(yaw, pitch) + np.cross(yaw + pitch, roll)
+    pitch_turned = np.cross(yaw, pitch)
+    roll_turned = np.cross(yaw + pitch, roll)
+    full[2, :, 3:] = by_changes + pitch_turned + roll_turned
     return full[1][:, selected], full[2][:, selected]
 
 
-# of a search, whose objectives and limits all ask for the same motion and for those beside it
+# A search evaluates objectives and limits at the same motion, and its derivatives at the same neighbouring motions.
 @lru_cache(maxsize=4)
 def _moving(mechanism: ClosedRobot, *motion: bytes) -> LoopMotion:
     """Return the motion of all joints for x, v, a (N, r) of the platform."""
-    x, v, a = (np.frombuffer(series).reshape(-1, mechanism.robot.r) for series in motion)
+    x, v, a = _series(mechanism, motion)
     return along(mechanism, x, v, a)
+
+
+def _series(mechanism: ClosedRobot, motion: Sequence[bytes]) -> list[np.ndarray]:
+    """Return the arrays x, v, a (N, r) of a motion from their bytes."""
+    series = [np.frombuffer(content) for content in motion]
+    return [values.reshape(-1, mechanism.robot.r) for values in series]
 
 
 @lru_cache(maxsize=4)
 def _beside(mechanism: ClosedRobot, *motion: bytes) -> list[tuple[LoopMotion, LoopMotion]]:
-    """Return the motions for finite differences at x, v, a (N, r): each column increased and decreased by its step."""
-    states = [np.frombuffer(series).reshape(-1, mechanism.robot.r) for series in motion]
+    """Return pairs of motions near x, v, a (N, r), for central differences.
+
+    In a pair one coordinate of x, v or a is increased and decreased by its step: first those of x, then of v and a.
+    """
+    states = _series(mechanism, motion)
     result = []
     start = _moving(mechanism, *motion).posture
     still = loop_jacobians(mechanism, start)
     for order, step in enumerate(STEPS):
         for shift in step * np.eye(mechanism.robot.r):
             ends = []
-            for shifted in ([*states], [*states]):
-                shifted[order] = shifted[order] + (-shift if ends else shift)
+            for displacement in (shift, -shift):
+                shifted = [*states]
+                shifted[order] = shifted[order] + displacement
                 posture = start
+                jacobians: LoopJacobians | None = still
                 if order == 0:
                     posture = mechanism.place(shifted[0], start)
-                twist = _twist_of(mechanism, *shifted)
-                ends.append(of_platform(mechanism, posture, *twist, None if order == 0 else still))
-            result.append(tuple(ends))
+                    jacobians = None
+                rate, change = _twist_of(mechanism, *shifted)
+                ends.append(of_platform(mechanism, posture, rate, change, jacobians))
+            raised, lowered = ends
+            result.append((raised, lowered))
     return result
 
 
 @dataclass(frozen=True, eq=False)
 class PlatformRegressor:
-    """Regressor in platform coordinates and actuator torques as functions of x, v, a; gradients are by differences.
+    """Regressor and actuator torques of a robot as functions of the platform's coordinates x, v, a.
+
+    Gradients are computed by central differences.
 
     Attributes:
         model: model of the robot.
         columns: (b,) indices of the model's columns that are used.
         values: (p,) parameters that predict torques; None where unknown.
+        carried: labels of the payloads on board; None: all.
     """
 
     model: ParallelModel
@@ -635,9 +754,9 @@ class PlatformRegressor:
         return motion.v[:, self.model.mechanism.robot.actuated]
 
     def _reachable(self, x: np.ndarray, spare_share: float = 0.01) -> np.ndarray:
-        """Return coordinates clipped to the robot's box, since a search may leave the box.
+        """Return coordinates clipped to the robot's box and a margin, since a search may leave the box.
 
-        `spare_share`: share of the box's width allowed beyond the box (our choice).
+        `spare_share`: margin on each side as a share of the box's width (our choice).
         """
         robot = self.model.mechanism.robot
         spare = spare_share * (robot.upper - robot.lower)
@@ -645,7 +764,8 @@ class PlatformRegressor:
 
     def _columns(self, motion: LoopMotion) -> np.ndarray:
         regressor = self.model.platform_regressor(motion, self.carried)
-        return regressor.transpose(2, 1, 0)[self.columns].transpose(2, 1, 0)
+        by_column = regressor.transpose(2, 1, 0)
+        return by_column[self.columns].transpose(2, 1, 0)
 
     def slopes(
         self, x: np.ndarray, v: np.ndarray, a: np.ndarray, of: Callable[[LoopMotion], np.ndarray], weights: np.ndarray
@@ -660,6 +780,9 @@ class PlatformRegressor:
         pairs = _beside(self.model.mechanism, within.tobytes(), v.tobytes(), a.tobytes())
         for k, (raised, lowered) in enumerate(pairs):
             order, j = divmod(k, x.shape[1])
-            change = ((of(raised) - of(lowered)) * weights).reshape(len(x), -1)
-            result[order, :, j] = change.sum(axis=1) / (2.0 * STEPS[order])
-        return result[0] * (within == x), result[1], result[2]
+            change = (of(raised) - of(lowered)) * weights
+            by_sample = change.reshape(len(x), -1)
+            result[order, :, j] = by_sample.sum(axis=1) / (2.0 * STEPS[order])
+        # a clipped coordinate has no effect
+        by_x = result[0] * (within == x)
+        return by_x, result[1], result[2]

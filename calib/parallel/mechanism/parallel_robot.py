@@ -52,16 +52,17 @@ ENDS = ("rigid", "spherical")
 
 @dataclass(frozen=True, eq=False)
 class Leg(Frozen):
-    """One serial chain from the base to the platform.
+    """A serial chain from the base to the platform.
 
     Attributes:
-        name: of the leg.
-        chain: its joints, from the robot's base to its end; the first element holds its place in the base.
-        actuated: which of its joints have a motor and an encoder.
-        home: (n,) joint values near those that close its loop at the platform's home: they choose the branch.
-        attachment: (4, 4) pose at which the platform holds the leg's end, in the platform's frame.
-        end: ``rigid``: the last link is the platform, all passive joints are in the chain; ``spherical``: a joint of
-            three freedoms ends it, which the chain leaves out.
+        name: name of the leg.
+        chain: the leg's joints from the robot's base to the leg's end; the first element contains the leg's pose in the
+            base.
+        actuated: indices of the joints with a motor and an encoder.
+        home: (n,) joint values near those that close the loop with the platform at home; they select the branch.
+        attachment: (4, 4) pose of the leg's end in the platform's frame.
+        end: ``rigid``: the chain contains all joints, and its last link is the platform; ``spherical``: a ball joint,
+            which is not part of the chain, connects the chain's last link to the platform.
     """
 
     name: str
@@ -78,7 +79,7 @@ class Leg(Frozen):
         if self.end not in ENDS:
             refuse_robot(location, f"its end '{self.end}' is neither {' nor '.join(ENDS)}")
         if self.home.shape != (n,):
-            refuse_robot(location, f"home has {self.home.size} values for its {n} joints")
+            refuse_robot(location, f"home has {self.home.size} values for its {n} joints: state one per joint")
         if n > self.held:
             refuse_robot(
                 location,
@@ -104,20 +105,20 @@ class ParallelRobot(Frozen):
         closure of leg k:   tip_k(q_k) = P · attachment_k    (six equations where the leg is rigid with the platform,
                                                               three where a spherical joint ends it)
 
-    Nothing is planar or symmetric by construction: a planar robot is one whose loops leave x, y and rz. The virtual
-    tree of the papers (Khalil & Ibrahim 2007; Briot, Gautier & Krut 2013) is all legs side by side, and the free
-    platform.
+    Robots need not be planar or symmetric; in a planar robot the loops allow motions in x, y and rz only. All legs
+    without the loops' closures, and the platform as a free body, are called the tree (Khalil & Ibrahim 2007; Briot,
+    Gautier & Krut 2013).
 
     Attributes:
-        name: of the robot.
-        legs: in the order of the file; actuated joints are numbered through them.
-        freedom: the platform's independent coordinates, of `COORDINATES`: position of its frame's origin [m] and
-            roll-pitch-yaw from the base's axes [rad], both from `home`; v and forces along them are parts of its twist
-            and wrench, in the base's axes.
-        home: (4, 4) the platform's home in the base.
-        lower, upper: (r,) box of platform coordinates in which states are drawn and motions designed.
-        platform: (10,) its standard parameters about its frame; None where unknown.
-        gravity: (3,) in the base frame [m/s²].
+        name: name of the robot.
+        legs: the legs in the order of the file; actuated joints are numbered in this order.
+        freedom: names, out of `COORDINATES`, of the platform's independent coordinates: position of its frame's origin
+            [m] and roll-pitch-yaw angles about the base's axes [rad], both relative to `home`. The platform's velocity
+            and force along these coordinates are components of its twist and wrench in the base's axes.
+        home: (4, 4) pose of the platform at home, in the base.
+        lower, upper: (r,) box of platform coordinates in which random states are drawn and motions designed.
+        platform: (10,) standard parameters of the platform about its frame; None where unknown.
+        gravity: (3,) gravity in the base's frame [m/s²].
     """
 
     name: str
@@ -128,7 +129,7 @@ class ParallelRobot(Frozen):
     upper: np.ndarray
     platform: np.ndarray | None = None
     gravity: np.ndarray = field(default_factory=lambda: np.array(GRAVITY))
-    # names of a URDF's, which there is none of
+    # Names of a URDF's links; a parallel robot has no URDF.
     links = ()
 
     def __post_init__(self) -> None:
@@ -137,14 +138,16 @@ class ParallelRobot(Frozen):
         names = [leg.name for leg in self.legs]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            self.refuse(f"two legs are called '{twice[0]}'")
+            self.refuse(f"two legs are called '{twice[0]}': rename one")
         if not freedom or not set(self.freedom) <= set(COORDINATES) or len(set(self.freedom)) < self.r:
             self.refuse(
                 f"freedom {freedom or 'is empty'}; it names the platform's independent coordinates, each once, of "
                 f"{', '.join(COORDINATES)}"
             )
         if self.n < self.r:
-            self.refuse(f"{self.n} actuated joints cannot hold a platform of {self.r} freedoms ({freedom})")
+            self.refuse(
+                f"{self.n} actuated joints cannot hold a platform of {self.r} freedoms ({freedom}): actuate more joints"
+            )
         if self.lower.shape != (self.r,) or self.upper.shape != (self.r,) or not (self.lower < self.upper).all():
             self.refuse(
                 f"the platform's limits need one lower and one higher upper value per coordinate ({freedom}); found "
@@ -300,7 +303,7 @@ def write(
 
 
 def to_table(robot: ParallelRobot, source: str = "") -> dict[str, object]:
-    """Return the table (schema above) that `_from_table` reads back exactly."""
+    """Return the table of a robot's TOML file (schema above); reading it gives exactly the same robot."""
     table: dict[str, object] = {"kind": KIND, "name": robot.name, "gravity": robot.gravity.tolist()}
     if source:
         table["source"] = source
@@ -357,7 +360,14 @@ def _words(value: object, where: str) -> tuple[str, ...]:
 
 
 def _values(values: object, turns: Sequence[bool], location: str, quantity: str) -> np.ndarray:
-    """Return a list of values [rad where `turns`, else m], one per `each`."""
+    """Return parsed values (k,) of a list in a TOML file.
+
+    Args:
+        values: the list: numbers, or texts with a unit.
+        turns: (k,) whether each value is an angle [rad] instead of a length [m].
+        location: place in the file, for messages.
+        quantity: what each value belongs to (joint, coordinate), for messages.
+    """
     if not isinstance(values, list) or len(values) != len(turns):
         refuse_robot(location, f"expected one value per {quantity}, {len(turns)}; found {shown(values)}")
     parsed = []

@@ -1,6 +1,7 @@
-"""Compiled closed loop (numba): a parallel robot under a sampled controller of its actuators, midpoint rule in between.
+"""Compiled simulation (numba) of a parallel robot under a sampled controller of its actuators.
 
-The platform's coordinates are integrated, the legs follow, their gaps closed on the way; notation of `closure_kernels`.
+Between samples the platform's coordinates are integrated by the midpoint rule. The legs' joints follow the platform,
+and each evaluation also corrects the gaps of the loops. Notation as in `closure_kernels`.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ def _add(A, x, out):
 @njit(**OPTIONS)
 def _platform(body, pose, turn, gravity, M, h):
     """Write the platform's inertia M (6, 6), zero on entry, and its wrench h (6,) where the twist does not change."""
-    w, g = (turn[0], turn[1], turn[2]), (gravity[0], gravity[1], gravity[2])
+    w = (turn[0], turn[1], turn[2])
+    g = (gravity[0], gravity[1], gravity[2])
     rows = (three(pose, 0, 0), three(pose, 1, 0), three(pose, 2, 0))
     moments = body[6], body[7], body[8]
     S = dot(rows[0], moments), dot(rows[1], moments), dot(rows[2], moments)
@@ -56,8 +58,12 @@ def _platform(body, pose, turn, gravity, M, h):
 
 @njit(**OPTIONS)
 def _bent(full, v, turn, lever, leg, shift):
-    """Add to row `leg` of `shift` (L, 6) that of a leg's acceleration equations J q̈ = G ṫ - shift, see `velocities`."""
-    w, t = (0.0, 0.0, 0.0), (turn[0], turn[1], turn[2])
+    """Add the right-hand side of a leg's acceleration equations J q̈ = G ṫ - shift to row `leg` of `shift` (L, 6).
+
+    The terms are those of `velocities.of_platform`.
+    """
+    w = (0.0, 0.0, 0.0)
+    t = (turn[0], turn[1], turn[2])
     for j in range(v.shape[0]):
         moved = scaled(v[j], (full[0, j], full[1, j], full[2, j]))
         turned = scaled(v[j], (full[3, j], full[4, j], full[5, j]))
@@ -69,12 +75,14 @@ def _bent(full, v, turn, lever, leg, shift):
 
 @njit(**OPTIONS)
 def _freedoms(full, inverse, carried, held, starts, selected, D, back):
-    """Write D (6, r), the twists that all legs can follow, and `back` (L, 6, 6), t_0 = Σ_k back[k] e_k; zero on entry.
+    """Write D (6, r) and `back` (L, 6, 6), both zero on entry: platform twists that all legs can follow are t_0 + D v.
 
-    The legs' equations J q̇ = G t - e leave (1 - J J⁺) (G t - e) = 0; of it the twist's other parts by least squares,
-    the selected ones of t_0 being zero (`calib.parallel.mechanism.closure.twists`).
+    t_0 = Σ_k back[k] e_k. From the equations J q̇ = G t - e of all legs remain (1 - J J⁺) (G t - e) = 0, which determine
+    the components of the twist that are not selected, by least squares; the selected components of t_0 are zero
+    (`calib.parallel.mechanism.closure.twists`).
     """
-    L, r = starts.shape[0] - 1, selected.shape[0]
+    L = starts.shape[0] - 1
+    r = selected.shape[0]
     others = np.empty(6 - r, np.int64)
     count = 0
     for i in range(6):
@@ -84,10 +92,13 @@ def _freedoms(full, inverse, carried, held, starts, selected, D, back):
         if free:
             others[count] = i
             count += 1
-    square, mixed = np.zeros((6 - r, 6 - r)), np.zeros((6 - r, r))
-    rows, across = np.zeros((L, 6, 6)), np.zeros((L, 6, 6))
+    square = np.zeros((6 - r, 6 - r))
+    mixed = np.zeros((6 - r, r))
+    rows = np.zeros((L, 6, 6))
+    across = np.zeros((L, 6, 6))
     for leg in range(L):
-        n, c = starts[leg + 1] - starts[leg], held[leg]
+        n = starts[leg + 1] - starts[leg]
+        c = held[leg]
         for i in range(c):
             across[leg, i, i] = 1.0
             for m in range(c):
@@ -122,7 +133,10 @@ def _freedoms(full, inverse, carried, held, starts, selected, D, back):
 
 @njit(**OPTIONS)
 def _follow(held, inverse, carried, gap, mend, D, q, J):
-    """Move a leg's joints q (n,) after the platform's step `mend` (6,), and write J (n, r), q̇ = J v; zero on entry."""
+    """Move a leg's joints q (n,) so that they follow the platform's step `mend` (6,), and close the leg's gap.
+
+    Also write J (n, r), zero on entry, with q̇ = J v.
+    """
     for m in range(held):
         missing = -gap[m]
         for a in range(6):
@@ -136,17 +150,28 @@ def _follow(held, inverse, carried, gap, mend, D, q, J):
 
 @njit(**OPTIONS)
 def _leg_share(links, constants, parameters, drives, held, inverse, carried, shift, still, q, rates, tau, J, M, h):
-    """Add a leg's share to the inertia M (r, r) and to the force h (r,) where the twist changes by `still`.
+    """Add a leg's share to the inertia M (r, r) and to the force h (r,), the force if ṫ = `still`.
 
     Args:
-        drives: (n, 5); q, rates, tau: (n,); J: (n, r) of its joints.
+        drives: (n, 5) drive parameters of the leg's joints.
+        q, rates, tau: (n,) joint values, rates and actuator torques of the leg.
+        J: (n, r) Jacobian of the leg's joints.
     """
-    n, r = q.shape[0], h.shape[0]
-    rows = np.zeros((6, n + 1, n))  # of the motion, and of the same with one joint accelerating by one more
-    amount, cosine, sine, v, a, need = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
+    n = q.shape[0]
+    r = h.shape[0]
+    # Row 0 is the motion; in row j + 1 the acceleration of joint j is larger by 1.
+    rows = np.zeros((6, n + 1, n))
+    amount = rows[0]
+    cosine = rows[1]
+    sine = rows[2]
+    v = rows[3]
+    a = rows[4]
+    need = rows[5]
     for j in range(n):
-        amount[:, j], v[:, j] = constants[j, SCALE] * q[j], rates[j]
-        cosine[:, j], sine[:, j] = np.cos(amount[0, j]), np.sin(amount[0, j])
+        amount[:, j] = constants[j, SCALE] * q[j]
+        v[:, j] = rates[j]
+        cosine[:, j] = np.cos(amount[0, j])
+        sine[:, j] = np.sin(amount[0, j])
         for m in range(held):
             bent = -shift[m]
             for b in range(6):
@@ -168,26 +193,46 @@ def _leg_share(links, constants, parameters, drives, held, inverse, carried, shi
 
 @njit(**OPTIONS)
 def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
-    """Write v̇ (r,) into `change`, q̇ (n_t,) into `rates`, t (6,) into `twist`; close the gaps in q and pose on the way.
-
-    Returns a bound [1/s] on the fastest decay of friction near standstill, the trace of M⁻¹ Jᵀ D J with the signs'
-    steepest slopes D, or -1 where M is not positive definite.
+    """Write the accelerations of a state, and correct the gaps of the loops in q and pose.
 
     Args:
-        robot: of L legs of B bodies or fewer: links (L, B, 4 + B), constants (L, B + 1, 13), tails and attachments
-            (L, 4, 4), starts, held, selected, actuated, gravity, and whether the platform's twist is always the
-            selected parts alone.
-        values: parameters of the legs' bodies (L, 10 B), of the platform (10,), drives (n_t, 5) Ia Fv Fc off and v0.
-        q: (n_t,); pose: (4, 4) of the platform; rate: (r,); tau: (n,) of the actuators.
+        robot: arrays of L legs with at most B bodies: links (L, B, 4 + B), constants (L, B + 1, 13), tails and
+            attachments (L, 4, 4), starts, held, selected, actuated, gravity, and whether the components of the twist
+            that are not selected are always zero.
+        values: parameters of the legs' bodies (L, 10 B) and of the platform (10,), drives (n_t, 5) Ia Fv Fc off and v0.
+        q: (n_t,) values of all joints.
+        pose: (4, 4) pose of the platform.
+        rate: (r,) independent components v of the platform's twist.
+        tau: (n,) torques of the actuators.
+        rates, twist, change: results q̇ (n_t,), t (6,) and v̇ (r,).
+
+    Returns:
+        An upper bound [1/s] on the fastest decay rate of friction near standstill: the trace of M⁻¹ Jᵀ D J with the
+        steepest slopes D of the friction. -1 if M is not positive definite.
     """
     links, constants, tails, attachments, starts, held, selected, actuated, gravity, fixed = robot
     parameters, body, drives = values
-    r, n_t, L, most = rate.shape[0], q.shape[0], starts.shape[0] - 1, links.shape[1]
-    full, inverse, carried = np.zeros((L, 6, most)), np.zeros((L, most, 6)), np.zeros((L, 6, 6))
-    gap, lever, shift, back = np.zeros((L, 6)), np.zeros((L, 3)), np.zeros((L, 6)), np.zeros((L, 6, 6))
-    frame, D, J = np.zeros((4, 6 + 3 * most)), np.zeros((6, r)), np.zeros((n_t, r))
-    M, whole = np.zeros((r, r)), np.zeros((6, 6))
-    mend, still, wrench, h, torque = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(r), np.zeros(n_t)
+    r = rate.shape[0]
+    n_t = q.shape[0]
+    L = starts.shape[0] - 1
+    most = links.shape[1]
+    full = np.zeros((L, 6, most))
+    inverse = np.zeros((L, most, 6))
+    carried = np.zeros((L, 6, 6))
+    gap = np.zeros((L, 6))
+    lever = np.zeros((L, 3))
+    shift = np.zeros((L, 6))
+    back = np.zeros((L, 6, 6))
+    frame = np.zeros((4, 6 + 3 * most))
+    D = np.zeros((6, r))
+    J = np.zeros((n_t, r))
+    M = np.zeros((r, r))
+    whole = np.zeros((6, 6))
+    mend = np.zeros(6)
+    still = np.zeros(6)
+    wrench = np.zeros(6)
+    h = np.zeros(r)
+    torque = np.zeros(n_t)
     for leg in range(L):
         one_leg(
             links[leg],
@@ -220,13 +265,15 @@ def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
     for j in range(actuated.shape[0]):
         torque[actuated[j]] = tau[j]
     for leg in range(L):
-        first, last = starts[leg], starts[leg + 1]
+        first = starts[leg]
+        last = starts[leg + 1]
         _follow(held[leg], inverse[leg], carried[leg], gap[leg], mend, D, q[first:last], J[first:last])
         _add(J[first:last], rate, rates[first:last])
         _bent(full[leg], rates[first:last], twist[3:], lever, leg, shift)
         _add(back[leg], shift[leg], still)
     for leg in range(L):
-        first, last = starts[leg], starts[leg + 1]
+        first = starts[leg]
+        last = starts[leg + 1]
         _leg_share(
             links[leg],
             constants[leg],
@@ -273,14 +320,20 @@ def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
 
 @njit(**OPTIONS)
 def _turn(factor, twist, pose, out):
-    """Write a pose moved by `factor` times a twist (6,): p += v, R = Exp(ω) R (Rodrigues); `out` may be `pose`."""
-    x, y, z = factor * twist[3], factor * twist[4], factor * twist[5]
+    """Write a pose moved by `factor` times a twist [v; ω] (6,): p + v and Exp(ω) R (Rodrigues); `out` may be `pose`."""
+    x = factor * twist[3]
+    y = factor * twist[4]
+    z = factor * twist[5]
     angle = np.sqrt(x * x + y * y + z * z)
     one = np.sin(angle) / angle if angle > 1e-12 else 1.0
     two = 0.5 * (np.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-12 else 0.5
     for k in range(3):
-        a, b, c = pose[0, k], pose[1, k], pose[2, k]
-        dx, dy, dz = y * c - z * b, z * a - x * c, x * b - y * a
+        a = pose[0, k]
+        b = pose[1, k]
+        c = pose[2, k]
+        dx = y * c - z * b
+        dy = z * a - x * c
+        dz = x * b - y * a
         out[0, k] = a + one * dx + two * (y * dz - z * dy)
         out[1, k] = b + one * dy + two * (z * dx - x * dz)
         out[2, k] = c + one * dz + two * (x * dy - y * dx)
@@ -289,22 +342,36 @@ def _turn(factor, twist, pose, out):
 
 @njit(**OPTIONS)
 def run(robot, values, q, pose, rate, mixing, gains, reference, encoder, period, smoothing, late, far, out):
-    """Run the loop: measure, command, hold the torque for one period, integrate. Return (status, period reached).
+    """Simulate the closed loop: in each period measure, compute the torque, hold it, integrate.
 
     Args:
         robot, values: see `_accelerate`.
         q, pose, rate: the state at the beginning, overwritten.
-        mixing: (N, n, n) that the feedback is multiplied by; none: (0, n, n).
+        mixing: (N, n, n) matrices by which the feedback is multiplied; an array (0, n, n): none.
         gains: (6, n) of the actuators' controller, reference (4, N, n): see `loop_kernels.closed_loop`.
         encoder: (N, n) noise of the readings.
         far: distance from the reference [rad or m] at which a run has diverged.
-        out: (3, N, n) true and measured positions, torque held from instant to instant.
+        out: (3, N, n) results: true positions, measured positions, torque held during each period.
+
+    Returns:
+        Status, and the number of the last simulated period.
     """
-    actuated, n, r = robot[7], robot[7].shape[0], rate.shape[0]
-    q2, pose2, rate2 = q.copy(), pose.copy(), rate.copy()
-    rates, change, twist = np.zeros(q.shape[0]), np.zeros(r), np.zeros(6)
-    speed, read, before, integral = reference[1, 0].copy(), np.zeros(n), np.zeros(n), np.zeros(n)
-    wish, tau, waiting = np.zeros(n), np.zeros(n), np.zeros((late + 1, n))
+    actuated = robot[7]
+    n = robot[7].shape[0]
+    r = rate.shape[0]
+    q2 = q.copy()
+    pose2 = pose.copy()
+    rate2 = rate.copy()
+    rates = np.zeros(q.shape[0])
+    change = np.zeros(r)
+    twist = np.zeros(6)
+    speed = reference[1, 0].copy()
+    read = np.zeros(n)
+    before = np.zeros(n)
+    integral = np.zeros(n)
+    wish = np.zeros(n)
+    tau = np.zeros(n)
+    waiting = np.zeros((late + 1, n))
     for k in range(reference.shape[1]):
         for j in range(n):
             read[j] = q2[actuated[j]] + encoder[k, j]
@@ -319,14 +386,19 @@ def run(robot, values, q, pose, rate, mixing, gains, reference, encoder, period,
             for m in range(n * (mixing.shape[0] > 0)):
                 asked += mixing[k, j, m] * wish[m]
             held = min(max(asked, -gains[4, j]), gains[4, j])
+            # The integral does not grow while the torque is at its limit.
             if held != asked and (reference[0, k, j] - read[j]) * asked > 0.0:
-                integral[j] -= period * (reference[0, k, j] - read[j])  # no winding up against the limit
+                integral[j] -= period * (reference[0, k, j] - read[j])
             waiting[k % (late + 1), j] = held
             tau[j] = waiting[(k + 1) % (late + 1) if k >= late else 0, j]
-            out[0, k, j], out[1, k, j], out[2, k, j] = q2[actuated[j]], read[j], tau[j]
-        left, span = period, 0.0
+            out[0, k, j] = q2[actuated[j]]
+            out[1, k, j] = read[j]
+            out[2, k, j] = tau[j]
+        left = period
+        span = 0.0
         while left > 1e-9 * period:
-            for half in range(2):  # one call, which the compiler joins into this loop: two take it twice as long
+            # A single call, since the compiler inlines each call and would take twice as long with two.
+            for half in range(2):
                 decay = _accelerate(robot, values, q2, pose2, rate2, tau, rates, twist, change)
                 if decay < 0.0:
                     return SINGULAR, k
@@ -335,7 +407,9 @@ def run(robot, values, q, pose, rate, mixing, gains, reference, encoder, period,
                     if pieces * period > 2 * MAX_STEPS * left:
                         return STIFF, k
                     span = left / pieces
-                    q[:], pose[:], rate[:] = q2, pose2, rate2
+                    q[:] = q2
+                    pose[:] = pose2
+                    rate[:] = rate2
                 length = span if half else 0.5 * span
                 for i in range(q.shape[0]):
                     q2[i] = q[i] + length * rates[i]

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.parallel.mechanism.closure import ClosedRobot, LegLinks, Posture, leg_links, times, twists
+from calib.parallel.mechanism.closure import ClosedRobot, LegLinks, Posture, joint_rates, leg_links, times, twists
 from calib.records import shaped
 
 
@@ -20,8 +20,8 @@ class LoopJacobians:
     Attributes:
         joints: (N, n_t, r) J_t: rates of all joints of the tree.
         readings: (N, n, r) J_p^inv: rates of the actuated joints.
-        platform: (N, 6, r) D: the whole twist, in the base's axes.
-        links: the legs.
+        platform: (N, 6, r) D: the platform's twist, in the base's axes.
+        links: Jacobians and gaps of the legs.
     """
 
     joints: np.ndarray
@@ -55,7 +55,7 @@ def loop_jacobians(mechanism: ClosedRobot, posture: Posture) -> LoopJacobians:
     """Return the Jacobians of postures."""
     links = leg_links(mechanism.robot, posture)
     D, _ = twists(mechanism, links)
-    joints = np.concatenate([link.inverse @ (link.carried @ D) for link in links], axis=1)
+    joints = joint_rates(links, D)
     return LoopJacobians(joints, joints[:, mechanism.robot.actuated], D, links)
 
 
@@ -78,13 +78,16 @@ def of_platform(
     shifts = []
     starts = mechanism.robot.starts
     for link, a, b in zip(loop.links, starts, starts[1:]):
-        shifts.append(_end_bias(link, v[:, a:b]) - _attachment_bias(link, twist))
+        end_bias = _end_bias(link, v[:, a:b])
+        shifts.append(end_bias - _attachment_bias(link, twist))
     _, still = twists(mechanism, loop.links, shifts)
-    turning = still + np.einsum("nkr,nr->nk", loop.platform, change)
-    accelerations = [
-        times(link.inverse, times(link.carried, turning) - shift) for link, shift in zip(loop.links, shifts)
-    ]
-    return LoopMotion(posture, loop, v, np.concatenate(accelerations, axis=1), twist, turning, rate)
+    twist_change = still + np.einsum("nkr,nr->nk", loop.platform, change)
+    leg_accelerations = []
+    for link, shift in zip(loop.links, shifts):
+        attachment = times(link.carried, twist_change)
+        leg_accelerations.append(times(link.inverse, attachment - shift))
+    accelerations = np.concatenate(leg_accelerations, axis=1)
+    return LoopMotion(posture, loop, v, accelerations, twist, twist_change, rate)
 
 
 def of_readings(mechanism: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarray) -> LoopMotion:
@@ -102,9 +105,11 @@ def of_readings(mechanism: ClosedRobot, posture: Posture, v: np.ndarray, a: np.n
         back = np.linalg.inv(loop.readings)
     rate = times(back, v)
     still = of_platform(mechanism, posture, rate, np.zeros_like(rate), loop)
-    change = times(back, a - still.a[:, mechanism.robot.actuated])
-    turned = still.change + np.einsum("nkr,nr->nk", loop.platform, change)
-    return replace(still, a=still.a + np.einsum("ntr,nr->nt", loop.joints, change), change=turned)
+    a_remaining = a - still.a[:, mechanism.robot.actuated]
+    change = times(back, a_remaining)
+    joint_accelerations = still.a + np.einsum("ntr,nr->nt", loop.joints, change)
+    twist_change = still.change + np.einsum("nkr,nr->nk", loop.platform, change)
+    return replace(still, a=joint_accelerations, change=twist_change)
 
 
 def _attachment_bias(links: LegLinks, twist: np.ndarray) -> np.ndarray:
@@ -126,8 +131,9 @@ def _end_bias(links: LegLinks, v: np.ndarray) -> np.ndarray:
     w = np.zeros((len(v), 3))
     result = np.zeros(links.full.shape[:2])
     for j in range(v.shape[1]):
-        linear = links.full[:, :3, j] * v[:, j : j + 1]
-        angular = links.full[:, 3:, j] * v[:, j : j + 1]
+        rate = v[:, j : j + 1]
+        linear = links.full[:, :3, j] * rate
+        angular = links.full[:, 3:, j] * rate
         result[:, :3] += cross(2.0 * w + angular, linear)
         result[:, 3:] += cross(w, angular)
         w = w + angular
@@ -135,7 +141,7 @@ def _end_bias(links: LegLinks, v: np.ndarray) -> np.ndarray:
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a × b (N, 3); ten times as fast as numpy for few samples."""
+    """Return a × b (N, 3); ten times as fast as `numpy.cross` for few samples."""
     following = [1, 2, 0]
     preceding = [2, 0, 1]
     return a[:, following] * b[:, preceding] - a[:, preceding] * b[:, following]
@@ -144,33 +150,45 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def preload_directions(mechanism: ClosedRobot, jacobians: LoopJacobians) -> np.ndarray:
     """Return N (N, n, n - r), orthonormal torques without effect on the platform.
 
-    Their signs are those of home carried along, so that a constant preload does not jump; with more than one redundant
-    actuator the basis is the one nearest to home's (Procrustes).
+    Of all orthonormal bases, that nearest to the basis at home is returned (orthogonal Procrustes problem), so that a
+    constant preload is a continuous torque along a motion.
     """
     robot = mechanism.robot
     directions = _left_null(jacobians.readings, robot.r)
-    home = _left_null(loop_jacobians(mechanism, mechanism.home).readings, robot.r)[0]
-    if home.shape[1] and home[np.argmax(np.abs(home[:, 0])), 0] < 0:
-        home = -home
-    u, _, vt = np.linalg.svd(directions.transpose(0, 2, 1) @ home)
+    home_jacobians = loop_jacobians(mechanism, mechanism.home)
+    home = _left_null(home_jacobians.readings, robot.r)[0]
+    # sign convention: the largest entry of the first direction at home is positive
+    if home.shape[1]:
+        largest = np.argmax(np.abs(home[:, 0]))
+        if home[largest, 0] < 0:
+            home = -home
+    overlap = directions.transpose(0, 2, 1) @ home
+    u, _, vt = np.linalg.svd(overlap)
     return directions @ (u @ vt)
 
 
 def overconstraint(mechanism: ClosedRobot, jacobians: LoopJacobians, torques: np.ndarray) -> np.ndarray:
     """Return the overconstraint c (N, n - r) [N m or N] of actuator torques (N, n): the part that does no work."""
-    torques = shaped(torques, (len(jacobians.readings), mechanism.robot.n), "torques of the actuators")
-    return np.einsum("nac,na->nc", preload_directions(mechanism, jacobians), torques)
+    shape = (len(jacobians.readings), mechanism.robot.n)
+    torques = shaped(torques, shape, "torques of the actuators")
+    directions = preload_directions(mechanism, jacobians)
+    return np.einsum("nac,na->nc", directions, torques)
 
 
 def distributed(
     mechanism: ClosedRobot, jacobians: LoopJacobians, forces: np.ndarray, preload: np.ndarray | float = 0.0
 ) -> np.ndarray:
-    """Return actuator torques (N, n) that produce forces (N, r) in platform coordinates, with overconstraint c.
+    """Return actuator torques (N, n) that produce given forces in platform coordinates.
 
     Args:
-        preload: c, (N, n - r) or one for all [N m or N]; 0: the torques of least norm.
+        mechanism: the robot.
+        jacobians: Jacobians at N postures.
+        forces: (N, r) forces and moments on the platform's coordinates.
+        preload: overconstraint c of redundant actuators, (N, n - r) or (n - r,) [N m or N]; 0: the torques of least
+            norm.
     """
-    distribution = np.linalg.pinv(jacobians.readings).transpose(0, 2, 1)
+    inverse = np.linalg.pinv(jacobians.readings)
+    distribution = inverse.transpose(0, 2, 1)
     minimum = np.einsum("nar,nr->na", distribution, forces)
     if not mechanism.robot.redundant:
         return minimum

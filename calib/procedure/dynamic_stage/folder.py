@@ -1,4 +1,4 @@
-"""Folder of an identification: written completely into a temporary folder, then moved to its final place."""
+"""Result folder of an identification: written completely into a temporary folder, then moved to its final path."""
 
 from __future__ import annotations
 
@@ -16,11 +16,16 @@ from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.physical_consistency import information
-from calib.identification.prediction import Dynamics
+from calib.identification.prediction import Dynamics, Score, predict
 from calib.identification.rows import Case
-from calib.identification.uncertainty.torque_errors import TorqueErrorModel, TorqueIntervals, read_uncertainty
+from calib.identification.uncertainty.torque_errors import TorqueErrorModel, read_uncertainty
 from calib.procedure.dynamic_stage import geometry_tables
-from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome, ModelFindings
+from calib.procedure.dynamic_stage.identify import (
+    DynamicsAssessment,
+    IdentificationOutcome,
+    ModelFindings,
+    RecordingErrors,
+)
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport, metrics, on_bounds, with_current_keys
 from calib.procedure.dynamic_stage.verdict import Resting
@@ -66,7 +71,7 @@ class _Essential(NamedTuple):
 
 @dataclass(frozen=True)
 class IdentificationFolder:
-    """Folder of an identification: paths of its files, and their content."""
+    """Result folder of an identification: paths of its files, and functions that read them."""
 
     path: Path
 
@@ -81,23 +86,36 @@ class IdentificationFolder:
 
     @property
     def torques(self) -> list[Path]:
-        """Paths of the tables of measured and predicted torques on unseen motion; without unseen motion, the training
-        table.
+        """Paths of the tables of measured and predicted torques on held-out motion.
+
+        Without held-out motion: the table of the first training recording.
         """
-        return sorted(self.unseen.path.glob("torques_*.csv")) or [self.path / "torques_1.csv"]
+        paths = self.unseen.path.glob("torques_*.csv")
+        return sorted(paths, key=_number_of_table) or [self.path / "torques_1.csv"]
+
+    def scores_of_torques(self) -> Sequence[Score | None]:
+        """Read the scores of the model on the recordings of the tables `torques`; None if they are not stored."""
+        if not (self.unseen.report.is_file() or (self.path / folders.REPORT).is_file()):
+            return [None] * len(self.torques)
+        report = self.judged
+        scores = {**report.fit, **report.validation}
+        return [scores[curves.name] for curves in report.curves]
 
     @property
     def unseen(self) -> UnseenFolder:
-        """Folder of the model's validation on unseen motion, which only sessions write."""
+        """Folder with the model's validation on held-out motion, which only sessions write."""
         return UnseenFolder(self.path / "unseen")
 
     @property
     def judged(self) -> UnseenReport:
-        """Report of the model on unseen motion: the session's if it exists, else the report of `calib identify`."""
+        """Report of the model's errors on held-out motion.
+
+        It is the session's report if there is one, otherwise the report that `calib identify` wrote.
+        """
         return (self.unseen if self.unseen.report.is_file() else UnseenFolder(self.path)).read()
 
     def dynamics(self) -> Dynamics:
-        """Return the identified model, read from the folder."""
+        """Return the identified dynamic model, read from the folder."""
         return read_dynamics(self.path)[1]
 
     def metrics(self) -> ModelMetrics:
@@ -105,7 +123,7 @@ class IdentificationFolder:
         return read_json(self.numbers, "identify again", ModelMetrics, with_current_keys)
 
     def findings(self) -> ModelFindings:
-        """Read the findings on the model; folders of earlier versions contain only the warnings' texts."""
+        """Read the findings on the model; folders of earlier versions contain only warnings as text."""
         metrics = self.metrics()
         return metrics.findings or ModelFindings(Resting(), metrics.warnings)
 
@@ -114,7 +132,7 @@ class IdentificationFolder:
         return tuple(row.name for row in folders.read_estimate(self.path, _Essential) if row.essential is not None)
 
     def errors(self) -> TorqueErrorModel | None:
-        """Read the model's expected torque errors; None if no errors or no covariance were stored."""
+        """Read the model of expected torque errors; None if the folder contains no errors or no covariance."""
         discrepancy = self.findings().errors
         if discrepancy is None:
             return None
@@ -124,28 +142,46 @@ class IdentificationFolder:
         return TorqueErrorModel(uncertainty.columns, uncertainty.covariance, discrepancy)
 
 
+def _number_of_table(path: Path) -> int:
+    """Return the number in the file name of a table of torques, such as 12 for ``torques_12.csv``."""
+    return int(path.stem.rpartition("_")[2])
+
+
 @dataclass(frozen=True)
 class UnseenFolder:
-    """Folder of an identified model's validation on unseen motion."""
+    """Folder with an identified model's validation on held-out motion."""
 
     path: Path
 
     report = folders.InFolder(folders.REPORT)  # scores, verdict, and curves for the certificate
 
     def write(self, inputs: IdentificationInputs, assessment: DynamicsAssessment) -> None:
-        """Write a table of torques per unseen recording, and the report."""
+        """Write one table of torques for each held-out recording, and the report on the model's errors.
+
+        Args:
+            inputs: robot, recordings and options.
+            assessment: the model's predictions and errors on the held-out recordings, and the verdict.
+        """
+        nominal = geometry_tables.on_nominal_geometry(self.path.parent)
         for number, case in enumerate(inputs.unseen, 1):
-            predicted, intervals = assessment.predictions[case.name], assessment.intervals.get(case.name)
-            _write_torques(inputs, case, predicted, intervals, self.path / f"torques_{number}.csv")
+            _write_torques(inputs, case, assessment, nominal, self.path / f"torques_{number}.csv")
         files.write_json(self.report, UnseenReport.of(inputs, assessment))
 
     def read(self) -> UnseenReport:
-        """Read the report."""
+        """Read the report on the model's errors."""
         return read_json(self.report, "identify again", UnseenReport, with_current_keys)
 
 
 def check_identification_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Refuse an output folder that contains an input file, or files that no identification writes."""
+    """Check that results can be written into a folder.
+
+    Args:
+        out: the output folder; it need not exist.
+        inputs: files that the command reads; None entries are ignored.
+
+    Raises:
+        UsageError: if the folder contains an input file, or files that no identification writes.
+    """
     folders.check_target(out, OURS, (folders.METRICS, MODEL), "identification", inputs)
 
 
@@ -156,13 +192,13 @@ def write_folder(
     *,
     owned: bool = False,
 ) -> Path:
-    """Write the result folder `out` of an identification, or nothing on an error, and return its path.
+    """Write the result folder of an identification and return its path; on an error, nothing is written.
 
     Args:
         outcome: the identification.
         out: path of the folder.
-        plots: writes figures into the folder; None: no figures.
-        owned: whether the procedure owns the folder, so that its content may be replaced without a check.
+        plots: function that writes figures into the folder; None: no figures.
+        owned: whether the folder belongs to the procedure, so that its content is replaced without a check.
 
     Raises:
         UsageError: if a folder that is not owned contains input files, or files that no identification writes.
@@ -179,7 +215,12 @@ def write_folder(
 
 
 def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
-    """Write all files of an identification, except figures and pages."""
+    """Write all files of an identification into a folder, except figures and report pages.
+
+    Args:
+        outcome: the identification with its errors and verdict.
+        folder: the folder.
+    """
     inputs, identification = outcome.inputs, outcome.found
     robot = inputs.robot
     if isinstance(robot, Mechanism):
@@ -202,13 +243,13 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     if identification.prior is not None or binding:
         information.write(identification, folder)
 
-    first = (*inputs.unseen, *inputs.cases)[0]
-    intervals = outcome.intervals.get(first.name)
-    _write_torques(inputs, first, outcome.predictions[first.name], intervals, folder / "torques_1.csv")
     gains = inputs.gains and GainRecord.of(inputs.gains, inputs.unit)
     model_table = robot.model_table if isinstance(robot, Mechanism) else to_table
     table = model_table(identification.dynamics, identification.base, inputs.unit)
     files.write_json(folder / MODEL, table | {"drive_gains": gains})
+    first = (*inputs.unseen, *inputs.cases)[0]
+    nominal = geometry_tables.on_nominal_geometry(folder)
+    _write_torques(inputs, first, outcome, nominal, folder / "torques_1.csv")
     if gains is not None:
         header = ("joint", f"gain [{gains.unit}]", f"sigma [{gains.unit}]", "told")
         rows = zip(inputs.chain.joint_names, plain(gains.values), plain(gains.sigma), gains.told)
@@ -217,17 +258,29 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
 
 
 def _write_torques(
-    inputs: IdentificationInputs, case: Case, predicted: np.ndarray, intervals: TorqueIntervals | None, path: Path
+    inputs: IdentificationInputs, case: Case, errors: RecordingErrors, nominal: Dynamics | None, path: Path
 ) -> Path:
-    """Write measured and predicted torques (N, rows) of a recording and its joints (N, n), at about `TORQUE_RATE`.
+    """Write a table of measured and predicted torques and joint positions of a recording, at about `TORQUE_RATE`.
 
-    If `intervals` are known, columns are added for the expected standard deviation of the error, and for whether the
-    model extrapolates (1) or not (0). Recordings without a payload also get speeds and accelerations, for
-    `read_torques`.
+    Where intervals are known, two columns are added: the expected standard deviation of the torque error, and whether
+    the model extrapolates (1) or not (0). Recordings without a payload also get velocities and accelerations, which
+    `read_torques` requires.
+
+    Args:
+        inputs: robot and options of the identification.
+        case: the recording with N samples.
+        errors: torques predicted by the model, and their expected errors.
+        nominal: the model identified on the nominal geometry, whose torques are written too; None: none.
+        path: path of the table.
     """
     motion = case.motion
     rows = np.arange(0, len(motion), max(1, round(motion.rate / TORQUE_RATE)))
+    predicted = errors.predictions[case.name]
     columns = {"measured": case.target[rows], "predicted": predicted[rows], "q": motion.q[rows]}
+    if nominal is not None:
+        undeflected = replace(case, link=None)
+        columns["nominal"] = predict(nominal, undeflected)[rows]
+    intervals = errors.intervals.get(case.name)
     if intervals is not None:
         nearest = np.searchsorted(intervals.index, rows)
         columns |= {"sigma": intervals.sigma[nearest], "extrapolated": intervals.beyond[nearest]}
@@ -247,7 +300,15 @@ def _write_torques(
 
 
 def read_torques(path: Path) -> dict[str, np.ndarray]:
-    """Read the table of `_write_torques`: measured, predicted (N, rows) and q, v, a (N, n); empty without v and a."""
+    """Read a table of torques written for a recording without a payload.
+
+    Args:
+        path: the CSV file.
+
+    Returns:
+        Arrays by name: measured and predicted torques (N, rows), and joint positions q, velocities v and accelerations
+        a (N, n); empty if the table has no velocities and accelerations.
+    """
     table = read_table(path)
     blocks = {}
     for name in ("measured", "predicted", "q", "v", "a"):
@@ -258,10 +319,14 @@ def read_torques(path: Path) -> dict[str, np.ndarray]:
 
 
 def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[object, ...]]:
-    """Return a row of ``estimate.csv`` for each parameter, with the columns `HEADER`; RSD in percent.
+    """Return the rows of ``estimate.csv``, one for each parameter, with the columns `HEADER`.
 
-    σ is the total; the columns of the geometry's part are omitted if the geometry is taken as exact. Friction terms
-    that were switched off, and parameters fixed by a constraint, have no σ, because they were not measured.
+    The σ of a parameter is its total σ, from torque noise and geometry; the relative standard deviation (RSD) is in
+    percent. The σ from the geometry is NaN if the geometry is taken as exact. Friction terms that were switched off,
+    and parameters fixed by a constraint, have no σ (NaN), because they were not estimated from the measurement.
+
+    Args:
+        outcome: the identification with its errors and verdict.
     """
     identification, carried = outcome.found, outcome.carried
     estimate = identification.fitted.estimate
@@ -296,8 +361,14 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[object, ...]]:
 
 
 def _expressions(identification: Identification, unmeasured: Sequence[str], bound: Sequence[str]) -> list[str]:
-    """Return for each parameter its meaning as text: a combination of standard parameters, or the shape of a drive
-    term.
+    """Return for each parameter a text that explains it.
+
+    The text is a combination of standard parameters, or the name of a drive term's shape (such as a friction term).
+
+    Args:
+        identification: the identification.
+        unmeasured: names of the drive terms that were switched off since nothing was measured for them.
+        bound: names of the parameters that a constraint fixes at its bound.
     """
     lines = [line.split(" = ", 1)[1] for line in expressions(identification.base)]
     for term in identification.friction.terms:

@@ -15,14 +15,17 @@ Files in addition to those of every identification (``calib identify --out``)::
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from calib import files
+from calib.data.csv_table import read_table
 from calib.folders import write_covariance
+from calib.identification import model_file
+from calib.identification.prediction import Dynamics
 from calib.identification.uncertainty.geometry_uncertainty import (
     NOTHING,
     TILTS,
@@ -31,6 +34,7 @@ from calib.identification.uncertainty.geometry_uncertainty import (
 )
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.records import Number
+from calib.robot import calibrated
 
 # a shift, in σ_torque, that raises a σ by more than `NOTHING`
 MIN_SHIFT = float(np.sqrt((1.0 + NOTHING) ** 2 - 1.0))
@@ -43,7 +47,12 @@ TORQUE_COVARIANCE = "covariance_torque.csv"
 
 @dataclass(frozen=True)
 class TiltEffect:
-    """Parameter that a base tilt of 1 mrad changes most, and the change in σ of torque noise."""
+    """Parameter that changes most if the base is tilted by 1 mrad.
+
+    Attributes:
+        parameter: name of the parameter.
+        sigmas: its change, divided by its standard deviation from torque noise.
+    """
 
     parameter: str
     sigmas: float
@@ -51,7 +60,13 @@ class TiltEffect:
 
 @dataclass(frozen=True)
 class CalibrationChange:
-    """Change of a parameter from the nominal to the calibrated geometry, in its total σ and in percent."""
+    """Difference of a parameter between the estimates on the nominal and on the calibrated geometry.
+
+    Attributes:
+        name: name of the parameter.
+        sigmas: nominal minus calibrated estimate, divided by the parameter's total σ.
+        percent: nominal minus calibrated estimate, in percent of the calibrated one.
+    """
 
     name: str
     sigmas: float
@@ -63,13 +78,13 @@ class GeometryMetrics:
     """Effect of the geometry's uncertainty on the estimate: the entry ``geometry`` of ``metrics.json``.
 
     Attributes:
-        propagated: whether the robot came with a covariance of its geometry.
+        propagated: whether the robot has a covariance of its geometry, which was propagated to the estimate.
         summary: the effect in one sentence.
         changed: names of the parameters whose σ the geometry's uncertainty raises.
-        geometry_exceeds_torque: names of the parameters where the geometry's part of σ exceeds that of torque noise.
-        moved_by_1_mrad_of_tilt: parameter that a tilt of the base would change most.
+        geometry_exceeds_torque: names of the parameters whose σ from the geometry exceeds the σ from torque noise.
+        moved_by_1_mrad_of_tilt: parameter that changes most if the base is tilted by 1 mrad.
         largest_growth_of_sigma: largest ratio of total σ to σ from torque noise, over all parameters.
-        largest_changes_from_nominal: the five largest differences between the estimates on both geometries.
+        largest_changes_from_nominal: the five largest changes from the nominal to the calibrated geometry.
     """
 
     propagated: bool
@@ -82,7 +97,16 @@ class GeometryMetrics:
 
 
 class TwoGeometries(NamedTuple):
-    """A row of ``geometries.csv``: a parameter identified on the nominal and on the calibrated geometry."""
+    """A row of ``geometries.csv``: a parameter identified on the nominal and on the calibrated geometry.
+
+    Attributes:
+        name, unit: name and unit of the parameter.
+        nominal, sigma_nominal: estimate on the nominal geometry, and its σ from torque noise.
+        calibrated, sigma_calibrated: estimate on the calibrated geometry, and its total σ.
+        relative_percent: nominal minus calibrated estimate, in percent of the calibrated one; NaN if that is zero.
+        sigma_difference: standard deviation of the difference.
+        essential: ``yes`` for essential parameters, otherwise ``no``.
+    """
 
     name: str
     unit: str
@@ -96,7 +120,23 @@ class TwoGeometries(NamedTuple):
 
 
 class GeometricEffect(NamedTuple):
-    """A row of ``geometry_effects.csv``: the effect of one sigma of a geometric element on the dynamics."""
+    """A row of ``geometry_effects.csv``: the effect of a geometric element's uncertainty on the dynamic parameters.
+
+    Attributes:
+        rank: rank of the element by `shift_sigma`, from 1.
+        element, unit: name and unit (m or rad) of the element.
+        sigma: σ of the element; not finite, or None in the file, if it was not fitted.
+        matters: ``yes`` if the element alone raises the σ of some parameter by more than 1 %, else ``no``; empty
+            without σ.
+        parameter: name of the parameter that the element shifts most; empty if it shifts none.
+        shift_sigma: shift of this parameter if the element changes by one σ, divided by the parameter's σ from torque
+            noise.
+        parameters_moved: number of parameters whose σ the element alone raises by more than 1 %; None without σ.
+        torque_rms: rms change of the rigid-body torque if the element changes by one σ, at constant parameters [N m or
+            N].
+        torque_rms_left: the same after the parameters have been estimated again [N m or N].
+        shift_sigma_per_milli: shift as `shift_sigma`, for a change of the element by 1 mm or 1 mrad.
+    """
 
     rank: int
     element: str
@@ -112,7 +152,14 @@ class GeometricEffect(NamedTuple):
 
 
 def write(outcome: IdentificationOutcome, folder: Path) -> None:
-    """Write the tables of sensitivities, of ranked effects, and of the estimates on both geometries."""
+    """Write the tables of sensitivities, of ranked geometric effects, and of the estimates on both geometries.
+
+    Nothing is written if the effect of the geometry was not computed.
+
+    Args:
+        outcome: the identification; its effect of the geometry may be None.
+        folder: folder to write into.
+    """
     carried = outcome.carried
     if carried is None:
         return
@@ -126,8 +173,35 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
         files.write_table(folder / GEOMETRIES, TwoGeometries._fields, table)
 
 
+def on_nominal_geometry(folder: Path) -> Dynamics | None:
+    """Return the model on the nominal (CAD) geometry that was identified beside the model in a folder.
+
+    None where there is no such estimate, as for a robot whose geometry was not calibrated.
+    """
+    table = folder / GEOMETRIES
+    if not table.is_file():
+        return None
+    nominal = calibrated.read(folder / calibrated.ROBOT).nominal
+    if nominal is None:
+        return None
+    dynamics = model_file.from_table(nominal, model_file.read_table(folder))
+    columns = {name: column for column, name in enumerate(dynamics.model.names)}
+    values = dynamics.values.copy()
+    estimates = read_table(table)
+    for name, value in zip(estimates.texts("name"), estimates.numbers("nominal", None)):
+        column = columns[name] if name in columns else columns[name.removesuffix("R")]
+        values[column] = value
+    return replace(dynamics, values=values)
+
+
 def _ranking(carried: GeometryUncertainty) -> np.ndarray:
-    """Return the elements' indices, sorted by the largest shift that one σ causes; elements without σ last."""
+    """Return the indices of the geometric elements, sorted by the largest parameter shift that one σ causes.
+
+    Elements without σ are last.
+
+    Args:
+        carried: effect of the geometry's uncertainty on the parameters.
+    """
     has_sigma = np.isfinite(carried.deviations)
     shift_per_unit = _per_sigma(carried).max(axis=0, initial=0.0)
     deviations = np.where(has_sigma, carried.deviations, 0.0)
@@ -136,13 +210,16 @@ def _ranking(carried: GeometryUncertainty) -> np.ndarray:
 
 
 def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
-    """Return the rows of ``geometry_effects.csv``, sorted by the shift that an element causes, largest first.
+    """Return the rows of ``geometry_effects.csv``, sorted by the shift that one σ of the element causes, largest first.
 
-    Columns: `shift_sigma` is the shift of the parameter that moves most when the element changes by one σ, in units of
-    that parameter's σ from torque noise; `shift_sigma_per_milli` is its shift by 1 mm or 1 mrad. `torque_rms` is the
-    rms change of the rigid torque by one σ at fixed parameters, `torque_rms_left` the change that remains after the
-    parameters have been estimated anew. An element matters if it alone raises some parameter's σ by more than 1 %;
-    elements without σ have no entries.
+    `shift_sigma` is the shift of the most affected parameter if the element changes by one σ, in units of that
+    parameter's σ from torque noise; `shift_sigma_per_milli` is the shift if the element changes by 1 mm or 1 mrad.
+    `torque_rms` is the rms change of the rigid-body torque by one σ at constant parameters; `torque_rms_left` is the
+    change that remains after the parameters have been estimated again. `matters` is ``yes`` if the element alone raises
+    the σ of some parameter by more than 1 %; it is empty for elements without σ.
+
+    Args:
+        carried: effect of the geometry's uncertainty on the parameters.
     """
     rows = []
     shifts_per_unit = _per_sigma(carried)
@@ -173,7 +250,12 @@ def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
 
 
 def _geometries(comparison: GeometryComparison, essential: Sequence[str]) -> Iterator[TwoGeometries]:
-    """Yield the rows of ``geometries.csv``: each parameter on the nominal and on the calibrated geometry."""
+    """Yield the rows of ``geometries.csv``: each parameter identified on the nominal and on the calibrated geometry.
+
+    Args:
+        comparison: estimates on the nominal and on the calibrated geometry.
+        essential: names of the essential parameters, which are marked.
+    """
     nominal, calibrated = comparison.values
     sigma_nominal, sigma_calibrated = comparison.sigma
     relative = np.where(np.isfinite(comparison.relative), comparison.relative, np.nan)
@@ -192,7 +274,11 @@ def _geometries(comparison: GeometryComparison, essential: Sequence[str]) -> Ite
 
 
 def _essential_names(outcome: IdentificationOutcome) -> tuple[str, ...]:
-    """Return the names of the essential parameters; all names if none were removed."""
+    """Return the names of the essential parameters; if no parameters were eliminated, all names.
+
+    Args:
+        outcome: the identification.
+    """
     identification = outcome.found
     if identification.elimination is None:
         return identification.names
@@ -202,7 +288,12 @@ def _essential_names(outcome: IdentificationOutcome) -> tuple[str, ...]:
 
 
 def metrics(carried: GeometryUncertainty, comparison: GeometryComparison | None) -> GeometryMetrics:
-    """Return the metrics of the geometry's uncertainty in the estimate."""
+    """Return the metrics on the geometry's uncertainty.
+
+    Args:
+        carried: effect of the geometry's uncertainty on the parameters.
+        comparison: estimates on the nominal and on the calibrated geometry; None: there is only one geometry.
+    """
     growth = carried.sigma / np.where(carried.sigma_torque > 0.0, carried.sigma_torque, 1.0)
     return GeometryMetrics(
         propagated=carried.geometry is not None,
@@ -216,12 +307,16 @@ def metrics(carried: GeometryUncertainty, comparison: GeometryComparison | None)
 
 
 def _marked(names: Sequence[str], mask: np.ndarray) -> tuple[str, ...]:
-    """Return the names (p,) at which a mask (p,) is true."""
+    """Return the names, out of p names, at which a mask (p,) is true."""
     return tuple(name for name, marked in zip(names, mask) if marked)
 
 
 def summary(carried: GeometryUncertainty) -> str:
-    """Return a sentence on the effect of the geometry's uncertainty."""
+    """Return a sentence for the user on the effect of the geometry's uncertainty on the parameters' σ.
+
+    Args:
+        carried: effect of the geometry's uncertainty on the parameters.
+    """
     if carried.geometry is None:
         return (
             "the geometry is assumed exact, sigmas contain torque noise only: the robot has no covariance of its "
@@ -236,13 +331,17 @@ def summary(carried: GeometryUncertainty) -> str:
         sentence += f" and leaves {p - count} unchanged"
     dominated = _marked(carried.names, carried.dominated)
     if dominated:
-        sentence += f"; for {len(dominated)} it contributes more than torque noise: {', '.join(dominated)}"
+        sentence += f"; for {len(dominated)} the geometry contributes more than torque noise: {', '.join(dominated)}"
     return sentence
 
 
 def _tilt(carried: GeometryUncertainty) -> TiltEffect:
-    """Return the parameter that 1 mrad of base tilt against gravity changes most, and its change in σ of torque
-    noise.
+    """Return the parameter that changes most if the base is tilted by 1 mrad, and its change.
+
+    The change is in multiples of the parameter's σ from torque noise.
+
+    Args:
+        carried: effect of the geometry's uncertainty on the parameters.
     """
     size = 1e-3 * _per_sigma(carried)[:, -len(TILTS) :].max(axis=1, initial=0.0)
     worst = int(np.argmax(size))
@@ -250,13 +349,24 @@ def _tilt(carried: GeometryUncertainty) -> TiltEffect:
 
 
 def _per_sigma(carried: GeometryUncertainty) -> np.ndarray:
-    """Return the sensitivities |dφ/dg| in σ of torque noise (p, K + 2); zero if a parameter has no σ."""
+    """Return |sensitivity| of the parameters to geometric elements and base tilts, in multiples of σ from torque noise.
+
+    The shape is (p, K + 2) for p parameters, K geometric elements and 2 tilts. The entries of a parameter without σ are
+    zero.
+
+    Args:
+        carried: effect of the geometry's uncertainty on the parameters.
+    """
     sigma = carried.sigma_torque[:, None]
     return np.divide(np.abs(carried.sensitivity), sigma, out=np.zeros(carried.sensitivity.shape), where=sigma > 0.0)
 
 
 def _largest(comparison: GeometryComparison) -> tuple[CalibrationChange, ...]:
-    """Return the five parameters that differ most between the geometries, with the differences in total σ and [%]."""
+    """Return the five parameters with the largest changes between the geometries, in total σ and in percent.
+
+    Args:
+        comparison: estimates on the nominal and on the calibrated geometry.
+    """
     nominal, calibrated = comparison.values
     _, sigma = comparison.sigma
     size = (nominal - calibrated) / np.where(sigma > 0.0, sigma, np.inf)

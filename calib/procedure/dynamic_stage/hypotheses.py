@@ -1,4 +1,4 @@
-"""Findings on hypotheses that explain recordings better than the stated gravity or loads (catalogue, chapter 9)."""
+"""Findings on another gravity or load that explains recordings better than the stated one (catalogue, chapter 9)."""
 
 from collections.abc import Sequence
 
@@ -17,10 +17,15 @@ MAX_COMPARED = 12  # recordings in which an unstated load is looked for (our cho
 
 
 def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None:
-    """Return how well other gravity vectors explain the training recordings; None without motor torques or enough
-    samples.
+    """Return how well other gravity vectors explain the training recordings.
 
-    Of the recordings grouped by payload, the group with the most samples is used.
+    The recordings are grouped by payload, and the group with the most recordings is used.
+
+    Args:
+        inputs: robot, recordings and options.
+
+    Returns:
+        The hypotheses; None without motor torques or with too few samples.
     """
     if not isinstance(inputs.chain, Chain) or not inputs.options.settings.torque_rows.has_bodies:
         return None
@@ -33,7 +38,12 @@ def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None
 
 
 def gravity_findings(hypotheses: GravityHypotheses | None, joints: Sequence[str]) -> list[Finding]:
-    """Return the findings that gravity has another direction, or does not act on the torques of some joints."""
+    """Return findings if gravity seems to have another direction, or not to act on the torques of some joints.
+
+    Args:
+        hypotheses: how well other gravity vectors explain the recordings; None: unknown, which yields no findings.
+        joints: names of the joints.
+    """
     if hypotheses is None:
         return []
     findings = []
@@ -56,13 +66,13 @@ def gravity_findings(hypotheses: GravityHypotheses | None, joints: Sequence[str]
 
 
 def load_findings(inputs: IdentificationInputs, gravity: Sequence[float] | None) -> list[Finding]:
-    """Return the findings that a recording carries a load which the options do not state.
+    """Return a finding for each recording whose torques indicate a load that the options do not state.
 
-    Recordings with the same stated payload, training and unseen, are compared with each other.
+    All recordings, training and held-out ones, with one stated payload are compared with each other.
 
     Args:
         inputs: the recordings.
-        gravity: gravity (3,) in the base frame [m/s²]; None: that of the robot's description.
+        gravity: gravity (3,) in the base frame [m/s²]; None: gravity of the robot's description.
     """
     rows = inputs.options.settings.torque_rows
     if not isinstance(inputs.chain, Chain) or inputs.unit != TORQUE or not rows.has_bodies:
@@ -93,10 +103,10 @@ def load_findings(inputs: IdentificationInputs, gravity: Sequence[float] | None)
 
 
 def _typical(shares: np.ndarray) -> float:
-    """Return the geometric mean of the joints' unexplained shares (n,)."""
+    """Return the geometric mean over the joints of their unexplained shares (n,) of the torque."""
     return float(np.exp(np.mean(np.log(shares))))
 
 
 def _vector(vector: np.ndarray, between: str) -> str:
-    """Return a vector (3,) [m/s²] as text, with the components separated as an option expects."""
+    """Return a vector (3,) [m/s²] as text, with the components separated by the text `between`."""
     return between.join(f"{component:.4g}" for component in np.round(vector, 3) + 0.0)

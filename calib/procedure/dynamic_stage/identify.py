@@ -1,6 +1,6 @@
 """Identification stage of the guided procedure: identified model, its errors on the recordings, and the verdict.
 
-`assess` returns the same result for a new model and for a model read from its folder.
+`assess` computes errors and verdict in the same way for a new model and for a model read from its folder.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,17 +37,17 @@ REPEAT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class ModelFindings:
-    """Findings of an identification that the verdict needs in addition to the recordings; stored in its folder.
+    """Findings on an identified model, stored in the model's folder; the verdict needs them besides recordings.
 
     Attributes:
-        rests: parameters that rest on a prior rather than on the recordings.
-        notes: remarks on the model in folders of earlier versions, as text.
-        noticed: findings on the model that do not depend on unseen recordings.
-        controller: stated or identified controller; None without one.
+        rests: parameters whose values are determined by a prior instead of the recordings.
+        notes: remarks on the model as text, only in folders of earlier versions.
+        noticed: findings on the model that do not depend on held-out recordings.
+        controller: stated or identified controller; None: no controller is known.
         errors: distribution of the model's torque errors; None if too little was recorded to estimate it.
         contradiction: distance of the estimate from every physically consistent robot; None if unknown.
         unlike: how recorded torques refute an estimate that relies on the stated control loop; None if they do not.
-        plain: (p,) the model's parameters by plain least squares; () in files of earlier versions.
+        plain: (p,) the model's parameters by plain least squares; empty in files of earlier versions.
     """
 
     rests: judging.Resting
@@ -62,14 +62,16 @@ class ModelFindings:
 
 @dataclass(frozen=True, eq=False)
 class RecordingErrors:
-    """Errors of a model on the recordings.
+    """Errors of a dynamic model on the recordings.
 
     Attributes:
-        fit, validation: name of a training or unseen recording → score of the model.
-        predictions: name of a recording → predicted torques (N, rows) at the full rate.
-        repeated: name of an unseen recording that repeats training motion → share of its states found in the training.
-        excitation: name of a recording → report on what its motion can identify.
-        intervals: name of an unseen recording (without any: of the first training recording) → expected torque errors.
+        fit, validation: name of a training or held-out recording -> score of the model.
+        predictions: name of a recording -> predicted torques (N, rows) at the full sampling rate.
+        repeated: name of a held-out recording that repeats training motion -> share of its states (position, velocity)
+            that are also in the training motion.
+        excitation: name of a training recording -> report on the parameters that its motion can identify.
+        intervals: name of a held-out recording -> expected torque errors; without held-out recordings, those of the
+            first training recording.
     """
 
     fit: Mapping[str, Score]
@@ -81,7 +83,7 @@ class RecordingErrors:
 
     @property
     def proofs(self) -> dict[str, Score]:
-        """Scores on unseen recordings by name, without repeats of the training motion."""
+        """Scores on the held-out recordings that do not repeat the training motion: recording name -> score."""
         return {name: score for name, score in self.validation.items() if score.evidence}
 
 
@@ -90,12 +92,12 @@ class DynamicsAssessment(RecordingErrors):
     """Errors of a model on the recordings, and the verdict.
 
     Attributes:
-        verdict: see `calib.procedure.dynamic_stage.verdict`.
-        warnings: texts on the recordings and the model for the user.
-        noticed: the findings that the warnings render.
-        tracking: name of a recording → simulated tracking with the model as feedforward.
-        tracking_failure: reason for missing replays; empty if there are replays.
-        references: name of an unseen recording → errors of the plain references beside the model's error.
+        verdict: the verdict, by the rules of `calib.procedure.dynamic_stage.verdict`.
+        warnings: texts for the user on the recordings and the model.
+        noticed: the findings whose sentences are in the warnings.
+        tracking: name of a recording -> simulated tracking with the model as feedforward.
+        tracking_failure: reason why no tracking was simulated; empty otherwise.
+        references: name of a held-out recording -> errors of the plain references beside the model's error.
     """
 
     verdict: Verdict
@@ -107,7 +109,14 @@ class DynamicsAssessment(RecordingErrors):
 
 
 def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, float]:
-    """Return, for each unseen recording that repeats training motion, the share of its states found in the training."""
+    """Return the held-out recordings that repeat training motion: name -> share of their states in the training.
+
+    A state is a position with its velocity. A recording counts as a repeat from a share of `REPEAT`.
+
+    Args:
+        cases: training recordings.
+        unseen: held-out recordings.
+    """
     repeated = {}
     for case in unseen:
         share = max(repeats(training.motion, case.motion) for training in cases)
@@ -117,7 +126,12 @@ def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, 
 
 
 def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[Finding]:
-    """Return the findings on unseen recordings that share samples with a training recording."""
+    """Return findings on held-out recordings that share samples with a training recording.
+
+    Args:
+        cases: training recordings.
+        unseen: held-out recordings.
+    """
     findings = []
     for case, training in product(unseen, cases):
         if not training.motion.file or realpath(case.motion.file) != realpath(training.motion.file):
@@ -135,13 +149,13 @@ def errors_of(
     errors: torque_errors.TorqueErrorModel | None = None,
     say: Progress = silent,
 ) -> RecordingErrors:
-    """Return the predictions of every recording by a model, and their errors.
+    """Return a model's torque predictions for every recording, and the errors of these predictions.
 
     Args:
-        inputs: training and unseen recordings, and options.
+        inputs: training and held-out recordings, and options.
         dynamics: the model.
-        errors: expected torque errors of the model, for the intervals; None: no intervals.
-        say: called with the name of each step.
+        errors: expected torque errors of the model, from which intervals are computed; None: no intervals.
+        say: called with a text on each step.
     """
     predictions, scores = {}, {}
     for case in (*inputs.cases, *inputs.unseen):
@@ -179,15 +193,15 @@ def assess(
     wrong: Sequence[int] | None = None,
     progress: Progress | None = None,
 ) -> DynamicsAssessment:
-    """Return the predictions of every recording by a model, their errors, and the verdict.
+    """Return a model's torque predictions for every recording, the prediction errors, and the verdict.
 
     Args:
-        inputs: training recordings (for the model's error on its own data) and unseen recordings.
+        inputs: training recordings (for the model's error on its own data) and held-out recordings.
         dynamics: the model.
         findings: findings on the model, from its identification.
         errors: expected torque errors of the model; None if unknown.
         wrong: indices of joints whose friction term adds energy; None: computed by `friction.passivity.driven`.
-        progress: called with the name of each step; None: silent.
+        progress: called with a text on each step; None: silent.
     """
     say = progress or silent
     if wrong is None:
@@ -264,8 +278,8 @@ class IdentificationOutcome(DynamicsAssessment):
 
     Attributes:
         inputs: robot, recordings and options.
-        found: the model and its estimation.
-        findings: findings on the model that the verdict needs besides the recordings.
+        found: the model and how it was estimated.
+        findings: findings on the model that the verdict needs in addition to the recordings.
         carried: effect of the geometry's uncertainty; None if it was not requested.
         geometries: comparison with the estimate on the nominal geometry; None if the geometry is nominal.
         errors: expected torque errors; None if too little was recorded to estimate them.
@@ -285,10 +299,14 @@ T = TypeVar("T", bound=IdentificationOutcome)
 
 
 def run(inputs: IdentificationInputs, progress: Progress | None = None) -> IdentificationOutcome:
-    """Return the outcome of an identification: the model, its prediction of every recording, and the verdict.
+    """Identify a model and return it with its torque predictions for every recording, and the verdict.
 
-    If the torques refute the stated gravity, only the standard friction model is tried: richer friction, such as
-    couplings between joints, would absorb the error of gravity.
+    If the torques refute the stated gravity, only the standard friction model is tried, since richer friction, such as
+    couplings between joints, would absorb the gravity error.
+
+    Args:
+        inputs: robot, recordings and options.
+        progress: called with a text on each step; None: silent.
     """
     settings = inputs.options.settings
     hypotheses = gravity_hypotheses(inputs)
@@ -300,10 +318,15 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
 def judged(
     inputs: IdentificationInputs, found: Identification, progress: Progress | None = None
 ) -> IdentificationOutcome:
-    """Return the outcome of a finished identification: predictions of every recording, errors, and the verdict.
+    """Return the outcome of a finished identification: torque predictions for every recording, errors, and the verdict.
+
+    Args:
+        inputs: robot, recordings and options.
+        found: the identification.
+        progress: called with a text on each step; None: silent.
 
     Raises:
-        MeasurementError: if the identified friction would drive most joints instead of braking them.
+        MeasurementError: if the identified friction accelerates most joints instead of braking them.
     """
     say = progress or silent
     # refused before hours go into the geometry's share
@@ -334,9 +357,7 @@ def judged(
 
 
 def assessed(outcome: T, inputs: IdentificationInputs) -> T:
-    """Return an outcome with predictions, errors and verdict for the recordings of `inputs`; the model stays
-    unchanged.
-    """
+    """Return an outcome with the predictions of its unchanged model for the recordings of `inputs`, and the verdict."""
     stage = stage_of(inputs.robot, "identify")
     if stage is not None and stage.judge is not None:
         assessment = stage.judge(inputs, outcome.found, outcome.findings)
@@ -348,7 +369,15 @@ def assessed(outcome: T, inputs: IdentificationInputs) -> T:
 def _carry(
     inputs: IdentificationInputs, identification: Identification, say: Progress
 ) -> tuple[geometry_uncertainty.GeometryUncertainty, geometry_uncertainty.GeometryComparison | None]:
-    """Return the effect of the geometry's uncertainty on the estimate, and the comparison with the nominal geometry."""
+    """Return the effect of the geometry's uncertainty on the estimate, and the comparison with the nominal geometry.
+
+    The comparison is None if the robot's geometry is the nominal one.
+
+    Args:
+        inputs: robot and recordings.
+        identification: the identified model.
+        say: called with a text on each step.
+    """
     carried = geometry_uncertainty.propagate(identification, inputs.robot, inputs.cases, say)
     if inputs.robot.nominal is None or not inputs.robot.moved:
         return carried, None

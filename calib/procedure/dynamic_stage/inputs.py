@@ -1,4 +1,4 @@
-"""Inputs of an identification: the robot, the training recordings, and the unseen recordings."""
+"""Inputs of an identification: the robot, the training recordings, and the held-out recordings."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ class IdentificationInputs:
     """Robot, recordings and options of an identification.
 
     Attributes:
-        robot: `CalibratedChain` from a geometric fit or from a description, with joint corrections only where these
-            move the links; or a `calib.procedure.robot_kinds.Mechanism`.
-        source: file that the robot was read from.
+        robot: `CalibratedChain` from a geometric fit or from a description, with joint corrections only if they move
+            the links; or a `calib.procedure.robot_kinds.Mechanism`.
+        source: file from which the robot was read.
         cases: training recordings.
-        unseen: recordings to be predicted.
-        options: content of the options file, updated by the command's options.
+        unseen: held-out recordings, whose torques are predicted.
+        options: content of the options file, with the command's options replacing the file's values.
         notes: remarks for the user on the interpretation of the files.
         currents: drive gains that convert currents to torques.
         replayed: whether tracking with the model as feedforward is simulated.
@@ -77,13 +77,14 @@ class IdentificationInputs:
 
     @property
     def unit(self) -> str:
-        """Unit of the torques."""
+        """Unit of the torques: N m, or amperes if the drive gains are unknown."""
         return self.currents.unit
 
     @property
     def row_units(self) -> tuple[str, ...]:
-        """Unit of each torque row; joints without an identified gain have amperes of their own, excluded from
-        totals.
+        """Unit of each torque row.
+
+        Joints without an identified drive gain keep their currents in amperes and are excluded from totals over joints.
         """
         rows = self.options.settings.torque_rows.units([joint.kind == "prismatic" for joint in self.chain.joints])
         if self.unit == TORQUE:
@@ -93,19 +94,19 @@ class IdentificationInputs:
 
     @property
     def gains(self) -> DriveGains | None:
-        """Identified drive gains; None if none were identified."""
+        """Identified drive gains; None if no gains were identified."""
         return self.currents.found
 
     @property
     def chain(self) -> Any:
-        """Identified arm (`Chain`); for other robots, their actuated joints with names and limits."""
+        """The arm (`Chain`); for other robots, the actuated joints with names and limits."""
         return self.robot.chain
 
     def with_unseen(self, validate: Sequence[str | Path | Recording]) -> IdentificationInputs:
-        """Return inputs with additional unseen recordings.
+        """Return inputs with additional held-out recordings.
 
         Args:
-            validate: paths, each with a cut if wanted, or recordings in memory.
+            validate: paths, each with an optional cut (``log.npz@0:9.4``), or recordings in memory.
         """
         joints = joints_of(self.chain)
         paths = [_path(recording) for recording in validate]
@@ -134,18 +135,18 @@ def gather(
     designed: Sequence[DesignedMotion] = (),
     progress: Progress | None = None,
 ) -> IdentificationInputs:
-    """Return the inputs of an identification from files: the robot, and all recordings as motions.
+    """Return the inputs of an identification from files: the robot, and all recordings as filtered motions.
 
     Args:
-        robot: a name or file as in `calib.robot.library`, or a robot as a geometric fit returns it.
-        recordings, validate: training and unseen recordings: paths, each with an optional cut (``log.npz@0:9.4``), or
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
+        recordings, validate: training and held-out recordings: paths, each with an optional cut (``log.npz@0:9.4``), or
             recordings in memory.
         options: content of the options file; None: defaults.
-        method, friction: replace those of the options; None: as in the options.
-        base, tip: links of a URDF at which the chain begins and ends; None: see `calib.robot.library`.
+        method, friction: identification method and friction model; None: as in the options.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
         seed: seed of all random numbers.
-        designed: designed motions to search for in recordings without a reference, if the options have a [loop].
-        progress: called with the name of each step; None: silent.
+        designed: designed motions, which are searched in recordings without a reference if the options have a [loop].
+        progress: called with a text on each step; None: silent.
 
     Raises:
         UsageError: without a recording, and for unknown options.
@@ -198,7 +199,7 @@ def gather(
         if shifts:
             effect = f"move the links by up to {1e3 * max(shifts):.3g} mrad or mm"
         else:
-            effect = "take no part: the links are rigid"
+            effect = "are not used: the links are rigid"
             described = described.without_corrections()
         notes.append(f"joint corrections of the geometric fit {effect}")
     return IdentificationInputs(
@@ -213,11 +214,20 @@ def gather(
 
 
 def silent(words: str) -> None:
-    """Show no progress."""
+    """Ignore a progress text, `words`."""
 
 
 def _check_payloads(cases: Sequence[Case], unseen: Sequence[Case], settings: IdentificationSettings) -> None:
-    """Refuse an unseen recording with a payload that is neither in the training recordings nor in the options."""
+    """Check that the payload of each held-out recording is identifiable or known.
+
+    Args:
+        cases: training recordings.
+        unseen: held-out recordings.
+        settings: settings of the identification with the payloads.
+
+    Raises:
+        UsageError: for a payload that is neither carried in a training recording nor stated in the options.
+    """
     available = set(settings.payload_values)
     available.update(label for label, load in settings.payloads.items() if load.parameters)
     for case in cases:
@@ -231,7 +241,10 @@ def _check_payloads(cases: Sequence[Case], unseen: Sequence[Case], settings: Ide
 
 
 def _path(recording: str | Path | Recording) -> str:
-    """Return the path of a recording; for a recording in memory, its file and time span (so that two cuts differ)."""
+    """Return the path of a recording, by which options and names refer to it.
+
+    For a recording in memory, this is its file name with its time span, so that two cuts of one file differ.
+    """
     if not isinstance(recording, Recording):
         return str(recording)
     file = recording.file or "recording"
@@ -243,7 +256,16 @@ def _path(recording: str | Path | Recording) -> str:
 
 
 def _with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
-    """Return the options with the command's method, friction model and seed; refuse unknown names."""
+    """Return the options with the method, friction model and seed that the command states; None: as in the options.
+
+    Args:
+        options: content of the options file.
+        method, friction: identification method and friction model; None: as in the options.
+        seed: seed of all random numbers.
+
+    Raises:
+        UsageError: for an unknown method or friction model.
+    """
     choices: FieldValues = {"seed": seed}
     if method is not None:
         _check_choice("method", method, tuple(METHODS))
@@ -255,13 +277,24 @@ def _with_choices(options: IdentifyOptions, method: str | None, friction: str | 
 
 
 def _check_choice(option: str, value: str, allowed: Sequence[str]) -> None:
-    """Refuse a value that an option of the command does not allow."""
+    """Raise a UsageError if the value of a command's option is not among the allowed values."""
     if value not in allowed:
         raise UsageError(f"--{option} {value}: expected {', '.join(allowed)}{suggestion(value, allowed)}")
 
 
 def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, gains: FoundGains, robot: Any) -> Case:
-    """Return the case of one recording: payload, gains, and the links' motion where joints have corrections."""
+    """Return a recording as a `Case`: motion, torques by drive gains, payload, and the links' motion.
+
+    The links' motion differs from the joints' motion only if the robot has joint corrections.
+
+    Args:
+        path: path of the recording, by which the options refer to it.
+        name: name of the recording in results and messages.
+        motion: the filtered motion.
+        options: content of the options file.
+        gains: drive gains.
+        robot: the calibrated robot.
+    """
     file_options = options.file_settings(path)
     rows = options.settings.torque_rows
     with refused_as(MeasurementError, NoPosture, "{}", name):
@@ -275,14 +308,14 @@ def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, g
 def read_motion(
     given: str | Path | Recording, chain: Chain | Joints, own: FileSettings, like: Motion | None = None
 ) -> Motion:
-    """Return the motion of a recording, checked against the robot's joints and limits.
+    """Return the filtered motion of a recording, checked against the robot's joints and limits.
 
     Args:
         given: a path, with an optional cut, or a recording in memory.
         chain: the robot, or its joints.
-        own: the options for the recording's file.
-        like: motion whose identification band is used if the options state none; the cutoff of the position filter
-            still follows from the recording itself. None: both follow from the recording.
+        own: the options for this recording.
+        like: motion whose identification band is used if the options state no band; the cutoff of the position filter
+            still follows from the recording. None: both follow from the recording.
     """
     joints = chain if isinstance(chain, Joints) else joints_of(chain)
     if isinstance(given, Recording):
@@ -311,7 +344,7 @@ def read_motion(
         band=min(band, MAX_BAND * motion.rate),
     )
     wider = make_motion(recording, wider_options, sampled, motion.cutoffs)
-    note = f"f_p = {wider.band:.3g} Hz instead, so that decimation does not remove the ends of a short recording"
+    note = f"identification band f_p = {wider.band:.3g} Hz instead, to keep the ends of a short recording"
     return replace(wider, notes=(*motion.notes, note))
 
 
@@ -320,9 +353,16 @@ def _joints(values: np.ndarray) -> tuple[float, ...]:
 
 
 def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampled: Resampled) -> Motion:
-    """Return the motion filtered with a higher cutoff f_q if the encoder noise is low: f_q ≥ 5 f_dyn is only a minimum.
+    """Return the motion filtered with twice the cutoff f_q if the encoder noise is low; otherwise the unchanged motion.
 
-    f_q is doubled if the noise stays below `QUIET` of every moving joint's rms acceleration (our choice).
+    The default f_q ≥ 5 f_dyn is only a minimum. f_q is doubled if the resulting acceleration noise stays below `QUIET`
+    times the rms acceleration of every moving joint (our choice).
+
+    Args:
+        recording: the recording.
+        motion: the recording, filtered with the default cutoff.
+        options: options of the filters.
+        sampled: the recording at a constant sampling rate.
     """
     rms = np.sqrt(np.mean(motion.a**2, axis=0))
     moves = np.ptp(motion.q, axis=0) > MIN_RANGE
@@ -335,7 +375,7 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
     borders = 2.0 / cutoff if options.borders is None else options.borders
     sharper_options = replace(options, velocity_cutoff=_joints(motion.velocity_cutoff), borders=borders, cutoff=doubled)
     sharper = make_motion(recording, sharper_options, sampled, motion.cutoffs)
-    note = f"f_q = {doubled:.3g} Hz instead: the position noise is low enough"
+    note = f"cut-off of positions f_q = {doubled:.3g} Hz instead: the position noise is low enough"
     return replace(sharper, notes=(*motion.notes, note))
 
 
@@ -346,8 +386,16 @@ def _referred(
     options: IdentifyOptions,
     designed: Sequence[DesignedMotion],
 ) -> Motion:
-    """Return the motion with its reference positions: from a file named in the options, the recording, or a designed
-    motion.
+    """Return the motion with reference positions of the control loop, if the options describe a control loop.
+
+    The reference positions are from a file named in the options, from the recording, or from a designed motion.
+
+    Args:
+        motion: the filtered motion.
+        recording: the recording, or its path.
+        joints: the robot's joints.
+        options: content of the options file.
+        designed: designed motions, which are searched in the recording.
     """
     file_options, loop = options.file_settings(_path(recording)), options.settings.loop
     if loop is None:
@@ -371,9 +419,17 @@ def _with_design(
     options: FileSettings,
     designed: Sequence[DesignedMotion],
 ) -> Motion:
-    """Return the part of a motion in which whole periods of a designed motion were played, with it as the reference.
+    """Return the part of a motion in which whole periods of a designed motion were played, with reference positions.
 
-    The designed motion is searched in the whole file, since a cut may contain less than a period.
+    The reference positions are those of the designed motion. It is searched in the whole file, since a cut may contain
+    less than a period.
+
+    Args:
+        motion: the filtered motion of the recording.
+        source: the recording, or its path with an optional cut.
+        joints: the robot's joints.
+        options: the options for this recording.
+        designed: designed motions to search for.
 
     Raises:
         MeasurementError: if no designed motion is found.
@@ -392,11 +448,23 @@ def _with_design(
             part = slice(start, stop)
             q_ref = frozen(design.orders(motion.t[part] - located.began)[0])
             return replace(motion.part(part), q_ref=q_ref, located=located.began)
-    refuse_data(motion.file, "has no reference positions (q_ref), and contains none of the designed motions whole")
+    refuse_data(
+        motion.file,
+        "has no reference positions (q_ref), and contains none of the designed motions whole: log the reference, or "
+        "record again",
+    )
 
 
 def _check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
-    """Refuse a [files] table that names none of the recordings."""
+    """Check that each entry of the options' table ``[files]`` names one of the recordings.
+
+    Args:
+        options: content of the options file.
+        paths: paths of all recordings.
+
+    Raises:
+        UsageError: for an entry that matches no recording.
+    """
     files = [Path(parse_cut(str(path))[0]) for path in paths]
     file_names = [file.name for file in files]
     source = f"{options.source}: " if options.source else ""

@@ -1,7 +1,7 @@
-"""Content of ``metrics.json`` (schema 3): the record of an identification that console and certificate show.
+"""Content of ``metrics.json`` (schema 3): the record of an identification, from which console and certificate are made.
 
-The fields are the keys of the file. Most are values of the estimation, stored as they are typed. Files before schema 3
-have no schema number and other keys; `with_current_keys` converts them.
+The fields of the dataclasses are the keys of the file. Most values are those of the estimation, stored with its types.
+Files before schema 3 have no schema number and other keys; `with_current_keys` converts them.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from calib.identification.methods.constraint_settings import Binding
 from calib.identification.prediction import Score, relative_error_sigma
 from calib.identification.registry import METHODS
 from calib.identification.rows import Case
+from calib.identification.uncertainty.error_growth import error_growth
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
@@ -41,9 +42,7 @@ BOUND_SIGMA = 1e-9
 
 @dataclass(frozen=True)
 class ParameterCounts:
-    """Numbers of standard parameters, of base parameters (identifiable from any motion), and of essential
-    parameters.
-    """
+    """Numbers of standard parameters, base parameters (identifiable from some motion), and essential parameters."""
 
     standard: int
     base: int
@@ -52,7 +51,7 @@ class ParameterCounts:
 
 @dataclass(frozen=True)
 class ColumnCounts:
-    """Numbers of standard parameters without effect on any torque, and of those regrouped into other parameters."""
+    """Numbers of standard parameters without effect on any torque, and of standard parameters regrouped into others."""
 
     without_effect: int
     regrouped: int
@@ -60,9 +59,7 @@ class ColumnCounts:
 
 @dataclass(frozen=True)
 class ConditionNumber:
-    """Condition number of the observation matrix, in SI units (raw) and with columns scaled to unit norm
-    (normalised).
-    """
+    """Condition number of the observation matrix: in SI units (raw), and with columns of unit norm (normalised)."""
 
     raw: Number
     normalised: Number
@@ -70,7 +67,16 @@ class ConditionNumber:
 
 @dataclass(frozen=True, eq=False)
 class FilterMetrics:
-    """Sampling rate, cutoffs f_q and f_v by joint, and identification band f_p, all in [Hz], and decimation factor."""
+    """Filters of a recording.
+
+    Attributes:
+        rate: sampling rate [Hz].
+        cutoff: (n,) cutoff f_q of the positions' filter, by joint [Hz].
+        band: upper limit f_p of the identification band [Hz].
+        decimation: number of samples per row of the identification.
+        velocity_cutoff: (n,) cutoff f_v of the velocities' filter, by joint [Hz]; None in files of version 0.1: equal
+            to `cutoff`.
+    """
 
     rate: float
     cutoff: Array
@@ -81,14 +87,18 @@ class FilterMetrics:
 
     @classmethod
     def of(cls, motion: Motion) -> FilterMetrics:
-        """Return the filter metrics of a motion."""
+        """Return rate, cutoffs, band and decimation factor of a filtered motion."""
         return cls(motion.rate, motion.cutoff, motion.band, motion.decimator.factor, motion.velocity_cutoff)
 
 
 @dataclass(frozen=True, eq=False)
 class ConstraintMetrics:
-    """Constraints of an estimate, the constraints at their bounds, and the number of postures whose M(q) is at its
-    bound.
+    """Constraints of an estimate.
+
+    Attributes:
+        names: names of the constraints.
+        binding: the constraints that are at their bounds.
+        postures_binding: number of postures at which the inertia matrix is at the bound of positive definiteness.
     """
 
     names: tuple[str, ...]
@@ -101,15 +111,16 @@ class JudgedMetrics:
     """Results of a model on recordings, as stored in ``metrics.json`` and ``unseen/report.json``.
 
     Attributes:
-        verdict, reason: level of the model's verdict, and its reason as text.
-        code, advice: of the finding that decided the verdict; empty for a pass, and in files of earlier versions.
+        verdict, reason: level of the verdict on the model, and the reason as text.
+        code, advice: code and advice of the finding that decided the verdict; empty for a pass, and in files of earlier
+            versions.
         warnings: texts for the user.
-        noticed: findings behind the warnings; warnings without a finding are text only.
+        noticed: findings whose sentences are in the warnings; other warnings are text only.
         rows: names of the torque rows.
-        validation: name of an unseen recording → score of the model.
-        tracking: name of a replayed recording → simulated tracking.
-        tracking_failure: reason for missing replays; empty if there are replays.
-        references: name of an unseen recording → errors of plain references beside the model's.
+        validation: name of a held-out recording -> score of the model.
+        tracking: name of a recording -> simulated tracking with the model as feedforward.
+        tracking_failure: reason why no tracking was simulated; empty otherwise.
+        references: name of a held-out recording -> errors of the plain references beside the model's error.
     """
 
     verdict: str
@@ -126,7 +137,7 @@ class JudgedMetrics:
 
 
 def _judged(assessment: DynamicsAssessment) -> FieldValues:
-    """Return the entries of an assessment common to both JSON files, without the names of the torque rows."""
+    """Return the entries of an assessment that both JSON files contain, without the names of the torque rows."""
     return {
         "verdict": assessment.verdict.level,
         "reason": assessment.verdict.reason,
@@ -143,7 +154,31 @@ def _judged(assessment: DynamicsAssessment) -> FieldValues:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ModelMetrics(JudgedMetrics):
-    """The content of ``metrics.json``; see `calib.identification.model_file`."""
+    """The content of an identification's ``metrics.json``.
+
+    Attributes:
+        identification: name of a training recording -> score of the model.
+        parameters, counts: numbers of parameters, and of standard parameters that are not estimated.
+        condition_number: condition number of the observation matrix.
+        friction: name of the friction model.
+        method, method_assumes: identification method, and its assumption as text.
+        ladder: tried friction models with their errors.
+        ripple: torque ripple of the joints; empty: not modelled.
+        elimination: steps of the elimination of parameters that are not essential; empty: none.
+        unit: unit of the torques.
+        switched_off: names of drive terms that were switched off, since nothing was measured for them.
+        drive_gains: identified drive gains; None: none.
+        loop: results of the closed-loop simulation; None: none.
+        constraints: constraints of the estimate; None: none.
+        filters: name of a recording -> its filters.
+        geometry: effect of the geometry's uncertainty; None: not computed.
+        repeated: name of a held-out recording that repeats training motion -> share of its states in the training.
+        findings: findings that the verdict needs besides the recordings; None in files of earlier versions.
+        error_density: (rows,) spectral density of the torque errors [N² m² s or N² s]; None in files of earlier
+            versions.
+        seed: seed of all random numbers.
+        schema: version of the file's format.
+    """
 
     identification: Mapping[str, Score]
     parameters: ParameterCounts
@@ -165,15 +200,20 @@ class ModelMetrics(JudgedMetrics):
     repeated: Mapping[str, float] = field(default_factory=dict)
     findings: ModelFindings | None = None
     error_density: Array | None = None
+    error_growth: Array | None = None
+    torque_variance: Array | None = None
     seed: int = 0
     schema: int = SCHEMA
 
 
 def on_bounds(identification: Identification) -> tuple[str, ...]:
-    """Return the parameters fixed by a constraint at its bound: the recordings do not identify them, and they have no
-    σ.
+    """Return the names of the parameters that a constraint fixes at its bound.
 
-    The covariance takes the constraint as an equality, so that the other parameters' σ assume these values to be exact.
+    The recordings do not identify these parameters, so that they have no σ. The covariance treats the constraint as an
+    equality; the σ of the other parameters therefore assume that the fixed values are exact.
+
+    Args:
+        identification: the identification with its constrained estimate.
     """
     constrained = identification.fitted.held
     if constrained is None:
@@ -187,7 +227,7 @@ def on_bounds(identification: Identification) -> tuple[str, ...]:
 
 
 def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
-    """Return the content of ``metrics.json`` for an identification."""
+    """Return the content of ``metrics.json`` for the outcome of an identification."""
     identification, inputs = outcome.found, outcome.inputs
     base, constrained = identification.base, identification.fitted.held
     count = base.b + len(identification.friction.terms)
@@ -196,6 +236,7 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         essential, steps = len(identification.elimination.kept), identification.elimination.steps
     method = identification.fitted.method
     filters = {case.name: FilterMetrics.of(case.motion) for case in (*inputs.cases, *inputs.unseen)}
+    growth = error_growth(identification.rows, identification.fitted.estimate.values)
     return ModelMetrics(
         **_judged(outcome),
         rows=identification.settings.torque_rows.numbered(inputs.chain.n),
@@ -219,6 +260,8 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         repeated=outcome.repeated,
         findings=outcome.findings,
         error_density=_error_density(identification, inputs.cases),
+        error_growth=growth.share,
+        torque_variance=growth.torque_variance,
         seed=outcome.seed,
     )
 
@@ -226,8 +269,13 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
 def _error_density(identification: Identification, cases: Sequence[Case]) -> np.ndarray:
     """Return the spectral density of the torque errors (rows,) [N² m² s or N² s].
 
-    It is the errors' variance divided by the number of independent rows per second; a motion's information is
-    ∫ ωᵀω / density dt.
+    The density is the variance of the errors divided by the number of independent rows per second. With it, the
+    information matrix of a motion is ∫ ωᵀω / density dt, where ω is the regressor, the matrix that maps parameters to
+    torques.
+
+    Args:
+        identification: the identification.
+        cases: training recordings.
     """
     count = sum(len(rows.target) for rows in identification.rows)
     per_second = count / sum(case.duration for case in cases)
@@ -236,12 +284,14 @@ def _error_density(identification: Identification, cases: Sequence[Case]) -> np.
 
 @dataclass(frozen=True, eq=False)
 class TorqueCurves:
-    """Measured and predicted torques of one recording, each (rows, K), thinned for drawing; times (K,) [s].
+    """Measured and predicted torques of one recording, thinned to K samples for drawing.
 
     Attributes:
         name: name of the recording.
-        band: cutoff [Hz] to which both torques are low-passed; NaN in files of earlier versions: not filtered.
-        error_sigma: standard error of the relative error of the torques as recorded [%].
+        t: (K,) times [s].
+        measured, predicted: (rows, K) torques.
+        band: cutoff [Hz] to which both torques are low-passed; NaN: not filtered, in files of earlier versions.
+        error_sigma: standard error [%] of the relative error of the unfiltered torques.
     """
 
     name: str
@@ -253,7 +303,12 @@ class TorqueCurves:
 
     @classmethod
     def of(cls, case: Case, predicted: np.ndarray) -> TorqueCurves:
-        """Return the curves of a case and its prediction (N, rows)."""
+        """Return the curves of measured and predicted torques of a recording, thinned for drawing.
+
+        Args:
+            case: the recording with N samples.
+            predicted: (N, rows) torques that the model predicts for it.
+        """
         motion, measured = case.motion, np.asarray(case.target)
         picked = evenly(len(measured), MAX_POINTS)
         measured_in_band = _five_digits(motion.in_band(measured)[picked].T)
@@ -270,14 +325,13 @@ def _five_digits(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UnseenReport(JudgedMetrics):
-    """Report of a model on unseen motion, content of ``unseen/report.json``; see
-    `calib.procedure.dynamic_stage.identify`.
+    """Report on a model's errors on held-out motion, the content of ``unseen/report.json``.
 
     Attributes:
         units: units of the torque rows.
-        fit: name of a training recording → score of the model.
-        curves: torques of the recordings that the model is judged by.
-        limits: (rows,) torque limits of the robot's description; infinite without a limit; None in earlier files.
+        fit: name of a training recording -> score of the model.
+        curves: torques of the recordings on which the verdict is based.
+        limits: (rows,) torque limits of the robot's description; infinite: no limit; None in files of earlier versions.
         robot: name of the robot; empty in files of earlier versions.
     """
 
@@ -290,7 +344,7 @@ class UnseenReport(JudgedMetrics):
 
     @classmethod
     def of(cls, inputs: IdentificationInputs, assessment: DynamicsAssessment) -> UnseenReport:
-        """Return the report of an assessment of `inputs`."""
+        """Return the report on an assessment of the model on the recordings in `inputs`."""
         torque_rows = inputs.options.settings.torque_rows
         rows = torque_rows.titles(inputs.chain.joint_names)
         cases = inputs.unseen or inputs.cases
@@ -312,7 +366,7 @@ class UnseenReport(JudgedMetrics):
 
     @property
     def proofs(self) -> dict[str, Score]:
-        """Scores on unseen recordings by name, without repeats of the training motion."""
+        """Scores on the held-out recordings that do not repeat the training motion: recording name -> score."""
         return {name: score for name, score in self.validation.items() if score.evidence}
 
 
@@ -323,7 +377,7 @@ _STEP = ("ratio", "f", "p", "p_total")
 
 
 def with_current_keys(content: ParsedTable) -> ParsedTable:
-    """Return the content of an earlier version's ``metrics.json`` or ``unseen/report.json`` with today's keys."""
+    """Return the content of an earlier version's ``metrics.json`` or ``unseen/report.json`` with the current keys."""
     if content.get("schema", UNSEEN_SCHEMA - 1) >= UNSEEN_SCHEMA:
         return dict(content)
     result = dict(content)
@@ -357,14 +411,14 @@ def with_current_keys(content: ParsedTable) -> ParsedTable:
 
 
 def _score(score: ParsedTable) -> ParsedTable:
-    """Return a score of an earlier version with today's keys."""
+    """Return the score in a file of an earlier version with the current keys."""
     missing = {"acf": [], **dict.fromkeys(_WHITENESS)}
     rows = [whiteness and missing | whiteness for whiteness in score["whiteness"]]
     return {"rate": None, "r_squared": [], "motion_share": 1.0} | dict(score) | {"whiteness": rows}
 
 
 def _replay(replay: ParsedTable) -> ParsedTable:
-    """Return a replay of an earlier version with today's keys."""
+    """Return the simulated tracking (`replay`) in a file of an earlier version with the current keys."""
     stored = replay["controller"]
     controller = None
     if "kp" in stored:

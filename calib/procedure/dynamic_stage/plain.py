@@ -1,10 +1,10 @@
 """Plain references beside an identified model: the nominal masses, and weighted least squares without selection.
 
-Plain weighted least squares estimates the base parameters with Coulomb and viscous friction and offsets, from the rows
-and filters of the identification, without a prior and without richer friction. Directions of unit-norm columns with a
-singular value below `RANK` of the largest are omitted (truncated at the data's rank). On held-out recordings, the
-errors of this estimate and of the nominal masses are shown beside the delivered model's error: the difference shows
-the benefit of selection and prior.
+Plain weighted least squares estimates the base parameters with Coulomb and viscous friction and offsets. It uses the
+rows and filters of the identification, but no prior and no richer friction. With columns scaled to unit norm,
+directions with a singular value below `RANK` of the largest are omitted (truncated at the data's rank). On held-out
+recordings, the errors of this estimate and of the nominal masses are shown beside the error of the delivered model. The
+difference shows the benefit of selection and prior.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ BODY_PARAMETERS = 10
 
 @dataclass(frozen=True)
 class PlainReferences:
-    """Unexplained share of the torque of a held-out recording [%], each computed as `Score.judged`.
+    """Unexplained share of the torque of a held-out recording [%], for three models; computed as `Score.judged`.
 
     Attributes:
-        delivered: by the identified model.
-        plain: by plain weighted least squares; NaN where none was possible.
-        nominal: by the masses of the robot's description, without friction; NaN without masses, or for currents.
+        delivered: share of the identified model.
+        plain: share of plain weighted least squares; NaN if no such estimate was possible.
+        nominal: share of the masses in the robot's description, without friction; NaN without masses, or for currents.
     """
 
     delivered: Number
@@ -50,9 +50,12 @@ class PlainReferences:
 
 
 def plain_values(identification: Identification[RegressorModel]) -> np.ndarray:
-    """Return the parameters (p,) of the identified model by plain weighted least squares.
+    """Return the parameters (p,) of the identified model, estimated by plain weighted least squares.
 
-    Terms beyond the standard model are zero; a payload that no training recording carries keeps its known parameters.
+    Terms beyond the standard model are zero. A payload that no training recording carries keeps its known parameters.
+
+    Args:
+        identification: the identification with its recordings.
     """
     base, dynamics = identification.base, identification.dynamics
     torque_rows = identification.rows[0].target.shape[1]
@@ -72,10 +75,11 @@ def plain_values(identification: Identification[RegressorModel]) -> np.ndarray:
 
 
 def truncated(data: Triangles) -> np.ndarray:
-    """Return the weighted least-squares values (p,) of least norm, truncated at the data's rank.
+    """Return the weighted least-squares values (p,) of minimum norm, truncated at the data's rank.
 
     Args:
-        data: R factors, one group per torque row; each group is weighted by the inverse rms of its residuals.
+        data: triangular factors R of the regression's rows (Rᵀ R: normal equations), one group per torque row; each
+            group is weighted by the inverse rms of its residuals.
     """
     weight, values = np.ones(data.groups), np.zeros(data.parameters)
     for _ in range(ROUNDS):
@@ -93,7 +97,11 @@ def truncated(data: Triangles) -> np.ndarray:
 def nominal_values(chain: Chain, dynamics: Dynamics[RegressorModel]) -> np.ndarray | None:
     """Return the model's parameters (p,) from the masses of the robot's description, without friction.
 
-    None if the description states no masses, or if the torque rows are those of drives alone, without rigid bodies.
+    None if the description states no masses, or if the torque rows contain no rigid-body torques.
+
+    Args:
+        chain: the arm with the masses and inertias of its description.
+        dynamics: the identified model, which determines the parameters and their order.
     """
     inertias = getattr(chain, "inertias", None)
     if inertias is None or not np.any(inertias[:, 9] > 0.0) or not dynamics.model.torque_rows.has_bodies:
@@ -112,16 +120,16 @@ def references(
     slow: float | tuple[float, ...] | None = None,
     apart: Sequence[int] = (),
 ) -> dict[str, PlainReferences]:
-    """Return the errors of plain references on held-out recordings beside the model's: recording name → errors.
+    """Return the errors of the plain references and of the model on held-out recordings: recording name -> errors.
 
     Args:
         cases: held-out recordings.
-        scores: recording name → score of the model.
+        scores: recording name -> score of the model.
         dynamics: the model.
-        plain: (p,) parameters by plain least squares; empty without such an estimate.
-        nominal: (p,) parameters by the description; None without.
-        slow: speed below which a joint counts as standing, see `calib.data.signals.motion.moving`; None: its default.
-        apart: indices of rows with a unit of their own, which are excluded from totals.
+        plain: (p,) parameters by plain least squares; empty: no such estimate.
+        nominal: (p,) parameters from the description; None: no masses in it.
+        slow: speed below which a joint counts as standing, see `calib.data.signals.motion.moving`; None: default speed.
+        apart: indices of rows that have another unit and are excluded from totals.
     """
     result = {}
     for case in cases:
@@ -131,31 +139,48 @@ def references(
             error = np.nan
             if values is not None and len(values) == len(dynamics.values):
                 predicted = predict(Dynamics(dynamics.model, values), case)
-                error = _unexplained(case, predicted, score.stands, slow, apart)
+                error = _unexplained(case, predicted, score, slow, apart)
             errors.append(error)
         result[case.name] = PlainReferences(score.judged.total, *errors)
     return result
 
 
 def _unexplained(
-    case: Case, predicted: np.ndarray, in_motion: bool, slow: float | tuple[float, ...] | None, apart: Sequence[int]
+    case: Case, predicted: np.ndarray, score: Score, slow: float | tuple[float, ...] | None, apart: Sequence[int]
 ) -> float:
-    """Return the unexplained share 100 ‖τ - τ̂‖ / ‖τ‖ [%] of a case; with `in_motion`, of moving joints only."""
+    """Return the unexplained share 100 ‖τ - τ̂‖ / ‖τ‖ [%] of the torques τ of a recording; NaN without torques.
+
+    Samples and frequencies are those that count in the model's score, see `Score.judged`.
+
+    Args:
+        case: the recording with N samples.
+        predicted: (N, rows) predicted torques.
+        score: the model's score on the recording, which states whether noise or standing joints are excluded.
+        slow: speed below which a joint counts as standing; None: default speed.
+        apart: indices of rows that have another unit and are not counted.
+    """
     motion = case.motion
     rows = case.target.shape[1]
+    target = case.target
+    if score.noisy:
+        target, predicted = motion.in_band(target), motion.in_band(predicted)
     counted = np.repeat(motion.weight[:, None] > 0.5, rows, axis=1)
-    if in_motion:
+    if score.stands:
         moves = moving(motion) if slow is None else moving(motion, slow)
         counted &= moves[:, np.arange(rows) % motion.n]
     counted[:, list(apart)] = False
-    residual_squares = float(np.sum((case.target - predicted)[counted] ** 2))
-    squares = float(np.sum(case.target[counted] ** 2))
+    residual_squares = float(np.sum((target - predicted)[counted] ** 2))
+    squares = float(np.sum(target[counted] ** 2))
     return 100.0 * float(np.sqrt(residual_squares / squares)) if squares > 0.0 else np.nan
 
 
 def worse_than_plain(errors_by_file: Mapping[str, PlainReferences]) -> list[Finding]:
-    """Return the finding on the held-out recording where plain least squares is most ahead of the model; [] if
-    nowhere.
+    """Return a finding on the held-out recording on which plain least squares is better by the largest factor.
+
+    An empty list if plain least squares is better than the model by less than the catalogue's limit on every recording.
+
+    Args:
+        errors_by_file: name of a recording -> errors of the model and of the plain references.
     """
     ratios = {}
     for name, errors in errors_by_file.items():

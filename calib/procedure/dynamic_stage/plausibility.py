@@ -1,7 +1,7 @@
 """Findings on implausible sizes, signs and clocks of recordings (findings catalogue, chapter 9).
 
-The catalogue states their limits and sentences. A finding that makes the numbers of a model wrong by far fails the
-verdict, or limits it to marginal, unless the options' ``accept`` names the finding as intended.
+The catalogue contains the limits and sentences. A finding that makes the model's values grossly wrong fails the verdict
+or limits it to marginal, unless the options' ``accept`` names the finding.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -37,11 +37,13 @@ MIN_FACTOR_ERROR = 0.1
 def implausible(
     inputs: IdentificationInputs, impossible_by: Contradiction | None, loop: LoopDisagreement | None
 ) -> tuple[Finding, ...]:
-    """Return all findings on implausible recordings, descriptions and estimates, with the accepted ones marked.
+    """Return all findings on implausible recordings, descriptions and estimates; accepted findings are marked.
 
     Args:
-        impossible_by: distance of the estimate from every physically consistent robot.
-        loop: disagreement of recorded torques with an estimate that relies on the stated loop.
+        inputs: robot, recordings and options.
+        impossible_by: distance of the estimate from every physically consistent robot; None: unknown.
+        loop: disagreement of recorded torques with an estimate that relies on the stated control loop; None: no
+            disagreement.
     """
     chain, gravity = inputs.chain, inputs.options.settings.gravity
     cases = [*inputs.cases, *inputs.unseen]
@@ -67,7 +69,12 @@ def implausible(
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:
-    """Return the findings on implausible recordings, from the sizes of their torques, velocities and clocks."""
+    """Return findings on torques and velocities of implausible size in recordings, and on wrong clocks.
+
+    Args:
+        sizes: for each recording, the sizes of its quantities compared with the robot's description.
+        joints: names of the joints.
+    """
     result: list[Finding] = []
     for recording in sizes:
         result += _limits(recording, joints)
@@ -95,13 +102,20 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
 
 
 def _of_some_level(candidates: Iterable[Finding]) -> list[Finding]:
-    """Return the findings whose values reach a level (warning or verdict) of the catalogue."""
+    """Return the findings whose values reach a level (note, marginal or fail) of the catalogue.
+
+    Args:
+        candidates: findings with their values.
+    """
     return [candidate for candidate in candidates if level_of(candidate)]
 
 
 def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Finding]:
-    """Return the findings on clipped torques, and on positions and velocities that stay constant while a joint
-    moves.
+    """Return findings on clipped torques, and on positions or velocities that stay constant while a joint moves.
+
+    Args:
+        cases: the recordings.
+        joints: names of the joints.
     """
     result = []
     for case in cases:
@@ -131,7 +145,12 @@ def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Findi
 
 
 def wrong_joints(explanations: Mapping[str, Explanation | None], joints: Sequence[str]) -> list[Finding]:
-    """Return the findings on joints, by name, with a reversed sign or an angle relative to another joint."""
+    """Return findings on joints with a reversed sign, or with an angle that is measured relative to another joint.
+
+    Args:
+        explanations: recording name -> changes of joints that explain the torques; None: no change is needed.
+        joints: names of the joints.
+    """
     result = []
     for name, explanation in explanations.items():
         if explanation is None:
@@ -161,7 +180,11 @@ def _joints_of_change(change: Change) -> tuple[int, ...]:
 
 
 def impossible(contradiction: Contradiction | None) -> list[Finding]:
-    """Return the finding that an estimate is far from every physically consistent robot; [] if it is not or unknown."""
+    """Return a finding if an estimate is far from every physically consistent robot; otherwise an empty list.
+
+    Args:
+        contradiction: distance of the estimate from every physically consistent robot; None: unknown.
+    """
     if contradiction is None:
         return []
     candidate = finding(
@@ -175,21 +198,32 @@ def impossible(contradiction: Contradiction | None) -> list[Finding]:
 
 
 def described(chain: Chain) -> list[Finding]:
-    """Return the finding on physically inconsistent bodies in the robot's description."""
+    """Return a finding if the description of `chain` has physically inconsistent bodies; otherwise an empty list."""
     bodies = impossible_bodies(chain)
     return [finding("inconsistent-bodies", bodies=bodies)] if bodies else []
 
 
 def another_loop(disagreement: LoopDisagreement | None) -> list[Finding]:
-    """Return the finding that recorded torques contradict an estimate based on the given control loop; [] if they do
-    not.
+    """Return a finding if recorded torques contradict an estimate that relies on the stated control loop.
+
+    Args:
+        disagreement: how the torques contradict the estimate; None: they do not, which yields an empty list.
     """
     if disagreement is None:
         return []
-    factors, median = np.array(disagreement.factor), float(np.median(disagreement.factor))
-    # one factor at all joints, or one at each, or else another velocity
-    scaled = bool(np.ptp(factors) < MAX_FACTOR_SPREAD * abs(median) and abs(median - 1.0) > MIN_FACTOR_ERROR)
-    by_joint = not scaled and bool(np.any(np.abs(factors - 1.0) > MIN_FACTOR_ERROR))
+    factors = np.array(disagreement.factor)
+    median = float(np.median(factors))
+    equal_factors = np.ptp(factors) < MAX_FACTOR_SPREAD * abs(median)
+    # Hypotheses: one factor at all joints, a factor per joint, or else another velocity than the stated one.
+    times = None
+    wrong_factors: list[str] = []
+    velocity = ""
+    if equal_factors and abs(median - 1.0) > MIN_FACTOR_ERROR:
+        times = median
+    elif np.any(np.abs(factors - 1.0) > MIN_FACTOR_ERROR):
+        wrong_factors = _three_digits(disagreement.factor)
+    else:
+        velocity = "reference_velocity"
     return [
         finding(
             "loop-refuted",
@@ -200,9 +234,9 @@ def another_loop(disagreement: LoopDisagreement | None) -> list[Finding]:
             worst=max(disagreement.left),
             left=_three_digits(disagreement.left),
             other_left=_three_digits(disagreement.beside_left),
-            times=median if scaled else None,
-            factors=_three_digits(disagreement.factor) if by_joint else (),
-            velocity="" if scaled or by_joint else "reference_velocity",
+            times=times,
+            factors=wrong_factors,
+            velocity=velocity,
         )
     ]
 
@@ -212,7 +246,12 @@ def _three_digits(numbers: Sequence[float]) -> list[str]:
 
 
 def _masses(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Yield findings on the signs and sizes of torques compared with the robot's masses."""
+    """Yield findings on signs and sizes of torques that disagree with the masses in the robot's description.
+
+    Args:
+        recording: sizes of a recording's quantities compared with the robot's description.
+        joints: names of the joints.
+    """
     share = recording.masses
     determined = np.flatnonzero(np.isfinite(share)).tolist()
     if not determined:
@@ -229,13 +268,18 @@ def _masses(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Findin
 
 
 def _off(ratio: np.ndarray | np.floating) -> float:
-    """Return the largest factor max(|r|, 1/|r|) by which any of the ratios r differs from 1."""
+    """Return the largest factor by which any ratio r differs from 1: the maximum of |r| and 1/|r|."""
     sizes = np.maximum(np.abs(ratio), 1e-300)
     return float(np.maximum(sizes, 1.0 / sizes).max())
 
 
 def _limits(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Yield findings on torques a thousand times too large or too small for the joints' limits: another unit."""
+    """Yield findings on torques far above or below the joints' torque limits, which indicates another unit.
+
+    Args:
+        recording: sizes of a recording's quantities compared with the robot's description.
+        joints: names of the joints.
+    """
     limited = np.isfinite(recording.limits)
     if not limited.any():
         return
@@ -255,7 +299,12 @@ def _limits(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Findin
 
 
 def _speed(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Yield the findings on measured velocities whose size differs from the differentiated positions."""
+    """Yield findings on measured velocities whose size differs from that of the differentiated positions.
+
+    Args:
+        recording: sizes of a recording's quantities compared with the robot's description.
+        joints: names of the joints.
+    """
     ratio = recording.speed
     measured = np.flatnonzero(np.isfinite(ratio))
     median = float(np.median(ratio[measured])) if len(measured) else 1.0
@@ -287,8 +336,13 @@ def _speed(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding
 
 
 def _against(clock: ClockRatio | None, speed_ratio: float) -> str:
-    """Return which measurement contradicts the ratio of inertias to masses: ``stamps`` or ``velocities``; "" if
-    neither.
+    """Return which measurement contradicts the known ratio of inertias to masses: ``stamps`` or ``velocities``.
+
+    An empty text if the data do not decide between the two.
+
+    Args:
+        clock: ratio of inertias to masses found in the torques, relative to the expected ratio; None: unknown.
+        speed_ratio: measured velocities divided by differentiated positions.
     """
     if clock is None:
         return ""
@@ -300,7 +354,12 @@ def _against(clock: ClockRatio | None, speed_ratio: float) -> str:
 
 
 def _unlike(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Yield the finding on joints whose measured velocities do not match the positions."""
+    """Yield a finding on joints whose measured velocities have the wrong sign or are unrelated to the positions.
+
+    Args:
+        recording: sizes of a recording's quantities compared with the robot's description.
+        joints: names of the joints.
+    """
     backwards = [joints[j] for j in np.flatnonzero(recording.follows < -FOLLOWS).tolist()]
     unrelated = [joints[j] for j in np.flatnonzero(np.abs(recording.follows) <= FOLLOWS).tolist()]
     if backwards or unrelated:
@@ -315,7 +374,13 @@ def _unlike(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Findin
 
 
 def _lag(name: str, lag: Lag | None, joints: Sequence[str]) -> Iterator[Finding]:
-    """Yield the findings on torques that are delayed at all joints, or at one joint."""
+    """Yield findings on torques that are delayed relative to the motion, at all joints or at one joint.
+
+    Args:
+        name: name of the recording.
+        lag: delay of its torques [s]; None: no delay was found.
+        joints: names of the joints.
+    """
     if lag is None:
         return
     if lag.certain:
@@ -348,7 +413,12 @@ def _direction(seconds: float) -> str:
 
 
 def _clock(name: str, clock: ClockRatio | None) -> Iterator[Finding]:
-    """Yield the finding on time stamps that contradict the ratio of inertias to masses."""
+    """Yield a finding if the time stamps contradict the known ratio of inertias to masses.
+
+    Args:
+        name: name of the recording.
+        clock: ratio of inertias to masses found in the torques, relative to the expected ratio; None: unknown.
+    """
     if clock is None:
         return
     times = _off(np.float64(clock.ratio))

@@ -1,4 +1,4 @@
-"""Drive gains that convert currents to torques: from the options or the file, or identified with a known payload."""
+"""Drive gains that convert currents to torques: from the options or the recording, or identified by a known payload."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -31,9 +31,9 @@ class FoundGains:
     """Drive gains that convert currents to torques.
 
     Attributes:
-        options: the options, with payload parameters that were identified together with the gains.
-        gains: (n,) gains for recordings without stated gains; None if not needed.
-        found: the identification of the gains; None if they were not identified.
+        options: the options, including payload parameters that were identified together with the gains.
+        gains: (n,) gains for recordings that state no gains; None if not needed.
+        found: identified gains with their σ; None if no gains were identified.
         unit: unit of the converted torques.
         notes: remarks for the user.
     """
@@ -46,16 +46,23 @@ class FoundGains:
 
     @property
     def own(self) -> tuple[int, ...]:
-        """Joints (from 0) without an identified gain, whose torques stay in amperes."""
+        """Indices of joints without an identified gain, whose torques stay in amperes."""
         return () if self.found is None else self.found.own
 
     def for_motion(self, motion: Motion, options: FileSettings) -> np.ndarray | None:
-        """Return the gains (n,) for a motion, from options, identification or file; None if it has torques, not
-        currents.
+        """Return the gains (n,) that apply to a motion; None if the motion contains torques instead of currents.
+
+        Gains in the options take precedence over identified gains, and these over gains in the recording.
+
+        Args:
+            motion: the motion.
+            options: the options for its recording.
         """
         if options.gains is not None:
             if len(options.gains) not in (1, motion.n):
-                raise UsageError(f"gains: {len(options.gains)} values for {motion.n} joints ({motion.file})")
+                raise UsageError(
+                    f"gains: {len(options.gains)} values for {motion.n} joints ({motion.file}): state one per joint"
+                )
             return np.broadcast_to(np.array(options.gains), (motion.n,))
         if motion.kind != "current":
             return None
@@ -69,14 +76,18 @@ def find_gains(
     training: Sequence[str],
     say: Callable[[str], None],
 ) -> FoundGains:
-    """Return the drive gains that convert the currents of `motions` (path → motion) to torques.
+    """Return the drive gains that convert recorded currents to torques.
 
     Args:
         chain: the arm.
-        options: options of the identification; a stated pair of recordings with a known payload determines the gains.
-        motions: path → motion of all recordings.
+        options: options of the identification; if they name recordings without and with a known payload, these
+            determine the gains.
+        motions: path of a recording -> motion, for all recordings.
         training: paths of the training recordings, from which relative gains are identified.
-        say: called with the name of each step.
+        say: called with a text on each step.
+
+    Raises:
+        UsageError: if some recordings contain currents without gains, and others torques.
     """
     if options.gain_pair is not None:
         say("drive gains")
@@ -90,15 +101,22 @@ def find_gains(
     with_gains = [path for path in motions if path not in bare_currents]
     if with_gains:
         raise UsageError(
-            f"{bare_currents[0]} holds currents without gains, {with_gains[0]} torques (or currents with gains): one "
-            "model cannot use both A and N m; state gains for all of them"
+            f"{bare_currents[0]} contains currents without gains, {with_gains[0]} torques (or currents with gains): "
+            "one model cannot use both A and N m; state gains for all of them"
         )
     say("relative drive gains")
     return _relative(chain, options, [(path, motions[path]) for path in training if path in bare_currents])
 
 
 def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: Mapping[str, Motion]) -> FoundGains:
-    """Return the absolute drive gains, identified from recordings without and with a payload of known mass."""
+    """Return absolute drive gains, identified from recordings without and with a payload of known mass.
+
+    Args:
+        chain: the arm.
+        options: options of the identification with the payload's mass.
+        pair: names of the recordings without and with the payload.
+        motions: path of a recording -> motion.
+    """
     settings = options.settings
     known_values = {f"M{label}": load.mass for label, load in settings.payloads.items() if load.mass is not None}
     for label, load in settings.payloads.items():
@@ -118,8 +136,8 @@ def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: 
     files = ", ".join(Path(parse_cut(name)[0]).name for name in (*pair.unloaded, *pair.loaded))
     notes = (
         f"drive gains from {files} ({gains.scale}): {printed}",
-        f"gains and payload are estimated from {files}: no independent validation data; no σ of a parameter contains "
-        "that of the gains",
+        f"gains and payload are estimated from {files}, so these do not validate the model; the σ of parameters do not "
+        "contain the uncertainty of the gains",
         *_poor_gains(gains),
     )
     with_loads = replace(options, settings=replace(settings, payload_values=loads))
@@ -127,7 +145,13 @@ def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: 
 
 
 def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[str, Motion]]) -> FoundGains:
-    """Return the drive gains relative to the joint with the largest current, so that all torques are in its amperes."""
+    """Return drive gains relative to the joint with the largest current; all torques are then in amperes of this joint.
+
+    Args:
+        chain: the arm.
+        options: options of the identification.
+        currents: path and motion of each training recording of currents; empty: the gains remain unknown.
+    """
     if not currents:
         return FoundGains(options, None, None, "A", ("drive gains are unknown: torques are currents [A]",))
     cases = [make_case(path, motion, carried=options.file_settings(path).payload) for path, motion in currents]
@@ -145,7 +169,8 @@ def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[s
         else:
             printed.append(f"{gain:.4g} ± {sigma:.2g}")
     notes = [
-        f"torques are {without_gains(unit)}; gains relative to it {', '.join(printed)}; for N m give gains, "
+        f"torques are {without_gains(unit)}; gains by joint, relative to that reference: {', '.join(printed)}; for N "
+        "m give gains, "
         "or [gain_identification] with a payload of known mass"
     ]
     if gains.own:
@@ -172,7 +197,7 @@ def _identify(
     base = find_base(model, cases, chain_states(chain, model, settings.seed))
     missing = [name for name in known_values if name not in [model.names[k] for k in base.kept]]
     if missing:
-        raise UsageError(f"'{missing[0]}' is not separately identifiable here; was the payload attached?")
+        raise UsageError(f"'{missing[0]}' is not separately identifiable from these runs; was the payload attached?")
     decimator = common_decimator(cases, settings)
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     tau = first_fit(rows)[1]
@@ -184,7 +209,20 @@ def _identify(
 def _case(
     name: str, chain: Chain, options: IdentifyOptions, motions: Mapping[str, Motion], carried: tuple[str, ...]
 ) -> Case:
-    """Return the case of a recording of currents: one of `motions`, or a file in the folder of the options file."""
+    """Return a recording of currents as a `Case`.
+
+    The recording is one of `motions`, or else a file in the folder of the options file.
+
+    Args:
+        name: name or path of the recording in the options.
+        chain: the arm.
+        options: options of the identification.
+        motions: path of a recording -> motion, for all recordings of the command.
+        carried: labels of the payloads that the arm carries.
+
+    Raises:
+        UsageError: if there is no such recording.
+    """
     file = parse_cut(name)[0]
     for path, motion in motions.items():
         if path == name or Path(parse_cut(path)[0]).name == file:
@@ -202,7 +240,7 @@ def _case(
 
 
 def _poor_gains(gains: DriveGains) -> list[str]:
-    """Return a note on gains with a large σ; [] if there are none."""
+    """Return a note for the user on gains with a large relative σ; an empty list if there are none."""
     joints = []
     for j, (gain, sigma) in enumerate(zip(gains.gains, gains.sigma)):
         if sigma > MAX_GAIN_SIGMA * abs(gain):

@@ -1,25 +1,26 @@
 """Benefit of the model as feedforward in a controller: simulated tracking errors on recorded motion.
 
-Without the real robot, a simulated one is used that needs the measured torque: it is the identified model, and the
-torque that the model left unexplained along the recording acts on it as a disturbance,
+The real robot is replaced by a simulated robot. Along the recorded motion, the simulated robot requires exactly the
+measured torque: it is the identified model, on which the torque not explained by the model acts as a disturbance,
 
-    M(q) a + … = tau + (tau_model(q_r, v_r, a_r) - tau_measured),    tau = feedback + feedforward,
+    M(q) a + … = tau + (tau_model(q_r, v_r, a_r) - tau_measured), tau = feedback + feedforward,
 
-with the recorded motion (filtered) as the reference. A robot that follows the reference needs tau = tau_measured. The
-feedforwards compared are: none; the robot's own inertias (CAD), without friction; the complete identified model; and
-the measured torque itself, whose error is the least that the control period allows. On motion that the model was not
-fitted to, its whole error acts as the disturbance, although the simulated robot is the model. The simulation does not
-contain disturbances that depend on the path (they are replayed by time), elastic joints, and further functions of the
-real controller. The noise of the torque sensors is replayed as a disturbance; feedback suppresses most of it.
+where the reference (q_r, v_r, a_r) is the filtered recorded motion. A robot that follows the reference needs exactly
+the torque tau_measured. Four feedforwards are compared: none; the inertias of the robot's description (CAD) without
+friction; the complete identified model; and the measured torque, whose tracking error is the least that the control
+period allows. On held-out motion, the whole model error acts as the disturbance, although the simulated robot is the
+model. The simulation does not contain disturbances that depend on the path (they are replayed by time), elastic joints,
+or additional functions of the real controller. The noise of the torque sensors is replayed as a disturbance; feedback
+suppresses most of it.
 
-Estimates are often physically inconsistent (a small wrist inertia is negative). Then the least sufficient motor inertia
-is added to the simulated robot and reported; along the reference the disturbance compensates it, so that it affects
-only how fast the feedback reacts. Likewise, sign functions too steep for so little inertia are smoothed over more
-speed.
+Estimates are often physically inconsistent (such as a small negative wrist inertia). Then the smallest sufficient motor
+inertia is added to the simulated robot and reported. Along the reference the disturbance compensates the added inertia,
+so that it affects only how fast the feedback reacts. Likewise, sign functions that are too steep for such a small
+inertia are smoothed over a wider range of velocities.
 
-Without a stated controller: PD with `FREQUENCY` and damping `DAMPING` on the model's mean inertia, as slow as robots'
-controllers are, so that the model's effect is visible. All of this is our choice; the criterion, tracking error with
-feedforward, is that of Kolyubin, Shiriaev & Jubien (2019, section 7).
+Without a stated controller, PD feedback with `FREQUENCY` and damping `DAMPING` on the model's mean inertia is used. It
+is as slow as usual robot controllers, so that the effect of the model is visible. All of this is our choice; the
+criterion, tracking error with feedforward, is from Kolyubin, Shiriaev & Jubien (2019, section 7).
 """
 
 from collections.abc import Mapping
@@ -60,20 +61,19 @@ def replay(
     controller: LoopController | None = None,
     rate: float | None = None,
 ) -> Replay:
-    """Return the tracking errors on a recorded motion with the feedforwards none, CAD model, model, and measured
-    torque.
+    """Return simulated tracking errors on a recorded motion with four kinds of feedforward torque.
 
     Args:
-        chain: arm with the CAD's inertias, if it has any.
+        chain: arm, with CAD inertias if its description has any.
         dynamics: the identified model, of motor torques (or of motor and link torques).
         case: the recording.
-        predicted: (N, rows) torques of the model along the case.
-        controller: the feedback, without its own feedforward torques; None: the default.
+        predicted: (N, rows) torques predicted by the model for the recording.
+        controller: the feedback; its feedforward torques are ignored; None: default controller.
         rate: rate of the controller [Hz]; None: see
             `calib.identification.closed_loop.loop_recordings.periods_per_sample`.
 
     Raises:
-        CalibError: if the torque rows are not those of the motors, or the loop is unstable.
+        CalibError: if the torque rows are not motor torques, or the control loop is unstable.
     """
     model = dynamics.model
     n = chain.n
@@ -108,14 +108,23 @@ def replay(
 
 
 def _stretch(case: Case) -> slice:
-    """Return the slice of the longest part without gaps, cut to `MAX_SECONDS`."""
+    """Return the index range of the longest part of a recording without gaps, at most `MAX_SECONDS` long.
+
+    Args:
+        case: the recording.
+    """
     first, last = max(segments(case.motion.segment), key=lambda ends: ends[1] - ends[0])
     return slice(first, min(last, first + int(MAX_SECONDS * case.motion.rate)))
 
 
 def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
-    """Return the model as a simulated robot with the case's payloads, and the names of terms that cannot be
-    simulated.
+    """Return the model as a simulated robot with the recording's payloads, and the names of omitted terms.
+
+    Drive terms that depend on neither velocity nor acceleration cannot be simulated and are omitted.
+
+    Args:
+        dynamics: the identified model.
+        case: the recording.
     """
     model = dynamics.model
     bodies, drives = dynamics.values[: model.inertial], dynamics.values[model.inertial :]
@@ -131,8 +140,11 @@ def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
 
 
 def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
-    """Return the recorded motion as a reference at the control rate [Hz], and the number of control periods per
-    sample.
+    """Return the recorded motion as a reference at the control rate, and the number of control periods per sample.
+
+    Args:
+        part: the recording.
+        rate: control rate [Hz]; None: derived from the recording.
     """
     motion = part.motion
     periods = periods_per_sample(motion, rate)
@@ -144,9 +156,10 @@ def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
 
 
 def _with_inertia(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray]:
-    """Return the robot with motor inertia added until M(q) is positive definite, and the added inertia (n,).
+    """Return the simulated robot with motor inertia added until M(q) is positive definite, and the added inertia (n,).
 
-    The least eigenvalue of M(q) along the reference, scaled by its diagonal, is raised to `MIN_EIGENVALUE`.
+    The smallest eigenvalue of the inertia matrix M(q) along the reference, scaled by the diagonal of M(q), is raised to
+    `MIN_EIGENVALUE`. The added inertia is in kg m² (prismatic joints: kg).
     """
     inertia = robot.inertia(reference.q[::50])
     diagonal = np.abs(np.einsum("kii->i", inertia)) / len(inertia)
@@ -164,7 +177,14 @@ def _with_inertia(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray
 
 
 def _smoothed(term: DriveTerm, value: float, size: np.ndarray, reference: Reference) -> DriveTerm:
-    """Return a drive term whose sign function is smooth enough to integrate at the control period of `reference`."""
+    """Return a drive term with its sign function smoothed enough for integration at the control period of `reference`.
+
+    Args:
+        term: the drive term.
+        value: coefficient of the term.
+        size: (n,) inertia of each joint.
+        reference: reference motion at the control rate.
+    """
     if "v0" not in term.form.settings:
         return term
     min_v0 = MIN_SMOOTHING * abs(value) * reference.period / size[term.acts[0][0]]
@@ -184,13 +204,14 @@ def track(
     predictions: Mapping[str, np.ndarray],
     controller: LoopController | None = None,
 ) -> tuple[dict[str, Replay], str]:
-    """Return the replays by recording, of unseen recordings or else of a training recording, and the reason if there
-    are none.
+    """Return the simulated tracking by recording, and the reason if none was simulated (otherwise an empty text).
+
+    Held-out recordings are simulated; without held-out recordings, the first training recording.
 
     Args:
         inputs: recordings and options; without a [loop] in the options, the default controller is used.
         dynamics: the model.
-        predictions: name of a recording → torques by the model.
+        predictions: name of a recording -> torques predicted by the model.
         controller: the identified controller, used if the options let the controller be identified; None: not
             identified.
     """

@@ -46,12 +46,12 @@ CHANCE_SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class Resting:
-    """Base parameters whose values are determined by a prior, not by the motion.
+    """Base parameters whose values are determined by a prior instead of the motion.
 
     Attributes:
         names: names of these parameters.
-        of: number of all base parameters.
-        source: source of the prior: ``cad`` or ``sizes``; empty without a prior.
+        of: number of base parameters in total.
+        source: source of the prior: ``cad`` or ``sizes``; empty: no prior.
     """
 
     names: tuple[str, ...] = ()
@@ -60,7 +60,7 @@ class Resting:
 
     @property
     def origin(self) -> str:
-        """Source of the prior's values, as text."""
+        """Text that names the source of the prior's values."""
         return "CAD values" if self.source == "cad" else "typical magnitudes of such parameters"
 
 
@@ -72,19 +72,23 @@ def judge(
     rows: Sequence[str] = (),
     coordinate: str = "joint",
 ) -> tuple[str, list[Finding]]:
-    """Return the torque errors on unseen motion as a sentence, and the findings that worsen the verdict.
+    """Return a sentence on the torque errors on held-out motion, and the findings that worsen the verdict.
 
-    Recordings in which the robot stands are ignored. The first list entry is the worst finding on the error of all
-    joints together, among ``motion-poor``, ``torque-unexplained``, ``training-torque-unexplained`` and
-    ``no-torque-transfer`` (the first of equals), or, without unseen motion, the reason why there is none.
-    ``joints-unexplained`` follows, since a total hides small joints.
+    Recordings that the scores mark as no evidence, since the robot stands or nearly stands, are ignored. The first
+    finding is the worst of ``motion-poor``,
+    ``torque-unexplained``, ``training-torque-unexplained`` and ``no-torque-transfer`` (on the error of all joints
+    together; the first one if several are equally bad). Without usable held-out motion, the first findings state the
+    training error and why there is no held-out motion. ``joints-unexplained`` follows, since a total hides joints with
+    small torques.
 
     Args:
-        fit, validation: scores by recording; validation without repeats of the training motion.
-        repeated: unseen recordings that repeat the training motion → share of their states found in the training.
-        excitation: name of a training recording → report on its motion.
-        rows: names of the torque rows, see `calib.dynamics.torque_rows.TorqueRows.numbered`; default 1, 2, ...
-        coordinate: noun for what a torque row belongs to.
+        fit: name of a training recording -> score.
+        validation: name of a held-out recording -> score, without recordings that repeat the training motion.
+        repeated: name of a held-out recording that repeats training motion -> share of its states that are also in the
+            training motion.
+        excitation: name of a training recording -> report on its motion.
+        rows: names of the torque rows, see `calib.dynamics.torque_rows.TorqueRows.numbered`; empty: 1, 2, ...
+        coordinate: noun for a torque row in messages, such as joint.
     """
     moving = {name: score for name, score in validation.items() if score.motion_share >= MOVES}
     training_error = max((score.judged.total for score in fit.values()), default=np.nan)
@@ -103,7 +107,10 @@ def judge(
         return figures, [*settle([training]), reason, *joints]
 
     name = max(moving, key=lambda recording: moving[recording].judged.total)
-    error = moving[name].judged.total
+    worst_score = moving[name]
+    error = worst_score.judged.total
+    # training and unseen motion are compared in the same frequencies
+    training_error = max((score.counted(worst_score.noisy).total for score in fit.values()), default=np.nan)
     totals = []
     if excitation and all(report.poor for report in excitation.values()):
         totals.append(finding("motion-poor"))
@@ -112,21 +119,37 @@ def judge(
     totals.append(training)
     times, most = error / max(training_error, 1e-300), limit("no-torque-transfer", "times", "marginal")
     totals.append(finding("no-torque-transfer", times=times, most=most))
-    figures = finding("torque-errors", unseen=error, file=name, own=training_error, rest=moving[name].at_rest)
+    figures = finding(
+        "torque-errors",
+        unseen=error,
+        file=name,
+        own=training_error,
+        rest=worst_score.at_rest,
+        band=worst_score.band,
+        all=worst_score.above_band,
+    )
     worst = settle(totals)[:1]
     return sentence(figures), [*worst, *joints]
 
 
 def friction_drives(joints: Iterable[object], payload: str = "") -> list[Finding]:
-    """Return the finding that friction of joints adds energy, [] without joints; `payload`: label of a possible
-    payload.
+    """Return a finding if the friction of some joints adds energy; an empty list without joints.
+
+    Args:
+        joints: names or numbers of the joints.
+        payload: label of a payload that could be the cause; empty: none.
     """
     names = list(map(str, joints))
     return [finding("friction-drives", joints=names, payload=payload)] if names else []
 
 
 def with_duration(verdict: Verdict, excitation: Mapping[str, ExcitationReport]) -> Verdict:
-    """Return the verdict; if it is not pass and the training motion is too short, its reason begins with this cause."""
+    """Return the verdict; if it is not pass and the training motion is too short, the reason begins with this cause.
+
+    Args:
+        verdict: the verdict.
+        excitation: name of a training recording -> report on its motion.
+    """
     seconds = sum(report.seconds for report in excitation.values())
     if verdict.level == "pass" or not excitation or seconds >= MIN_MOTION:
         return verdict
@@ -135,10 +158,15 @@ def with_duration(verdict: Verdict, excitation: Mapping[str, ExcitationReport]) 
 
 
 def _joints(scores: Mapping[str, Score], rows: Sequence[str], coordinate: str) -> list[Finding]:
-    """Return the finding on joints whose torque the model does not explain.
+    """Return a finding on joints whose torque the model does not explain; an empty list if there are none.
 
-    The error is taken in the identification band, since noise is not an error of the model, and while the joint moves,
+    The error is computed in the identification band, since noise is not a model error, and for moving joints only,
     since friction at rest can take any value.
+
+    Args:
+        scores: name of a held-out recording -> score.
+        rows: names of the torque rows; empty: 1, 2, ...
+        coordinate: noun for a torque row in messages, such as joint.
     """
     threshold = limit("joints-unexplained", "worst", "marginal")
     unexplained: dict[int, float] = {}
@@ -161,10 +189,12 @@ def _joints(scores: Mapping[str, Score], rows: Sequence[str], coordinate: str) -
 
 
 def too_narrow(expected: Mapping[str, TorqueIntervals], rows: Sequence[str]) -> list[Finding]:
-    """Return the finding on the first unseen recording with errors outside their intervals more often than by chance.
+    """Return a finding on the first held-out recording whose torque errors exceed their 95 % intervals too often.
+
+    An empty list if no recording has more such errors than chance allows.
 
     Args:
-        expected: name of an unseen recording → intervals of its torque errors.
+        expected: name of a held-out recording -> intervals of its torque errors.
         rows: names of the torque rows.
     """
     for name, intervals in expected.items():
@@ -178,7 +208,12 @@ def too_narrow(expected: Mapping[str, TorqueIntervals], rows: Sequence[str]) -> 
 
 
 def extrapolates(name: str, expected: TorqueIntervals | None) -> list[Finding]:
-    """Return the finding on a recording whose motion leaves the training range; [] if it does not, or if unknown."""
+    """Return a finding if the motion of a recording leaves the range of the training motion; otherwise an empty list.
+
+    Args:
+        name: name of the recording.
+        expected: expected torque errors, which state where the model extrapolates; None: unknown, an empty list.
+    """
     if expected is None:
         return []
     share = float(expected.beyond.mean())
@@ -190,7 +225,12 @@ def extrapolates(name: str, expected: TorqueIntervals | None) -> list[Finding]:
 
 
 def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
-    """Return the verdict, with a remark if most parameters are determined by a prior instead of the motion."""
+    """Return the verdict, with a remark if a prior determines more than half of the parameters.
+
+    Args:
+        verdict: the verdict.
+        rests: the parameters that the prior determines.
+    """
     if 2 * len(rests.names) <= rests.of:
         return verdict
     remark = finding("mostly-prior", count=len(rests.names), parameters=rests.of, source=rests.origin)
@@ -198,8 +238,12 @@ def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
 
 
 def motion_findings(validation: Mapping[str, Score], repeated: Mapping[str, float]) -> list[Finding]:
-    """Return the findings on recordings that repeat the training motion, or in which the robot stands; for any
-    robot.
+    """Return findings on held-out recordings that repeat the training motion, or in which the robot does not move.
+
+    Args:
+        validation: name of a held-out recording -> score of the model.
+        repeated: name of a held-out recording that repeats training motion -> share of its states that are also in the
+            training motion.
     """
     findings = [finding("repeats-training", file=name, share=share) for name, share in repeated.items()]
     standing = [name for name, score in validation.items() if score.motion_share < MOVES]
@@ -208,12 +252,23 @@ def motion_findings(validation: Mapping[str, Score], repeated: Mapping[str, floa
 
 
 def excitation_notes(excitation: Mapping[str, ExcitationReport]) -> list[str]:
-    """Return remarks on what the training motion cannot identify, by file."""
+    """Return remarks on parameters that the training motions cannot identify.
+
+    Each begins with the name of the recording.
+
+    Args:
+        excitation: name of a training recording -> report on its motion.
+    """
     return [f"{name}: {note}" for name, report in excitation.items() for note in report.notes]
 
 
 def model_findings(cases: Sequence[Case], identification: Identification) -> tuple[Finding, ...]:
-    """Return the findings on the model and its training motion, independent of unseen motion."""
+    """Return the findings on the model and its training motion that do not depend on held-out motion.
+
+    Args:
+        cases: training recordings.
+        identification: the identification.
+    """
     return (
         *parameter_findings(identification),
         *identification.loop.findings,
@@ -223,7 +278,11 @@ def model_findings(cases: Sequence[Case], identification: Identification) -> tup
 
 
 def parameter_findings(identification: Identification[RegressorModel]) -> tuple[Finding, ...]:
-    """Return the findings on the parameters, for any robot: condition, bounds, signs, prior."""
+    """Return findings on the parameters of any robot: condition number, bounds, signs, and prior.
+
+    Args:
+        identification: the identification.
+    """
     removed = []
     if identification.elimination is not None:
         steps = sorted(identification.elimination.steps, key=lambda step: -step.f)
@@ -251,7 +310,12 @@ def parameter_findings(identification: Identification[RegressorModel]) -> tuple[
 
 
 def beyond(case: Case, chain: Chain) -> list[Finding]:
-    """Return the finding on joints that a recording moves far beyond the robot's limits."""
+    """Return a finding on joints that move far beyond their limits in a recording; otherwise an empty list.
+
+    Args:
+        case: the recording.
+        chain: the arm with its joint limits.
+    """
     q = np.asarray(case.motion.q)
     excess = np.maximum(chain.lower - q.min(axis=0), q.max(axis=0) - chain.upper)
     tolerance = BEYOND * (chain.upper - chain.lower)
@@ -263,7 +327,11 @@ def beyond(case: Case, chain: Chain) -> list[Finding]:
 
 
 def resting_parameters(identification: Identification[RegressorModel]) -> Resting:
-    """Return the base parameters that the motion does not identify."""
+    """Return the base parameters that are determined by the prior because the motion does not identify them.
+
+    Args:
+        identification: the identification with its prior.
+    """
     count, prior = identification.base.b, identification.prior
     if prior is None:
         return Resting(of=count)
@@ -273,7 +341,11 @@ def resting_parameters(identification: Identification[RegressorModel]) -> Restin
 
 
 def _negative(identification: Identification[RegressorModel]) -> list[Finding]:
-    """Return the finding on drive inertias and friction parameters that are negative by more than `SURELY` σ."""
+    """Return a finding on drive inertias and friction parameters that are negative by more than `SURELY` σ, if any.
+
+    Args:
+        identification: the identification.
+    """
     estimate = identification.fitted.estimate
     names = []
     for name, term, value, sigma in zip(identification.names, identification.terms, estimate.values, estimate.sigma):
@@ -283,24 +355,38 @@ def _negative(identification: Identification[RegressorModel]) -> list[Finding]:
 
 
 def _payload_masses(identification: Identification[RegressorModel]) -> Iterable[Finding]:
-    """Yield findings on payloads whose identified mass is not positive, or not the stated one."""
+    """Yield findings on payloads whose identified mass is not positive, or not the stated one.
+
+    Args:
+        identification: the identification with identified payloads.
+    """
     estimate = identification.fitted.estimate
     masses = dict(zip(identification.base.names, zip(estimate.values, estimate.sigma)))
     for label, payload in identification.settings.payloads.items():
         if f"M{label}" not in masses:
             continue
         mass, sigma = masses[f"M{label}"]
-        if mass < -SURELY_ABSENT * sigma:
+        doubt = SURELY_ABSENT * sigma
+        stated_mass = payload.mass
+        if stated_mass is not None and abs(mass - stated_mass) <= doubt:
+            continue
+        if mass < -doubt:
             yield finding("payload-exchanged", label=label, mass=mass, sigma=sigma)
-        elif mass < SURELY_ABSENT * sigma:
+        elif mass < doubt:
             yield finding("payload-absent", label=label, mass=mass, sigma=sigma)
-        elif payload.mass is not None and abs(mass - payload.mass) > SURELY_ABSENT * sigma:
-            off = abs(mass - payload.mass) / payload.mass
-            yield finding("payload-mass", label=label, mass=mass, sigma=sigma, stated=payload.mass, off=off)
+        elif stated_mass is not None:
+            off = abs(mass - stated_mass) / stated_mass
+            yield finding("payload-mass", label=label, mass=mass, sigma=sigma, stated=stated_mass, off=off)
 
 
 def _unmodelled(identification: Identification) -> list[Finding]:
-    """Return the finding on joints with autocorrelated residuals, whose σ are valid for this motion only."""
+    """Return a finding on joints with autocorrelated residuals, if any.
+
+    The σ of these joints' parameters are valid for the recorded motion only.
+
+    Args:
+        identification: the identification.
+    """
     inflation = np.nan_to_num(identification.fitted.inflation)
     rows = identification.settings.torque_rows.numbered(identification.dynamics.model.n)
     correlated = np.flatnonzero(inflation >= MAX_CORRELATED_ROWS)
@@ -309,7 +395,11 @@ def _unmodelled(identification: Identification) -> list[Finding]:
 
 
 def _elastic(cases: Sequence[Case]) -> Iterable[Finding]:
-    """Yield the findings on joints whose second encoders show elasticity."""
+    """Yield a finding for each recording with second encoders that show joint elasticity.
+
+    Args:
+        cases: training recordings.
+    """
     for case in cases:
         if case.motion.q_link is None:
             continue

@@ -73,7 +73,10 @@ Numbers = Annotated[tuple[float, ...], Expect("a list of finite numbers")]
 
 @dataclass(frozen=True)
 class _JointTable:
-    """Entry ``[[joint]]`` of ``trajectory.toml``: a joint's coefficients, see the module."""
+    """Entry ``[[joint]]`` of ``trajectory.toml``: coefficients of one joint.
+
+    The module's docstring explains the keys.
+    """
 
     name: Name
     kind: Text = "revolute"
@@ -85,7 +88,7 @@ class _JointTable:
 
 @dataclass(frozen=True)
 class TrajectoryFile:
-    """Content of ``trajectory.toml``; keys that are not fields here are ignored."""
+    """Content of ``trajectory.toml``; keys of the file that are not fields of this class are ignored."""
 
     family: Annotated[str, OneOf(("fourier", "bspline"))]
     period: Positive
@@ -97,15 +100,15 @@ class TrajectoryFile:
 
 @dataclass(frozen=True, eq=False)
 class Periodic:
-    """A periodic motion, defined by its coefficients: eq. 23 of Kolyubin et al. 2019, or control points.
+    """A periodic motion, defined by the coefficients of a Fourier series or of a spline.
 
     Attributes:
-        joint_names, kinds: names (n) and types (revolute, prismatic) of the joints.
+        joint_names, kinds: (n,) names and kinds (revolute, prismatic) of the joints.
         period: duration of a period [s].
         rate: rate of the controller [Hz].
         repeat: planned number of periods.
         kind: family of motions: fourier or bspline.
-        coefficients: per joint, q0, a, b of a Fourier series, or control points of a spline.
+        coefficients: for each joint, q0, a, b of a Fourier series, or control points of a spline [rad or m].
         degree: degree of splines.
     """
 
@@ -119,7 +122,7 @@ class Periodic:
     degree: int = 5
 
     def orders(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return positions, velocities and accelerations q, v, a (N, n) at times [s]."""
+        """Return positions, velocities and accelerations q, v, a, each (N, n), at times (N,) [s]."""
         if self.kind == "fourier":
             q, v, a = (evaluate(self.coefficients, self.period, times, order) for order in range(3))
             return q, v, a
@@ -131,7 +134,13 @@ class Periodic:
 
 
 def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, object]:
-    """Return the content of ``trajectory.toml`` for a motion; `limits`: text lines on its limits."""
+    """Return the content of ``trajectory.toml`` for a motion.
+
+    Args:
+        motion: the motion.
+        robot: name of the robot.
+        limits: lines of text on the limits of the motion.
+    """
     fourier = motion.kind == "fourier"
     content: dict[str, object] = {
         "robot": robot,
@@ -158,7 +167,7 @@ def table(motion: Periodic, robot: str, limits: Sequence[str]) -> dict[str, obje
 
 
 def read(folder: Path) -> Periodic:
-    """Return the periodic motion stored in a folder of `calib excite`.
+    """Return the periodic motion in a folder that `calib excite` wrote.
 
     Raises:
         UsageError: if the file is missing or damaged.
@@ -187,7 +196,15 @@ def read(folder: Path) -> Periodic:
 
 
 def _spline_points(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
-    """Return the control points of each joint's spline; refuse a joint without points."""
+    """Return the control points of each joint's spline.
+
+    Args:
+        content: content of ``trajectory.toml``.
+        path: the file, for messages.
+
+    Raises:
+        UsageError: for a joint without control points.
+    """
     coefficients = []
     for number, joint in enumerate(content.joint, 1):
         if joint.points is None:
@@ -197,28 +214,36 @@ def _spline_points(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
 
 
 def _fourier_coefficients(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
-    """Return [q0, a, b] of each joint as one array; refuse joints with different numbers of harmonics."""
-    count = len(content.joint[0].a or ())
+    """Return [q0, a, b] of each joint as one array; only [q0] for a locked joint.
+
+    Args:
+        content: content of ``trajectory.toml``.
+        path: the file, for messages.
+
+    Raises:
+        UsageError: for a joint with another number of harmonics.
+    """
+    count = max(len(joint.a or ()) for joint in content.joint)
     coefficients = []
     for number, joint in enumerate(content.joint, 1):
         where = f"{path}: [[joint]] number {number}"
         if joint.q0 is None or joint.a is None or joint.b is None:
             raise UsageError(f"{where}: family fourier needs q0, a and b")
-        if not len(joint.a) == len(joint.b) == count:
-            raise UsageError(f"{where}: a and b need {count} values each, as many as joint 1's a")
+        if not len(joint.a) == len(joint.b) or len(joint.a) not in (0, count):
+            raise UsageError(f"{where}: a and b need {count} values each, as many as those of the other joints")
         coefficients.append(np.array([joint.q0, *joint.a, *joint.b], dtype=float))
     return coefficients
 
 
 @dataclass(frozen=True, eq=False)
 class AveragedMotion:
-    """Average of the periods of a designed motion in a log.
+    """A designed motion found in a log and averaged over its periods.
 
     Attributes:
         motion: the designed motion.
         file: the log.
         found: samples of the log that contain the motion.
-        averages: series of the recording (q, effort, v, ...) → mean and variance over the periods.
+        averages: series of the recording (q, effort, v, ...) -> mean and variance over the periods.
         kind: kind of the effort: torque or current.
         rate: sampling rate [Hz]; a period has a whole number of samples.
         following: (n,) rms of measured minus commanded positions, after the best shift by whole samples [rad or m].
@@ -234,16 +259,22 @@ class AveragedMotion:
 
 
 def inputs(folder: Path, log: str) -> list[str | Path]:
-    """Return the files that `find` reads; no output may overwrite them."""
+    """Return the files and folders that `find` reads, which no output may overwrite.
+
+    Args:
+        folder: folder of the designed motion.
+        log: the recording.
+    """
     return [folder, folder / NAME, folder / METRICS, log]
 
 
 def find(folder: Path, log: str, skip: int = 0) -> AveragedMotion:
-    """Return the motion designed in `folder`, located in a log and averaged over its periods.
+    """Return the designed motion of a folder, located in a log and averaged over its periods.
 
     Args:
-        log: a recording, with a cut if wanted (``log.npz@0:90``).
-        skip: whole periods to leave out at the beginning: transients, a robot that warms up.
+        folder: folder that `calib excite` wrote.
+        log: a recording, with an optional cut (``log.npz@0:90``).
+        skip: number of whole periods to omit at the beginning, such as transients or warming up.
 
     Raises:
         UsageError, MeasurementError: for an unreadable folder or log, and if the log does not contain the motion.
@@ -273,7 +304,12 @@ def find(folder: Path, log: str, skip: int = 0) -> AveragedMotion:
 
 
 def write(averaged: AveragedMotion, out: Path) -> Path:
-    """Write one averaged period as a recording: CSV, or an archive with variances."""
+    """Write one averaged period as a recording, and return the path.
+
+    Args:
+        averaged: the averaged motion.
+        out: a CSV file, or a NumPy archive, which also contains the variances.
+    """
     averages, motion = averaged.averages, averaged.motion
     letters = HEADERS | {"q": "q", "v": "v", "effort": "tau" if averaged.kind == "torque" else "current"}
     t = np.arange(averaged.found.period) / averaged.rate
@@ -296,7 +332,11 @@ def write(averaged: AveragedMotion, out: Path) -> Path:
 
 
 def lines(averaged: AveragedMotion) -> list[str]:
-    """Return the lines that `calib recall` prints: periods, their agreement, noise of each joint."""
+    """Return the lines that `calib recall` prints: number of periods, their agreement, and noise of each joint.
+
+    Args:
+        averaged: the averaged motion.
+    """
     recalled, averages, motion = averaged.found, averaged.averages, averaged.motion
     start = recalled.start / averaged.rate
     unit = motion_units(motion.kinds)[0]
@@ -316,7 +356,14 @@ def lines(averaged: AveragedMotion) -> list[str]:
 
 
 def _longest(recording: Recording, period: float) -> tuple[float, dict[str, np.ndarray]]:
-    """Return rate and series of the longest part without gaps, with a whole number of samples per period."""
+    """Return sampling rate [Hz] and series of a recording's longest part without gaps.
+
+    The recording is resampled so that one period of the motion has a whole number of samples.
+
+    Args:
+        recording: the recording.
+        period: period of the motion [s].
+    """
     recorded_rate = 1.0 / float(np.median(np.diff(recording.t)))
     rate = max(1, round(period * recorded_rate)) / period
     sampled = resample(recording, rate=rate)

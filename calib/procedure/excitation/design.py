@@ -1,4 +1,7 @@
-"""Design of exciting motions: passes a robot's regressor and limits to the package `trajectories`."""
+"""Design of exciting motions for identification, by the optimisation in the package `trajectories`.
+
+This module supplies a robot's regressor and limits to the optimisation.
+"""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -12,6 +15,7 @@ from calib.config import Tables
 from calib.dynamics.load_cases import LoadCases
 from calib.errors import UsageError
 from calib.identification.settings import IdentificationSettings
+from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.excited_model import ExcitedModel
 from calib.procedure.excitation.goals import GUARD, missed, objectives_of, read_goals, torque_slack, wrist
 from calib.procedure.excitation.inputs import ExcitationInputs, read_inputs
@@ -19,6 +23,7 @@ from calib.procedure.excitation.limits import MotionLimits, located
 from calib.procedure.excitation.playback import Playback, check_start, play
 from calib.procedure.excitation.prediction import MotionOutlook, PredictedSigma, foretell
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings, split_goal
+from calib.procedure.excitation.stored_front import StoredFront, as_search_result
 from calib.robot.calibrated import CalibratedChain
 from calib.trajectories.basis import Family
 from calib.trajectories.bspline import bspline_family
@@ -38,9 +43,9 @@ from calib.workers import finishing
 class DesignCondition:
     """Condition numbers of the observation matrix: raw (SI units), and normalised (columns of unit norm).
 
-    With earlier motions, `raw` and `normalised` are those of all motions together, `…_alone` those of the new motion,
-    and `…_before` those of the earlier motions; None without earlier motions, or where the columns are not all
-    determined.
+    With earlier motions, `raw` and `normalised` apply to all motions together, `…_alone` to the new motion, and
+    `…_before` to the earlier motions. `…_alone` and `…_before` are None without earlier motions, or if the motions by
+    themselves do not determine all columns.
     """
 
     raw: float
@@ -51,13 +56,20 @@ class DesignCondition:
     normalised_before: float | None = None
 
     def table(self) -> dict[str, float]:
-        """Return the values as the entry ``condition_number`` of ``metrics.json``."""
+        """Return the entry ``condition_number`` of ``metrics.json``: name of a condition number -> value.
+
+        Values that are None are omitted.
+        """
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 Progress = Callable[[str], None]
 Search = Callable[..., SearchResult]
 
+# relative difference of periods that comes from rounding to samples
+PERIOD_ROUNDING = 0.01
+# degree of splines, where a family does not state it
+DEFAULT_DEGREE = 5
 # over the period, at which condition numbers are reported
 INSTANTS = 1000
 # index evaluations of the search for the ends of a front of trade-offs
@@ -66,20 +78,23 @@ END_EVALUATIONS = 300
 
 @dataclass(frozen=True, eq=False)
 class Designed:
-    """A designed exciting motion, with its inputs, goals reached, and verified margins to the limits.
+    """A designed exciting motion, with its inputs, reached goals, and verified margins to the limits.
 
     Attributes:
         inputs, settings: inputs and settings of the design.
         problem: optimisation problem that was solved last, with the family of motions.
         found: the motion.
-        proof: margins of the motion to the limits, checked independently.
+        proof: margins of the motion to the limits, checked independently of the optimisation.
         condition: condition numbers at `INSTANTS` samples over the period, without additional smoothing of Coulomb
             friction.
-        goals: stated goals: name, requested value, weight, and reached value (by `exact` of the inputs' model).
+        goals: stated goals: name, requested value, weight, and value reached without additional smoothing of friction.
         front: trade-offs between goals; None if not requested.
+        stored_front: the front with its motions, as the folder keeps it; None without a front.
         playback: setpoints for the controller.
         notes: remarks for the user.
-        outlook: prediction of what the motion identifies; None without torque limits, from which torque errors are
+        doubts: those `notes` that are on goals which are missed, or whose value depends on assumed typical friction.
+        outlook: predicted accuracy of the parameters and torques that the motion identifies; None without torque
+            limits, from which torque errors are
             assumed.
         predicted: predicted σ of the parameters; empty without `outlook`.
     """
@@ -96,6 +111,12 @@ class Designed:
     notes: tuple[str, ...]
     outlook: MotionOutlook | None = None
     predicted: Sequence[PredictedSigma] = ()
+    stored_front: StoredFront | None = None
+    doubts: tuple[str, ...] = ()
+
+    def periodic(self, motion: SearchResult) -> Periodic:
+        """Return a result of the search as a periodic motion."""
+        return _periodic(motion, self.inputs, self.settings, self.family)
 
     @property
     def family(self) -> Family:
@@ -103,12 +124,12 @@ class Designed:
 
     @property
     def period(self) -> float:
-        """The motion's period [s]."""
+        """Period of the motion [s]."""
         return self.family.period * self.found.factor
 
     @property
     def locked(self) -> dict[str, float]:
-        """Positions of the locked joints, by joint name [rad or m]."""
+        """Positions of the locked joints: joint name -> value [rad or m]."""
         last = self.playback.run.q[-1]
         return {self.inputs.chain.joint_names[j]: float(last[j]) for j in self.inputs.locked}
 
@@ -123,27 +144,32 @@ def excite(
     tip: str | None = None,
     options: IdentificationSettings | None = None,
     after: Path | None = None,
+    picked: StoredFront | None = None,
     map: Callable = map,
     progress: Progress | None = None,
 ) -> Designed:
     """Design a motion that excites the dynamics of a robot within its limits.
 
     Without goals, the logarithms of both condition numbers, raw and normalised, are minimised with equal weights; an
-    aim such as ``logdet`` replaces them. With goals (``wrist=0.1``), the condition numbers become goals, too: their
-    goal values are those reached by a first single-objective search (the study's advice), unless the settings state
-    them.
+    aim such as ``logdet`` replaces them. With goals (``wrist=0.1``), the condition numbers become goals, too. Unless
+    the settings state their goal values, these are the values reached in a first search for the condition numbers alone
+    (as Kolyubin et al. 2019 advise).
+
+    Ctrl-C ends the search; the best motion found until then is verified and returned.
 
     Args:
-        robot, base, tip: see `calib.robot.library`.
-        settings: see `calib.procedure.excitation.settings`.
-        model: folder of an identification: torques, friction and their uncertainty.
-        limits: see `calib.procedure.excitation.limits`.
-        options: options of the identification that will follow: torque rows, drive terms, payloads.
-        after: folder of an identification whose recordings the motion shall complement; replaces `model`.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
+        settings: goals, period, family of motions, search and playback.
+        model: folder of an identification, from which torques, friction and their uncertainty are taken; None: no
+            identification.
+        limits: limits file (`calib formats limits`), or its content as tables; None: limits of the robot's description.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
+        options: options of the identification that will follow (torque rows, drive terms, payloads); None: defaults.
+        after: folder of an identification whose recordings the motion shall complement; replaces `model`; None: none.
+        picked: front of an earlier design with the same settings, whose designed motion is taken instead of a search;
+            None: search.
         map: function that runs the starts of the search, possibly in parallel (`calib.workers`).
-        progress: called with the name of each step; None: silent.
-
-    Ctrl-C ends the search; the best motion found so far is verified and returned.
+        progress: called with a text on each step; None: silent.
 
     Raises:
         UsageError, MeasurementError: for a file that cannot be read, or belongs to another robot.
@@ -151,19 +177,32 @@ def excite(
     """
     inputs = read_inputs(robot, settings, model, limits, base, tip, options, after)
     try:
-        return search_motion(inputs, settings, map, progress)
+        return search_motion(inputs, settings, map, progress, picked)
     except NothingFeasible as error:
         raise located(error) from error
 
 
 def _silent(stage: str) -> None:
-    """Show no progress."""
+    """Ignore a progress text, `stage`."""
 
 
 def search_motion(
-    inputs: ExcitationInputs, settings: ExcitationSettings, map: Callable = map, progress: Progress | None = None
+    inputs: ExcitationInputs,
+    settings: ExcitationSettings,
+    map: Callable = map,
+    progress: Progress | None = None,
+    picked: StoredFront | None = None,
 ) -> Designed:
-    """Search for an exciting motion of an arm, or, for a parallel robot, of the platform's coordinates."""
+    """Search for an exciting motion of an arm, or, for a parallel robot, of the platform's coordinates.
+
+    Args:
+        inputs: robot, model, limits and earlier motions.
+        settings: settings of the design.
+        map: function that runs the starts of the search, possibly in parallel.
+        progress: called with a text on each step; None: silent.
+        picked: front of an earlier design, whose designed motion is verified and taken instead of a search; None:
+            search.
+    """
     show = progress or _silent
 
     def report(number: int, total: int, stage: str) -> None:
@@ -180,18 +219,24 @@ def search_motion(
     search = partial(
         design, evaluations=settings.evaluations, method=settings.solver, seed=settings.seed, map=map, report=report
     )
-    motion, problem = _searched(problem, goals, settings.starts, search, show)
+    if picked is None:
+        motion, problem = _searched(problem, goals, settings.starts, search, show)
+    else:
+        motion, problem = _picked(problem, goals, picked, inputs, settings)
+    proposed = motion
 
     show("verifying")
     motion, problem = _with_whole_samples(motion, problem, settings.rate)
     with finishing():
         motion, proof = ensured(problem, motion, checked)
-    front = None
-    if settings.front and not motion.interrupted:
+    stored = picked
+    if picked is None and settings.front and not motion.interrupted:
         # the motion exists: what follows may be cut short
         with suppress(KeyboardInterrupt):
             front = _front(problem, inputs, motion, goals, settings.front, settings.evaluations, report)
-            front, motion, proof = _nearest_goals(front, problem, goals, inputs, (motion, proof), checked)
+            front, nearest, nearest_proof = _nearest_goals(front, problem, goals, inputs, (motion, proof), checked)
+            motions = [_periodic(result, inputs, settings, problem.family) for result in front.found]
+            motion, proof, stored = nearest, nearest_proof, StoredFront(front, tuple(motions))
     with finishing():
         playback = play(problem.family, motion, inputs, settings)
         condition_numbers = _condition_of(inputs, problem.family, motion, settings.repeat)
@@ -205,6 +250,8 @@ def search_motion(
     if goals and not problem.goals:
         goal_notes = ("interrupted before any motion met the goals",)
     goal_notes += missed(goals, values, inputs)
+    if picked is not None and not np.allclose(motion.x, proposed.x):
+        goal_notes += ("the motion of the front did not keep all limits between its samples, and was changed",)
     reached = []
     for goal, value in zip(goals, values):
         name, number = split_goal(goal.words)
@@ -217,19 +264,83 @@ def search_motion(
         proof=proof,
         condition=condition_numbers,
         goals=tuple(reached),
-        front=front,
+        front=None if stored is None else stored.values,
         playback=playback,
         notes=(*inputs.limits.notes, *inputs.model.notes, *notes, *inputs.columns.notes, *goal_notes, *playback.notes),
         outlook=outlook,
         predicted=predicted,
+        stored_front=stored,
+        doubts=goal_notes,
+    )
+
+
+def _picked(
+    problem: ExcitationProblem,
+    goals: Sequence[AttainmentGoal],
+    front: StoredFront,
+    inputs: ExcitationInputs,
+    settings: ExcitationSettings,
+) -> tuple[SearchResult, ExcitationProblem]:
+    """Return the designed motion of a front, and the problem with the goals.
+
+    Args:
+        problem: the optimisation problem.
+        goals: the goals; empty: none.
+        front: front of an earlier design with the same settings.
+        inputs: robot and model.
+    """
+    stored, chain = front.designed, inputs.chain
+    if stored.joint_names != chain.joint_names:
+        joints, expected = ", ".join(stored.joint_names), ", ".join(chain.joint_names)
+        raise UsageError(f"the front is of a robot with the joints {joints}; {chain.name} has {expected}")
+    shortest, longest = problem.stretch
+    factor = stored.period / problem.family.period
+    same_period = shortest * (1.0 - PERIOD_ROUNDING) <= factor <= longest * (1.0 + PERIOD_ROUNDING)
+    if not same_period or (stored.kind, stored.rate) != (settings.family, settings.rate):
+        made = f"{stored.kind}, {stored.period:g} s at {stored.rate:g} Hz"
+        asked = f"{settings.family}, {settings.period:g} s at {settings.rate:g} Hz"
+        raise UsageError(f"the front's motions are {made}, the settings say {asked}; give the same, or design it again")
+    motion = as_search_result(front.designed, problem.family)
+    if goals:
+        problem = replace(problem, goals=tuple(goals))
+    dense = dense_motion(problem.family, motion.x, _instants(problem.family, motion), motion.factor)
+    regressor = inputs.model.exact.regressor(dense.q, dense.v, dense.a)
+    return replace(motion, merit=merit(problem, exact_values(problem, dense, regressor))), problem
+
+
+def _periodic(motion: SearchResult, inputs: ExcitationInputs, settings: ExcitationSettings, family: Family) -> Periodic:
+    """Return a result of the search as a periodic motion.
+
+    Args:
+        motion: the result of the search.
+        inputs: the robot, which names the joints.
+        settings: settings of the design, with the controller's rate.
+        family: family of motions of the search.
+    """
+    return Periodic(
+        joint_names=inputs.chain.joint_names,
+        kinds=tuple(joint.kind for joint in inputs.chain.joints),
+        period=family.period * motion.factor,
+        rate=settings.rate,
+        repeat=settings.repeat,
+        kind=settings.family,
+        coefficients=tuple(family.coefficients(motion.x)),
+        degree=getattr(family, "degree", DEFAULT_DEGREE),
     )
 
 
 def _reached(
     problem: ExcitationProblem, goals: Sequence[AttainmentGoal], result: SearchResult, inputs: ExcitationInputs
 ) -> tuple[float, ...]:
-    """Return the goals' values (one per goal) that a motion reaches at `INSTANTS`, without smoothing of Coulomb
-    friction.
+    """Return the value of each goal that a motion reaches at `INSTANTS` samples.
+
+    Coulomb friction is not smoothed additionally.
+
+    Args:
+        problem: the optimisation problem.
+        goals: the goals.
+        result: the motion.
+        inputs: robot and model.
     """
     if not goals:
         return ()
@@ -254,8 +365,14 @@ def _instants(family: Family, motion: SearchResult) -> np.ndarray:
 def _excitation_problem(
     inputs: ExcitationInputs, settings: ExcitationSettings
 ) -> tuple[ExcitationProblem, tuple[MotionConstraint, ...], tuple[str, ...]]:
-    """Return the optimisation problem (objectives, limits, family), the constraints to verify, and notes for the
-    user.
+    """Return the optimisation problem of a design, the constraints for its verification, and notes for the user.
+
+    Args:
+        inputs: robot, model, limits and earlier motions.
+        settings: settings of the design.
+
+    Raises:
+        UsageError: for a shortest period above the period.
     """
     constraints, checked, notes = _constraints(inputs.model, inputs.limits)
     condition = _condition_objective(inputs, settings)
@@ -280,7 +397,13 @@ def _excitation_problem(
 def _with_whole_samples(
     motion: SearchResult, problem: ExcitationProblem, rate: float
 ) -> tuple[SearchResult, ExcitationProblem]:
-    """Return (motion, problem), both with the period rounded to whole controller samples."""
+    """Return motion and problem with the period increased to a whole number of controller samples.
+
+    Args:
+        motion: result of the search.
+        problem: the optimisation problem.
+        rate: rate of the controller [Hz].
+    """
     if not problem.free_period:
         return motion, problem
     samples = problem.family.period * rate
@@ -289,7 +412,12 @@ def _with_whole_samples(
 
 
 def _condition_objective(inputs: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
-    """Return the objective: condition number of the identifiable columns, including earlier motions."""
+    """Return the condition number of the identifiable columns as an objective, including earlier motions.
+
+    Args:
+        inputs: robot, model and earlier motions.
+        settings: settings of the design.
+    """
     existing = None
     if inputs.prior is not None:
         existing = inputs.prior.per_sample(settings.samples, settings.repeat * settings.period)
@@ -300,8 +428,17 @@ def _condition_objective(inputs: ExcitationInputs, settings: ExcitationSettings)
 def _searched(
     problem: ExcitationProblem, goals: Sequence[AttainmentGoal], starts: int, search: Search, show: Progress
 ) -> tuple[SearchResult, ExcitationProblem]:
-    """Return the motion and the problem solved; if goals need it, a first search sets the condition numbers' goal
-    values.
+    """Return the motion that a search finds, and the optimisation problem that was solved.
+
+    If there are goals, but none for the condition numbers, a first search without goals determines the goal values of
+    the condition numbers.
+
+    Args:
+        problem: the optimisation problem.
+        goals: the goals; empty: none.
+        starts: number of random starts.
+        search: function that searches for the best motion of a problem.
+        show: called with a text on each step.
     """
     has_condition_goal = any(isinstance(goal.objective, Excitation) for goal in goals)
     if not goals or has_condition_goal:
@@ -327,8 +464,11 @@ def _searched(
 def _condition_of(inputs: ExcitationInputs, family: Family, result: SearchResult, repeat: int = 1) -> DesignCondition:
     """Return the condition numbers at `INSTANTS` samples over the period, without smoothing of Coulomb friction.
 
-    With earlier motions they are those of all motions together; `…_alone` and `…_before` are those of the new motion
-    and of the earlier motions by themselves.
+    Args:
+        inputs: robot, model and earlier motions.
+        family: family of motions.
+        result: the motion.
+        repeat: number of periods that are run.
     """
     columns = inputs.columns
     motion = dense_motion(family, result.x, _instants(family, result), result.factor)
@@ -350,15 +490,23 @@ def _condition_of(inputs: ExcitationInputs, family: Family, result: SearchResult
 
 
 def _finite(condition: float) -> float | None:
-    """Return a condition number; None where a motion by itself does not determine all columns."""
+    """Return a condition number; None if it is infinite, since a motion does not determine all columns."""
     if np.isfinite(condition):
         return condition
     return None
 
 
 def _family(inputs: ExcitationInputs, settings: ExcitationSettings) -> tuple[Family, Family | None]:
-    """Return the family of motions, and the family with fewer harmonics for the first search stage; None without
-    one.
+    """Return the family of motions, and a family with fewer harmonics for the first stage of the search.
+
+    The second family is None for splines, or if the first has few harmonics.
+
+    Args:
+        inputs: robot, limits and locked joints.
+        settings: settings of the design.
+
+    Raises:
+        UsageError: for an unknown family.
     """
     fixed = {j: value for j, value in inputs.locked.items() if value is not None}
     resonance, harmonics = inputs.limits.resonance, settings.harmonics
@@ -384,7 +532,14 @@ def _family(inputs: ExcitationInputs, settings: ExcitationSettings) -> tuple[Fam
 def _constraints(
     dynamics: ExcitedModel, limits: MotionLimits
 ) -> tuple[tuple[MotionConstraint, ...], tuple[MotionConstraint, ...], tuple[str, ...]]:
-    """Return the constraints for the search, those for the verification (Coulomb sign not smoothed), and notes."""
+    """Return the constraints for the search, the constraints for the verification, and notes for the user.
+
+    Constraints for the verification use the sign function of Coulomb friction without additional smoothing.
+
+    Args:
+        dynamics: the model to excite, with known values if torques are to be limited.
+        limits: limits of the motion.
+    """
     values = dynamics.values
     if values is None or not np.isfinite(limits.torque).any():
         return limits.constraints, limits.constraints, ()
@@ -421,9 +576,17 @@ def _nearest_goals(
     designed: tuple[SearchResult, Verification],
     checked: tuple[MotionConstraint, ...],
 ) -> tuple[Front, SearchResult, Verification]:
-    """Return the front, and the motion nearest to the goals, verified, among the front's motions and the designed one.
+    """Return the front, and the motion nearest to the goals with its verified margins.
 
-    Without goals, the designed motion is returned.
+    Candidates are the designed motion and the motions of the front. Without goals, the designed motion is returned.
+
+    Args:
+        front: the front.
+        problem: the optimisation problem.
+        goals: the goals; empty: none.
+        inputs: robot and model.
+        designed: the designed motion and its verified margins.
+        checked: constraints for the verification.
     """
 
     def distance(motion: SearchResult) -> float:
@@ -450,12 +613,19 @@ def _front(
     evaluations: int,
     report: Callable[[int, int, str], None],
 ) -> Front:
-    """Return the trade-offs by the ε-constraint method: torque goal from rest to its best value, versus condition
-    number.
+    """Return the trade-offs between condition number and a torque goal, by the ε-constraint method.
 
-    The torque goal is the first one stated (default: wrist); the condition number is the first among the goals
-    (default:
-    the normalised one, or the aim).
+    The torque goal is varied from its value at rest to its best value. It is the first torque goal in the settings
+    (default: wrist). The condition number is the first one among the goals (default: the normalised one, or the aim).
+
+    Args:
+        problem: the optimisation problem.
+        inputs: robot and model.
+        motion: the designed motion, which is added to the front.
+        goals: the goals.
+        count: number of trade-offs.
+        evaluations: largest number of evaluations of each search.
+        report: called with the number of searches done, their total, and a sentence.
     """
     slacks = [goal.objective for goal in goals if isinstance(goal.objective, TorqueSlack)]
     slack = slacks[0] if slacks else torque_slack(wrist(inputs.chain.n), inputs, "front")

@@ -1,4 +1,7 @@
-"""The dynamic model that a motion shall excite: from an identification, or from the robot and options."""
+"""The dynamic model whose parameters a designed motion shall excite.
+
+It is read from an identification, or built from the robot's description and options.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -34,13 +37,13 @@ BODY_PARAMETERS = 10
 
 @dataclass(frozen=True, eq=False)
 class ExcitedModel:
-    """The dynamic model to excite, with known parameter values to predict torques.
+    """The dynamic model to excite, with known parameter values from which torques are predicted.
 
     Attributes:
         smooth: base model with a smoothed sign function of Coulomb friction, for the search.
-        exact: base model with the identification's own sign function.
+        exact: base model with the sign function of the identification.
         values: (b,) base parameters; None if neither a model nor inertias are known.
-        covariance: (b, b) of the values; None if unknown.
+        covariance: (b, b) covariance of the values; None if unknown.
         friction: whether the values include friction.
         notes: remarks for the user.
     """
@@ -62,16 +65,18 @@ def read_model(
     loads: Sequence[str] = (),
     nominal: Chain | None = None,
 ) -> ExcitedModel:
-    """Return the model to excite: from an identification's folder, or from the robot's inertias and the given friction.
+    """Return the model to excite, of an identification, or of the robot's inertias and the stated friction.
 
     Args:
         chain: the arm.
-        folder: folder of an identification; its torque rows are used, with those of its payloads that `loads` names.
-        sets: drive terms of motor torques, used without folder and options.
+        folder: folder of an identification, whose torque rows are used; None: no identification.
+        sets: names of drive terms of motor torques (``Ia Fv Fc off``), used without folder and options; empty: default
+            terms.
         limits: limits of the motion, with the friction that the limits file states.
-        options: options of the identification that will follow; only without a folder.
-        loads: see `ExcitationSettings`.
-        nominal: see `excited_model`.
+        options: options of the later identification, allowed only without a folder; None: defaults.
+        loads: payloads of each run: ``none``, or labels joined by ``+``; empty: one run without, and one with each
+            payload.
+        nominal: arm on whose geometry the base parameters are selected, as in the identification; None: `chain`.
 
     Raises:
         UsageError: for an unknown payload, or if both folder and options are given.
@@ -97,7 +102,9 @@ def read_model(
     model, derivative_notes = _differentiable(model)
     cases = loads_of(loads, payloads, with_payloads=True)
     if options is not None and options.friction not in ("auto", "standard"):
-        notes.append(f"designed for standard friction: the step '{options.friction}' has its terms from recordings")
+        notes.append(
+            f"designed for standard friction, since the terms of '{options.friction}' are chosen from recordings"
+        )
     if chain.inertias is None and np.isfinite(limits.torque).any():
         sizes = ", ".join(f"{size:g}" for size in dict.fromkeys(limits.torque.tolist()))
         notes.append(f"NOT checked: torques (limits {sizes}), since the robot has no masses; name a model (--model)")
@@ -127,7 +134,15 @@ def read_model(
 
 
 def check_held(model: ExcitedModel, limits: MotionLimits) -> None:
-    """Raise a UsageError if gravity exceeds the torque limits in most postures: payload too heavy, or wrong masses."""
+    """Check that the torque limits suffice against gravity in at least half of the postures.
+
+    Args:
+        model: the model that predicts gravity torques.
+        limits: limits of the motion with the torque limits.
+
+    Raises:
+        UsageError: if they do not, since the payload is too heavy, or the masses or limits are wrong.
+    """
     if model.values is None:
         return
     exact, box = model.exact, limits.positions
@@ -149,12 +164,21 @@ def check_held(model: ExcitedModel, limits: MotionLimits) -> None:
 
 
 def _designable(rows: TorqueRows) -> bool:
-    """Return whether a motion can be designed for torque rows: they depend on the bodies and are differentiable."""
+    """Return whether a motion can be designed for the given torque rows.
+
+    The rows must depend on the rigid bodies, and must be differentiable.
+    """
     return rows.has_bodies and rows.projection is None
 
 
 def stated_payloads(options: IdentificationSettings | None) -> tuple[list[tuple[float, ...]], list[str]]:
-    """Return the ten parameters of each payload, and notes on assumptions about the payloads."""
+    """Return the ten inertial parameters of each payload in the options, and notes on assumptions about the payloads.
+
+    The parameters are zero for a payload without a stated mass.
+
+    Args:
+        options: options of the later identification; None: no payloads.
+    """
     parameters: list[tuple[float, ...]] = []
     notes: list[str] = []
     if options is None:
@@ -170,8 +194,17 @@ def stated_payloads(options: IdentificationSettings | None) -> tuple[list[tuple[
 
 
 def loads_of(texts: Sequence[str], payloads: Sequence[str], with_payloads: bool) -> Loads:
-    """Return the payload labels of each run; by default a run without payload, then, if `with_payloads`, one per
-    payload.
+    """Return the payload labels of each run of a motion.
+
+    Without texts, the runs are one without payload and, if `with_payloads`, one for each payload.
+
+    Args:
+        texts: payloads of each run: ``none``, or labels joined by ``+``.
+        payloads: labels of the known payloads.
+        with_payloads: whether the payloads are carried by default.
+
+    Raises:
+        UsageError: for an unknown payload.
     """
     if not texts:
         if with_payloads and payloads:
@@ -184,14 +217,18 @@ def loads_of(texts: Sequence[str], payloads: Sequence[str], with_payloads: bool)
             labels = tuple(part.strip() for part in text.split("+"))
         for label in labels:
             where = f"load '{text}': payload"
-            require(payloads, f"{where} '{label}' is not known: options or model have no payloads", UsageError)
+            require(
+                payloads,
+                f"{where} '{label}' is not known, since options or model have no payloads: leave it out",
+                UsageError,
+            )
             one_of(label, payloads, where, UsageError)
         runs.append(labels)
     return tuple(runs)
 
 
 def _differentiable(model: IdentificationModel) -> tuple[IdentificationModel, list[str]]:
-    """Return the model without drive terms that have no derivatives, and a note that names them."""
+    """Return the model without drive terms that have no derivatives, and a note for the user that names these terms."""
     differentiable = tuple(term for term in model.columns if term.form.slopes)
     omitted = [term.name for term in model.columns if not term.form.slopes]
     notes = []
@@ -201,7 +238,17 @@ def _differentiable(model: IdentificationModel) -> tuple[IdentificationModel, li
 
 
 def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain | None) -> ExcitedModel:
-    """Return the model of an identification's folder with the payloads of the loads, and its covariance."""
+    """Return the model in an identification's folder, with the payloads that the runs carry, and its covariance.
+
+    Args:
+        chain: the arm.
+        folder: folder of the identification.
+        texts: payloads of each run: ``none``, or labels joined by ``+``.
+        nominal: arm on whose geometry the base parameters are selected; None: `chain`.
+
+    Raises:
+        UsageError: if the identification belongs to another arm, or its torque rows are not suited for a design.
+    """
     refuse_currents(folder, "an excitation within torque limits")
     refuse_other_arm(folder, chain)
     table = read_table(folder)
@@ -223,7 +270,7 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain
     parameters = np.array([value_of[name] for name in model.names])
     if not np.isfinite(parameters).all():
         name = model.names[int(np.argmin(np.isfinite(parameters)))]
-        raise UsageError(f"{folder}: parameter {name} of the model is not finite")
+        raise UsageError(f"{folder}: parameter {name} of the model is not finite; identify again")
     friction = any(term.shape == "sign" for term in model.columns)
     excited = excited_model(model, loads, parameters, friction, notes, nominal)
     covariance = covariance_of(folder / COVARIANCE, excited.exact)
@@ -233,7 +280,13 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain
 
 
 def bodies_with(chain: Chain, gravity: np.ndarray, payloads: Sequence[str]) -> Bodies:
-    """Return the bodies of a chain, gravity (3,) in its base frame [m/s²], with payloads at its tip."""
+    """Return the rigid bodies of a chain with payloads at the tip.
+
+    Args:
+        chain: the arm.
+        gravity: (3,) gravity in the base frame [m/s²].
+        payloads: labels of the payloads.
+    """
     bodies = bodies_of(chain).with_gravity(np.asarray(gravity))
     for label in payloads:
         bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
@@ -241,12 +294,17 @@ def bodies_with(chain: Chain, gravity: np.ndarray, payloads: Sequence[str]) -> B
 
 
 def moved_to(chain: Chain, model: IdentificationModel) -> IdentificationModel:
-    """Return a model, payloads included, on another geometry of its arm."""
+    """Return a model, including its payloads, with the geometry of another arm.
+
+    Args:
+        chain: the arm.
+        model: the model.
+    """
     return replace(model, bodies=bodies_with(chain, model.bodies.gravity, _payloads(model)))
 
 
 def _payloads(model: IdentificationModel) -> list[str]:
-    """Return the labels of a model's payloads: the bodies that are not assigned to a joint coordinate."""
+    """Return the labels of a model's payloads, which are the bodies without a joint of their own."""
     bodies = zip(model.bodies.labels, model.bodies.coordinates)
     return [label for label, coordinate in bodies if coordinate < 0]
 
@@ -259,7 +317,7 @@ def excited_model(
     notes: Sequence[str] = (),
     nominal: Chain | None = None,
 ) -> ExcitedModel:
-    """Return the base model to excite, with a smoothed Coulomb sign for the search, from an identification model.
+    """Return the base model to excite, from an identification model; for the search, Coulomb friction is smoothed.
 
     Args:
         model: the identification model.
@@ -267,7 +325,7 @@ def excited_model(
         values: (p,) values of the model's parameters; None: unknown.
         friction: whether the values include friction.
         notes: remarks for the user.
-        nominal: arm on which the base columns are selected, as by the identification; None: the model's arm.
+        nominal: arm on which the base columns are selected, as in the identification; None: the model's arm.
     """
     smooth_terms = []
     for term in model.terms:
@@ -286,7 +344,10 @@ def excited_model(
     identifiable = {model.names[k].removeprefix(name) for k in base.kept for name in STANDARD}
     lost = [label for label in _payloads(model) if label not in identifiable]
     if lost:
-        notes = (*notes, f"payload {', '.join(lost)}: not identifiable from these loads; run others, too: --load none")
+        notes = (
+            *notes,
+            f"payload {', '.join(lost)}: not identifiable from these loads; add another load, such as --load none",
+        )
     return ExcitedModel(
         smooth=LoadCases(smooth, base, loads),
         exact=LoadCases(model, base, loads),
@@ -298,7 +359,14 @@ def excited_model(
 
 
 def covariance_of(path: Path, model: LoadCases) -> np.ndarray | None:
-    """Return the covariance (b, b) of a model's base columns; None if the file is missing or has other columns."""
+    """Return the covariance (b, b) of a model's base columns, read from a file.
+
+    None if the file is missing or contains other columns.
+
+    Args:
+        path: the CSV file.
+        model: the model with its base columns.
+    """
     names: Sequence[str] = ()
     covariance = np.empty((0, 0))
     if path.is_file():

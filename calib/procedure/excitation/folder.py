@@ -1,6 +1,6 @@
-"""The folders of designed and planned motions: samples at the controller's rate, ROS messages, metrics and pictures.
+"""Folders of designed and planned motions: samples at the controller's rate, ROS messages, metrics and figures.
 
-Each folder is written completely under another name, then moved to its place.
+Each folder is written completely into a temporary folder, then moved to its final path.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,8 +12,7 @@ import numpy as np
 from calib import files
 from calib.errors import counted
 from calib.folders import METRICS, check_target, write_staged
-from calib.procedure.excitation import coefficients, prediction
-from calib.procedure.excitation.coefficients import Periodic
+from calib.procedure.excitation import coefficients, prediction, stored_front
 from calib.procedure.excitation.design import INSTANTS, Designed
 from calib.procedure.excitation.limits import MotionBounds
 from calib.procedure.excitation.planning import Planned
@@ -22,7 +21,6 @@ from calib.records import plain
 from calib.robot import description
 from calib.robot.chain import Chain
 from calib.robot.tables import dumps
-from calib.trajectories.design.pareto import Front
 from calib.trajectories.design.verify import dense_motion
 from calib.trajectories.messages import joint_trajectory, to_json, to_yaml
 from calib.trajectories.setpoints import Setpoints
@@ -32,57 +30,62 @@ from calib.units import headings, motion_units
 # files that identify the folder of an earlier run
 DESIGN = (METRICS, coefficients.SAMPLES, coefficients.NAME)
 PLAN = (METRICS, coefficients.PLANNED, "trajectory.yaml", "trajectory.json")
-FRONT = "front.csv"
 APPROACH = "approach.csv"
 REHEARSAL = "rehearsal.csv"
 FIGURES = tuple(f"plot_{name}.png" for name in ("motion", "path", "history", "front", "profile", "outlook"))
-# files of an earlier run that a new one replaces
-ALL = (*DESIGN, *PLAN[1:], coefficients.ARM, coefficients.RUN, prediction.NAME, FRONT, APPROACH, REHEARSAL, *FIGURES)
+# files and folders of an earlier run that a new one replaces
+FRONT = (stored_front.TABLE, stored_front.FOLDER)
+ALL = (*DESIGN, *PLAN[1:], coefficients.ARM, coefficients.RUN, prediction.NAME, *FRONT, APPROACH, REHEARSAL, *FIGURES)
 # of limits, as `motion_units` has them
 KINDS = ("position", "velocity", "acceleration", "torque")
 # points per second of the ROS message, whose controllers interpolate (our choice)
 MESSAGES = 100.0
-# degree of splines, where a family does not state it
-DEFAULT_DEGREE = 5
 
 
 def check_design_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Raise a UsageError if a folder contains other results or input files, so that no designed motion can be
-    written.
+    """Check that a designed motion can be written into a folder.
+
+    Args:
+        out: the folder.
+        inputs: files that the command reads; None entries are ignored.
+
+    Raises:
+        UsageError: if the folder contains other results or input files.
     """
     check_target(out, ALL, DESIGN, "excitation", inputs)
 
 
 def check_plan_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Raise a UsageError if a folder contains other results or input files, so that no planned motion can be
-    written.
+    """Check that a planned motion can be written into a folder.
+
+    Args:
+        out: the folder.
+        inputs: files that the command reads; None entries are ignored.
+
+    Raises:
+        UsageError: if the folder contains other results or input files.
     """
     check_target(out, ALL, PLAN, "plan", inputs)
 
 
 def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path], None] | None = None) -> Path:
-    """Write the folder of a designed motion and return its path; `draw` adds figures.
+    """Write the folder of a designed motion and return its path.
+
+    Args:
+        designed: the motion.
+        out: path of the folder.
+        draw: function that writes figures into the folder; None: no figures.
 
     Raises:
         UsageError: if a file cannot be written; the earlier content of the folder is kept.
     """
 
     def write(folder: Path) -> None:
-        settings, family, playback = designed.settings, designed.family, designed.playback
+        playback = designed.playback
         chain, bounds = designed.inputs.chain, designed.inputs.limits.bounds
         period = one_period(designed)
         _write_setpoints(period, bounds, folder / coefficients.SAMPLES)
-        motion = Periodic(
-            chain.joint_names,
-            tuple(joint.kind for joint in chain.joints),
-            designed.period,
-            settings.rate,
-            settings.repeat,
-            settings.family,
-            tuple(family.coefficients(designed.found.x)),
-            getattr(family, "degree", DEFAULT_DEGREE),
-        )
-        table = coefficients.table(motion, chain.name, bounds.lines())
+        table = coefficients.table(designed.periodic(designed.found), chain.name, bounds.lines())
         files.write(folder / coefficients.NAME, dumps(table))
         if playback.approach is not None or playback.repeat > 1:
             _write_setpoints(playback.run, bounds, folder / coefficients.RUN)
@@ -91,8 +94,8 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
         _write_messages(playback.run, bounds, folder, max(1, round(period.rate / MESSAGES)))
         if draw is not None:
             draw(designed, folder)
-        if designed.front is not None and len(designed.front.values):
-            _write_front(designed.front, folder)
+        if designed.stored_front is not None:
+            stored_front.write(designed.stored_front, chain.name, bounds.lines(), folder)
         if designed.outlook is not None:
             prediction.write(designed.predicted, folder)
         files.write_json(folder / METRICS, design_metrics(designed))
@@ -100,16 +103,13 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
     return write_staged(out, ALL, write)
 
 
-def _write_front(front: Front, folder: Path) -> None:
-    """Write the trade-offs between goals as a table, one row per motion."""
-    rows = []
-    for k, values in enumerate(front.values):
-        rows.append([*map(float, values), bool(front.best[k]), k == front.designed])
-    files.write_table(folder / FRONT, [*front.names, "not dominated", "designed"], rows)
-
-
 def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None] | None = None) -> Path:
-    """Write the folder of a planned motion and return its path; `draw` adds figures.
+    """Write the folder of a planned motion and return its path.
+
+    Args:
+        planned: the motion.
+        out: path of the folder.
+        draw: function that writes figures into the folder; None: no figures.
 
     Raises:
         UsageError: if a file cannot be written; the earlier content of the folder is kept.
@@ -128,12 +128,26 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
 
 
 def _write_arm(chain: Chain, source: str, folder: Path) -> None:
-    """Write the robot that a motion was made for, with the name of its description."""
+    """Write a description of the robot for which a motion was made, with the name of the original description.
+
+    Args:
+        chain: the robot.
+        source: name of the original description.
+        folder: folder to write into.
+    """
     description.write(folder / coefficients.ARM, chain, {"provenance": {"robot": source}})
 
 
 def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path:
-    """Write t, q, v, a and, if known, tau, one row per controller sample; comments state the limits."""
+    """Write time, position, velocity, acceleration and, if known, torque, one row per controller sample.
+
+    Comments at the head of the file state the limits.
+
+    Args:
+        track: the setpoints.
+        bounds: limits of the motion.
+        path: the CSV file.
+    """
     bounds.check(track)
     columns = {"q": track.q, "v": track.v, "a": track.a}
     if track.tau is not None:
@@ -146,7 +160,13 @@ def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path
 
 
 def _write_approach_and_rehearsal(motion: Playback | Planned, bounds: MotionBounds, folder: Path) -> None:
-    """Write ``approach.csv`` and ``rehearsal.csv`` if the motion has an approach and a rehearsal."""
+    """Write the setpoints of approach and rehearsal, if the motion has them.
+
+    Args:
+        motion: the motion.
+        bounds: its limits, for the comments in the files.
+        folder: folder for ``approach.csv`` and ``rehearsal.csv``.
+    """
     if motion.approach is not None:
         _write_setpoints(motion.approach, bounds, folder / APPROACH)
     if motion.rehearsal is not None:
@@ -154,8 +174,13 @@ def _write_approach_and_rehearsal(motion: Playback | Planned, bounds: MotionBoun
 
 
 def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, step: int = 1) -> None:
-    """Write ``trajectory.json`` and ``trajectory.yaml`` (trajectory_msgs/JointTrajectory) with every `step`-th
-    sample.
+    """Write a motion as trajectory_msgs/JointTrajectory: ``trajectory.json`` and ``trajectory.yaml``.
+
+    Args:
+        track: the setpoints.
+        bounds: limits of the motion, for the comments in the files.
+        folder: folder to write into.
+        step: number of samples from one point of the message to the next.
     """
     bounds.check(track)
     message = joint_trajectory(track, [joint.name for joint in bounds.joints], step)
@@ -165,8 +190,11 @@ def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, step: 
 
 
 def one_period(designed: Designed, rate: float | None = None) -> Setpoints:
-    """Return the setpoints of one period at `rate` [Hz] (None: the controller's), both ends included, without
-    torques.
+    """Return the setpoints of one period with both ends included, without torques.
+
+    Args:
+        designed: the motion.
+        rate: sampling rate [Hz]; None: the controller's rate.
     """
     count = max(round(designed.period * (rate or designed.settings.rate)), 1)
     times = np.arange(count + 1) * (designed.period / count)
@@ -175,7 +203,7 @@ def one_period(designed: Designed, rate: float | None = None) -> Setpoints:
 
 
 def design_metrics(designed: Designed) -> dict[str, object]:
-    """Return the content of ``metrics.json`` of a designed motion."""
+    """Return the content of ``metrics.json`` for a designed motion."""
     motion, inputs, settings = designed.found, designed.inputs, designed.settings
     family, playback, proof = designed.family, designed.playback, designed.proof
     margins = {}
@@ -240,7 +268,11 @@ def _condition_text(raw: float | None, normalised: float | None) -> str:
 
 
 def design_lines(designed: Designed) -> list[str]:
-    """Return the lines that `calib excite` prints: condition number, goals, margins, limits, notes."""
+    """Return the lines that `calib excite` prints: condition numbers, reached goals, margins, limits, and notes.
+
+    Args:
+        designed: the motion.
+    """
     motion, condition, proof, playback = designed.found, designed.condition, designed.proof, designed.playback
     column_count = len(designed.inputs.columns.aimed_names)
     prior = designed.inputs.prior
@@ -259,7 +291,12 @@ def design_lines(designed: Designed) -> list[str]:
         )
     for name, goal, _, value in designed.goals:
         lines.append(f"goal {name}: {value:.4g} (asked: {goal:.4g})")
-    lines.append(f"{motion.evaluations} evaluations, {motion.feasible:.0%} of them feasible, {motion.seconds:.1f} s")
+    if motion.evaluations:
+        shares = f"{motion.feasible:.0%} of them feasible"
+        lines.append(f"{motion.evaluations} evaluations, {shares}, {motion.seconds:.1f} s")
+    if designed.front is not None:
+        front = designed.front
+        lines.append(f"motion {front.designed + 1} of the {len(front.values)} of the front ({stored_front.TABLE})")
     margins = []
     for name, margin in proof.worst.items():
         margins.append(f"{name} {margin.margin:.3g} {margin.unit} ({margin.label}, {margin.time:.2f} s)")
@@ -278,7 +315,7 @@ def design_lines(designed: Designed) -> list[str]:
 
 
 def plan_metrics(planned: Planned) -> dict[str, object]:
-    """Return the content of ``metrics.json`` of a planned motion."""
+    """Return the content of ``metrics.json`` for a planned motion."""
     timings, shaped = planned.timings, planned.shaped
     line_deviation = None
     if planned.deviation is not None:
@@ -322,7 +359,11 @@ def plan_metrics(planned: Planned) -> dict[str, object]:
 
 
 def plan_lines(planned: Planned) -> list[str]:
-    """Return the lines that `calib plan` prints: duration, margins, limits, notes."""
+    """Return the lines that `calib plan` prints: duration, margins, limits, and notes.
+
+    Args:
+        planned: the motion.
+    """
     lines = [
         f"{planned.track.duration:.3f} s at {planned.track.rate:g} Hz; closer than {ACTIVE:.0%} to a limit for "
         f"{planned.active_share:.1%} of the time; all limits are respected at "
@@ -344,7 +385,14 @@ def plan_lines(planned: Planned) -> list[str]:
 
 @dataclass(frozen=True)
 class _PlanMargin:
-    """Smallest margin to a limit: of the joint closest to it (also as a share of its limit), and of all joints."""
+    """Smallest margin of a planned motion to a limit.
+
+    Attributes:
+        margin, unit: margin of the joint closest to the limit.
+        at: name of this joint.
+        share: margin as a share of the limit.
+        joints: (n,) margins of all joints.
+    """
 
     margin: float
     unit: str
@@ -358,7 +406,7 @@ def _verified(planned: Planned) -> int:
 
 
 def _margins(planned: Planned) -> dict[str, _PlanMargin]:
-    """Return the smallest margin to each limit, by name."""
+    """Return the smallest margin of a planned motion to each limit: name of the limit -> margin."""
     result = {}
     if planned.margins is not None:
         j = int(np.argmin(planned.margins))
@@ -374,7 +422,15 @@ def _margins(planned: Planned) -> dict[str, _PlanMargin]:
 
 
 def _margin(planned: Planned, name: str, margins: np.ndarray, share: float, unit_size: float) -> _PlanMargin:
-    """Return the smallest of the margins (n,) of joints to a limit; `unit_size` converts it to the limit's unit."""
+    """Return the smallest margin among the joints to one limit.
+
+    Args:
+        planned: the motion.
+        name: quantity that is limited, such as ``velocity``.
+        margins: (n,) margins of the joints.
+        share: smallest margin as a share of the limit.
+        unit_size: factor that converts the margins to the unit of the limit.
+    """
     j = int(np.argmin(margins))
     joint = planned.chain.joints[j]
     unit = motion_units([joint.kind])[KINDS.index(name)]

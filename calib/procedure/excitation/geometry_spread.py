@@ -1,4 +1,4 @@
-"""Effect of the uncertainty of a calibrated geometry on the torques predicted for a designed motion."""
+"""Effect of a calibrated geometry's uncertainty on the torques that are predicted for a designed motion."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,18 +17,28 @@ from calib.robot.chain import Chain
 
 @dataclass(frozen=True, eq=False)
 class GeometrySpread:
-    """Principal errors of a geometry, see `calib.procedure.excitation.prior_motions.PrincipalErrors`.
+    """Principal errors g_i of a geometry, and the models with the geometry changed by them.
+
+    `calib.procedure.excitation.prior_motions.PrincipalErrors` explains principal errors.
 
     Attributes:
-        moved: r pairs of models, on the geometry changed by +g_i and by -g_i.
-        before: (b, r) shifts S g_i of the base parameters of an earlier identification; zero without one.
+        moved: r pairs of models, with the geometry changed by +g_i and by -g_i.
+        before: (b, r) shifts S g_i of the base parameters of an earlier identification, with S their sensitivity to the
+            geometry; zero without an earlier identification.
     """
 
     moved: tuple[tuple[LoadCases, LoadCases], ...]
     before: np.ndarray
 
     def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the changes of the torques (N, rows, r) by each principal error, at base parameters `values` (b,)."""
+        """Return the changes (N, rows, r) of the torques [N m or N] by each of r principal errors.
+
+        The base parameters are constant.
+
+        Args:
+            values: (b,) base parameters.
+            q, v, a: (N, n) positions, velocities and accelerations.
+        """
         changes = []
         for up, down in self.moved:
             change = up.regressor(q, v, a) - down.regressor(q, v, a)
@@ -39,14 +49,15 @@ class GeometrySpread:
 def geometry_spread(
     robot: object, source: Path, chain: Chain, model: ExcitedModel, after: Path | None
 ) -> GeometrySpread | None:
-    """Return the principal errors of a geometry, and their effect on the parameters of an identification; None if
-    unknown.
+    """Return the principal errors of a geometry, and their effect on the parameters of an earlier identification.
+
+    None if the covariance of the geometry, or the values of the parameters, are unknown.
 
     Args:
         robot, source: robot as given by the caller, and its file.
-        chain: arm that the motion is designed for.
+        chain: arm for which the motion is designed.
         model: model that predicts the torques.
-        after: folder of the identification whose geometry's covariance is used; None: that of the robot.
+        after: folder of an identification, from which the covariance of the geometry is taken; None: from the robot.
     """
     stored = None if after is None else after / SENSITIVITY
     path = source if after is None else after / calibrated.ROBOT

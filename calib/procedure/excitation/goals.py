@@ -1,6 +1,6 @@
-"""Objectives and goals of an excitation, from the settings.
+"""Objectives and goals of an excitation, made from the settings.
 
-They are described in `calib.procedure.excitation.settings.ExcitationSettings`.
+`calib.procedure.excitation.settings.ExcitationSettings` describes the available goals.
 """
 
 from collections.abc import Sequence
@@ -36,12 +36,13 @@ TOLERANCE = 0.01
 def objectives_of(
     settings: ExcitationSettings, condition: Excitation, inputs: ExcitationInputs
 ) -> tuple[tuple[Objective, float], ...]:
-    """Return the objectives and their weights: an aim, or both condition numbers with equal weights.
+    """Return the objectives of a design with their weights: an aim, or both condition numbers with equal weights.
 
     Args:
         settings: settings of the design.
-        condition: template of a condition number's objective, see `read_goals`.
-        inputs: robot and model; without goals, the determinant is the aim if an identification states torque errors.
+        condition: condition number as an objective, with the columns, rows and earlier information of the design; the
+            other objectives are derived from it.
+        inputs: robot and model; without goals, the aim is ``logdet`` if an identification states torque errors.
 
     Raises:
         UsageError: for two aims, or an aim together with the condition numbers that it replaces.
@@ -67,10 +68,16 @@ def objectives_of(
 def _predicted(aim: str, settings: ExcitationSettings, condition: Excitation, inputs: ExcitationInputs) -> Excitation:
     """Return the objective that minimises the predicted σ of the torques of a typical task, or of the parameters.
 
-    Rows are weighted by the torque errors that earlier motions state, or else by the torque limits.
+    Torque rows are weighted by the torque errors that earlier motions state, otherwise by the torque limits.
+
+    Args:
+        aim: ``torque`` or ``parameters``.
+        settings: settings of the design.
+        condition: condition number as an objective, from which this objective is derived.
+        inputs: robot and model.
 
     Raises:
-        UsageError: where torque limits or the parameters' values are not known.
+        UsageError: if torque limits or values of the parameters are not known.
     """
     exact, limits, columns = inputs.model.exact, inputs.limits.torque, inputs.columns
     limited = bool(np.isfinite(limits).all())
@@ -95,15 +102,15 @@ def _predicted(aim: str, settings: ExcitationSettings, condition: Excitation, in
 
 
 def read_goals(settings: ExcitationSettings, inputs: ExcitationInputs, condition: Excitation) -> list[AttainmentGoal]:
-    """Return the goals stated in the settings: first the soft goals, then the hard goals.
+    """Return the goals in the settings: first the soft goals, then the hard goals.
 
     Args:
         settings: settings of the design.
         inputs: robot and model.
-        condition: template of a condition number's objective: columns, rows, earlier information.
+        condition: condition number as an objective, with the columns, rows and earlier information of the design.
 
     Raises:
-        UsageError: for an unknown goal, or a goal that the inputs do not suffice to compute.
+        UsageError: for an unknown goal, or a goal that cannot be computed from the inputs.
     """
     soft = [text for text in settings.goals if text not in AIMS]
     goals = _goals(soft, None, inputs, condition, settings.shortest)
@@ -113,7 +120,15 @@ def read_goals(settings: ExcitationSettings, inputs: ExcitationInputs, condition
 def _goals(
     texts: Sequence[str], weight: float | None, inputs: ExcitationInputs, condition: Excitation, shortest: float | None
 ) -> list[AttainmentGoal]:
-    """Return the goals that texts (``name=value``) state; `weight` 0 for hard goals, None for soft ones."""
+    """Return the goals that texts (``name=value``) state.
+
+    Args:
+        texts: the texts.
+        weight: 0 for hard goals, None for soft goals.
+        inputs: robot and model.
+        condition: condition number as an objective.
+        shortest: shortest allowed period [s]; None: the period is fixed.
+    """
     names = [split_goal(text)[0] for text in texts if text not in AIMS]
     goals = []
     for text in texts:
@@ -127,7 +142,18 @@ def _goals(
 def _objective(
     name: str, value: float, inputs: ExcitationInputs, condition: Excitation, shortest: float | None
 ) -> tuple[Objective, float]:
-    """Return the objective that a goal names, and the value that the objective has to reach."""
+    """Return the objective with a goal's name, and the value that it has to reach.
+
+    Args:
+        name: name of the goal, such as ``raw``, ``wrist`` or ``coverage``.
+        value: stated value of the goal.
+        inputs: robot and model.
+        condition: condition number as an objective.
+        shortest: shortest allowed period [s]; None: the period is fixed.
+
+    Raises:
+        UsageError: for an unknown name, an invalid value, or missing inputs.
+    """
     text, chain = f"{name}={value:g}", inputs.chain
     if name in SCALINGS:
         require(value > 1, f"goal '{text}': expected a condition number above 1", UsageError)
@@ -150,15 +176,20 @@ def _objective(
 
 
 def wrist(n: int) -> tuple[int, ...]:
-    """Return the indices of the last two of n joints."""
+    """Return the indices of the wrist joints, which are the last two of n joints."""
     return tuple(range(max(0, n - 2), n))
 
 
 def torque_slack(joints: tuple[int, ...], inputs: ExcitationInputs, where: str) -> TorqueSlack:
-    """Return the objective that maximises the mean torque of some joints relative to their limits.
+    """Return the objective that maximises the mean torque of some joints relative to the torque limits.
+
+    Args:
+        joints: indices of the joints.
+        inputs: robot and model.
+        where: name of the goal for messages.
 
     Raises:
-        UsageError: where torques cannot be predicted, or have no limit.
+        UsageError: if torques cannot be predicted, or have no limit.
     """
     values, limits = inputs.model.values, inputs.limits.torque
     if values is None or not np.isfinite(limits[list(joints)]).all():
@@ -172,7 +203,13 @@ def torque_slack(joints: tuple[int, ...], inputs: ExcitationInputs, where: str) 
 
 
 def _typical_friction(inputs: ExcitationInputs) -> np.ndarray:
-    """Return standard parameters (p,) of typical friction: `TYPICAL` shares of the torque limits at full speed."""
+    """Return standard parameters (p,) of typical friction, all others zero.
+
+    At full speed, the friction torques are the shares `TYPICAL` of the torque limits.
+
+    Args:
+        inputs: robot and model with torque limits.
+    """
     limits, model = inputs.limits, inputs.model.exact.model
     # the values at which a term's torque is the joint's limit
     full = {"sign": limits.torque, "velocity": limits.torque / limits.bounds.velocity}
@@ -186,7 +223,13 @@ def _typical_friction(inputs: ExcitationInputs) -> np.ndarray:
 
 
 def missed(goals: Sequence[AttainmentGoal], values: Sequence[float], inputs: ExcitationInputs) -> tuple[str, ...]:
-    """Return a note for each goal that a motion with these values misses by more than 1 %."""
+    """Return a note for each goal that a motion misses by more than 1 %.
+
+    Args:
+        goals: the goals.
+        values: value of each goal that the motion reaches.
+        inputs: robot and model.
+    """
     notes = []
     for goal, value in zip(goals, values):
         if value > goal.goal + TOLERANCE * abs(goal.goal):

@@ -1,4 +1,4 @@
-"""Inputs of an excitation: model to identify, limits, locked joints, columns, and earlier motions to include."""
+"""Inputs of an excitation: model to identify, limits, locked joints, columns, and earlier motions."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,15 +27,15 @@ LISTED_COLUMNS = 12
 
 @dataclass(frozen=True, eq=False)
 class IdentifiableColumns:
-    """The columns that a motion can identify.
+    """The columns (base parameters) that a motion can identify.
 
     Attributes:
-        columns: (c,) indices of the identifiable columns among the model's base columns; None: all of them.
-        sigmas: (rows,) σ by which torque rows are divided, see `PriorMotions`; infinite for excluded rows; None: 1.
+        columns: (c,) indices of the identifiable columns among the model's base columns; None: all columns.
+        sigmas: (rows,) standard deviations by which torque rows are divided; infinite: excluded rows; None: 1.
         names: names of the identifiable columns.
         notes: remarks for the user.
-        chosen: (k,) indices of the columns for which the motion is designed while the others are estimated, too; None:
-            all.
+        chosen: (k,) indices of the columns for which the motion is designed, although all identifiable columns are
+            estimated; None: all identifiable columns.
     """
 
     columns: np.ndarray | None
@@ -46,7 +46,7 @@ class IdentifiableColumns:
 
     @property
     def aimed(self) -> np.ndarray | None:
-        """The model's columns (indices) whose condition number is minimised; None: all."""
+        """Indices of the model's columns whose condition number is minimised; None: all columns."""
         if self.chosen is None:
             return self.columns
         return self.chosen
@@ -61,7 +61,7 @@ class IdentifiableColumns:
 
     @property
     def kept(self) -> np.ndarray | slice:
-        """Index of the identifiable columns among all columns of the model."""
+        """Index expression that selects the identifiable columns among all columns of the model."""
         if self.columns is None:
             return slice(None)
         return self.columns
@@ -72,10 +72,10 @@ class ExcitationInputs:
     """Inputs of a design: robot, limits, model, locked joints, and earlier motions.
 
     Attributes:
-        chain, limits, model: the arm, the limits of its motion, and the dynamics to excite.
-        locked: joint index -> its fixed value [rad or m]; None: the search chooses the value.
+        chain, limits, model: the arm, the limits of its motion, and the dynamic model to excite.
+        locked: joint index -> fixed value [rad or m]; None: the search chooses the value.
         columns: columns that the motion can identify.
-        prior: information of earlier motions; None without any.
+        prior: information of earlier motions; None: no earlier motions.
         geometry: uncertainty of a calibrated robot's geometry; None if the robot is not calibrated or torques are
             unknown.
         source: the robot's description, as named by the user; empty if unknown.
@@ -109,13 +109,15 @@ def read_inputs(
     """Return the inputs of an excitation: robot, limits, model and earlier motions, read from their files.
 
     Args:
-        robot, base, tip: see `calib.robot.library`.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         settings: settings of the design.
-        model: folder of an identification: torques, friction and their uncertainty.
-        limits: see `calib.procedure.excitation.limits`.
-        options: options of the identification that will follow: torque rows, drive terms, payloads.
+        model: folder of an identification, from which torques, friction and their uncertainty are taken; None: from the
+            robot's description.
+        limits: limits file (`calib formats limits`), or its content as tables; None: limits of the robot's description.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
+        options: options of the later identification: torque rows, drive terms, payloads; None: defaults.
         after: folder of an identification whose recordings the motion shall complement; it replaces `model`, and its
-            information and torque errors are used.
+            information and torque errors are used; None: none.
 
     Raises:
         UsageError, MeasurementError: for a file that cannot be read, or belongs to another robot.
@@ -124,7 +126,7 @@ def read_inputs(
     model = model or after
     if settings.drives and (model is not None or options is not None):
         raise UsageError(
-            f"drives '{settings.drives}': {model or 'the options file'} states the drive terms; leave it out"
+            f"drives '{settings.drives}': {model or 'the options file'} states the drive terms; leave drives out"
         )
     calibrated, source = load_rigid(robot, None, base, tip)
     chain = calibrated.chain
@@ -159,10 +161,15 @@ def read_inputs(
 
 
 def _read_locked(texts: Sequence[str], chain: Chain, limits: BoxLimit) -> dict[int, float | None]:
-    """Return the locked joints: index -> stated value (``joint4=0.5``, rad or m), or None if the search chooses it.
+    """Return the locked joints: joint index -> stated value [rad or m], or None if the search chooses the value.
+
+    Args:
+        texts: locked joints, such as ``joint4`` or ``joint4=0.5``.
+        chain: the arm.
+        limits: limits of the joint positions.
 
     Raises:
-        UsageError: for an unknown joint, a value beyond its limits, or if all joints are locked.
+        UsageError: for an unknown joint, a value beyond the joint limits, or if all joints are locked.
     """
     index: dict[str, int] = {}
     for j in range(chain.n):
@@ -200,9 +207,9 @@ def identifiable(
     Args:
         model: the model to excite.
         chain: the arm.
-        locked: joint index -> its fixed value; None: chosen by the search.
-        prior: information of earlier motions; None without any.
-        noise: (rows,) σ of the torque rows where no earlier motion states it; None: 1.
+        locked: joint index -> fixed value [rad or m]; None: the search chooses the value.
+        prior: information of earlier motions; None: no earlier motions.
+        noise: (rows,) σ of the torque rows, used if no earlier motion states σ; None: 1.
     """
     names = model.exact.names
     information = None
@@ -238,6 +245,12 @@ def selected_columns(
     columns: IdentifiableColumns, model: ExcitedModel, settings: ExcitationSettings, folder: Path | None
 ) -> IdentifiableColumns:
     """Return the identifiable columns that the settings request: by name, or the essential ones of an identification.
+
+    Args:
+        columns: the identifiable columns.
+        model: the model to excite.
+        settings: settings of the design.
+        folder: folder of the identification; None: no identification.
 
     Raises:
         UsageError: for an unknown parameter, or ``essential`` without a folder.

@@ -49,8 +49,8 @@ from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
 from calib.trajectories.basis import SampledMotion
 from calib.trajectories.constraints import BoxLimit, MotionConstraint, box_limits
 from calib.trajectories.errors import NothingFeasible
-from calib.trajectories.places import Clearance, Workspace
 from calib.trajectories.setpoints import Setpoints
+from calib.trajectories.workspace_limits import Clearance, Workspace
 from calib.units import motion_units
 
 # [rad or m, s, N m or N] a number above is no limit of a joint; direct drives of fast robots reach 1300 (our choice)
@@ -78,24 +78,24 @@ STATED_IN = {
     "workspace": "[target] (height, axis_distance) and [[point]]",
     "clearance": "[collision] (margin, radius, floor) and [[obstacle]]",
 }
-# constraints of pose selection that `trajectories.places.Workspace` keeps
+# constraints of pose selection that `trajectories.workspace_limits.Workspace` keeps
 OF_WORKSPACE = ("height", "distance from the axis")
 
 
 @dataclass(frozen=True, eq=False)
 class MotionBounds:
-    """Limits (n,) of a motion's speed, acceleration and torque magnitudes; infinite: not limited.
+    """Limits (n,) on the magnitudes of a motion's velocity, acceleration and torque; infinite: not limited.
 
     Attributes:
         robot: the robot's file or name, for messages.
         joints: the n joints.
         velocity, acceleration: [rad/s or m/s], [rad/s² or m/s²].
-        torque: [N m or N] if a model predicts torques; else infinite.
+        torque: [N m or N] if a model predicts torques; otherwise infinite.
         origin: ``velocity``, ``acceleration`` or ``torque`` -> name of the file that states the limits.
-        place: text that says where a user can state missing limits, with {} for an example.
+        place: text for messages on where a user can state missing limits, with {} for an example.
 
     Raises:
-        UsageError: if joints have no limit; the message names the joints, and what to state.
+        UsageError: if joints have no limit; the message names the joints, and the limits to state.
     """
 
     robot: str
@@ -112,12 +112,20 @@ class MotionBounds:
             "acceleration",
             {"acceleration": self.acceleration, "effort": self.torque},
             "acceleration",
-            "; efforts count where masses are known or a model is named (--model)",
+            "; limits of effort are used only where masses are known or a model is named (--model)",
         )
 
     def _require(self, example: str, limits: Mapping[str, np.ndarray], quantity: str, hint: str) -> None:
-        """Raise a UsageError if a joint has none of the given limits; the message names the joints, and what to
-        state.
+        """Check that each joint has at least one of the given limits.
+
+        Args:
+            example: kind of limit of which the message shows an example.
+            limits: kind of limit -> values (n,).
+            quantity: name of the limited quantity for the message.
+            hint: text at the end of the message.
+
+        Raises:
+            UsageError: if a joint has none of the limits; the message names the joints, and the limits to state.
         """
         unlimited = np.all([sizes > MAX[kind] for kind, sizes in limits.items()], axis=0)
         if not unlimited.any():
@@ -130,20 +138,20 @@ class MotionBounds:
         for kind, sizes in limits.items():
             numbers += [f"{kind} {size:g}" for size in sizes[unlimited] if np.isfinite(size)]
         wrong = [number for number in dict.fromkeys(numbers) if number.split()[0] in limits]
-        remark = f" ({', '.join(wrong)} is no limit)" if wrong else ""
+        remark = f" ({', '.join(wrong)} is not a limit)" if wrong else ""
         raise UsageError(
             f"{self.robot}: no limit for the {quantity} of {self._named(joints)}{remark}; without it no motion "
             f"is written; state it {self.place.format(EXAMPLES[example])}{hint}"
         )
 
     def _named(self, joints: Sequence[Joint]) -> str:
-        """Return the joints' names as text; ``all joints`` if there are no others."""
+        """Return the names of joints as text; ``all joints`` if these are all joints of the robot."""
         if len(joints) == len(self.joints):
             return "all joints"
         return ", ".join(joint.name for joint in joints)
 
     def lines(self) -> list[str]:
-        """Return the limits as text lines for file headers: velocity, acceleration, torque."""
+        """Return lines of text for file headers that state the limits of velocity, acceleration and torque."""
         lines = []
         limits = {"velocity": self.velocity, "acceleration": self.acceleration, "torque": self.torque}
         for order, (kind, sizes) in enumerate(limits.items(), 1):
@@ -161,19 +169,28 @@ class MotionBounds:
         return lines
 
     def check(self, track: Setpoints) -> None:
-        """Raise an error if a track exceeds its limits of speed or acceleration, or `MAX`, beyond which no real joint
-        moves.
+        """Check that setpoints respect the limits of velocity and acceleration, and `MAX`.
 
-        `MAX` matters where light links and high torque limits would allow accelerations that no robot reaches.
+        `MAX` is a value that no real joint reaches. It matters if light links and high torque limits would allow
+        accelerations that no robot reaches.
+
+        Args:
+            track: the setpoints.
 
         Raises:
-            UsageError: naming the joint and the limit.
+            UsageError: for a violated limit; the message names the joint and the limit.
         """
         self._check("velocity", np.abs(track.v).max(axis=0), self.velocity)
         self._check("acceleration", np.abs(track.a).max(axis=0), self.acceleration)
 
     def _check(self, kind: str, peak: np.ndarray, limit: np.ndarray) -> None:
-        """Raise a UsageError if a joint's largest speed or acceleration (n,) exceeds its limit (n,)."""
+        """Raise a UsageError if the velocity or acceleration of a joint exceeds its limit.
+
+        Args:
+            kind: ``velocity`` or ``acceleration``.
+            peak: (n,) largest values of the motion.
+            limit: (n,) limits.
+        """
         limit = np.minimum(limit, MAX[kind])
         j = int(np.argmax(peak / limit))
         if not peak[j] <= (1.0 + MAX_EXCESS) * limit[j]:
@@ -186,7 +203,7 @@ class MotionBounds:
 @strict
 @dataclass(frozen=True)
 class PointTable:
-    """Entry ``[[point]]`` of the limits file, see the module."""
+    """Entry ``[[point]]`` of the limits file; the module's docstring explains the keys."""
 
     name: Name
     joint: Annotated[int, Whole()] = 0
@@ -196,7 +213,7 @@ class PointTable:
 @strict
 @dataclass(frozen=True)
 class FrictionTable:
-    """Table ``[friction]`` of the limits file, see the module."""
+    """Table ``[friction]`` of the limits file; the module's docstring explains the keys."""
 
     Fv: Annotated[tuple[NotNegative, ...], Spread()] | None = None
     Fc: Annotated[tuple[NotNegative, ...], Spread()] | None = None
@@ -205,7 +222,7 @@ class FrictionTable:
 @strict
 @dataclass(frozen=True)
 class FrequencyTable:
-    """Table ``[frequency]`` of the limits file, see the module."""
+    """Table ``[frequency]`` of the limits file; the module's docstring explains the keys."""
 
     resonance: Annotated[float, Real(above=0, quantity="frequency")] | None = None
 
@@ -213,7 +230,7 @@ class FrequencyTable:
 @strict
 @dataclass(frozen=True)
 class LimitsFile(ConstraintsFile):
-    """The content of a limits file; values per joint are in the unit of the joint."""
+    """The content of a limits file; values per joint are in the joint's units (rad or m, s, N m or N)."""
 
     velocity: Mapping[str, Numeric] = field(default_factory=dict)
     acceleration: Mapping[str, Numeric] = field(default_factory=dict)
@@ -231,14 +248,14 @@ class MotionLimits:
 
     Attributes:
         constraints: all constraints except those on torques.
-        bounds: limits of each joint's speed, acceleration and torque.
-        torque: (n,) limits [N m or N], also without a model that predicts torques; infinite: not limited.
+        bounds: limits of each joint's velocity, acceleration and torque.
+        torque: (n,) torque limits [N m or N], even if no model predicts torques; infinite: not limited.
         margin: share of the torque limits that stays free; None if the file does not state it.
         deviations: number of standard deviations of the predicted torque that stay free.
         friction: (2, n) viscous Fv and Coulomb Fc; None if the file does not state them.
-        resonance: smallest resonance [rad/s]; None if the file does not state it.
+        resonance: smallest resonance frequency [rad/s]; None if the file does not state it.
         notes: remarks for the user.
-        noise: (n,) standard deviation of the torques' errors [N m or N]; None if the file does not state it.
+        noise: (n,) standard deviation of the torque errors [N m or N]; None if the file does not state it.
     """
 
     constraints: tuple[MotionConstraint, ...]
@@ -253,7 +270,7 @@ class MotionLimits:
 
     @property
     def positions(self) -> BoxLimit:
-        """Limits of the joint positions; infinite: not limited."""
+        """Limits of the joint positions [rad or m]; infinite: not limited."""
         for constraint in self.constraints:
             if isinstance(constraint, BoxLimit) and constraint.order == 0:
                 return constraint
@@ -261,8 +278,12 @@ class MotionLimits:
         return BoxLimit(0, -unlimited, unlimited)
 
     def narrowed(self, ranges: Sequence[tuple[np.ndarray, np.ndarray]]) -> "MotionLimits":
-        """Return the limits, narrowed to the range of a motion: least and largest q, v and a (n,) of its moving
-        joints.
+        """Return the limits, with position, velocity and acceleration also limited to the range of another motion.
+
+        Joints that do not move in the other motion are not limited further.
+
+        Args:
+            ranges: smallest and largest values (n,) of q, v and a in the other motion.
         """
         boxes = []
         for order, (low, high) in enumerate(ranges):
@@ -271,8 +292,12 @@ class MotionLimits:
         return replace(self, constraints=(*self.constraints, *boxes))
 
     def broken(self, motion: SampledMotion) -> Iterator[tuple[MotionConstraint, str, int]]:
-        """Yield (constraint, message, index of the worst of N states) for each violated constraint except joint
-        limits.
+        """Yield each violated constraint with a message and the index of the worst of N sampled states.
+
+        Joint limits are not checked.
+
+        Args:
+            motion: N sampled states of the motion.
         """
         for limit in self.constraints:
             if isinstance(limit, BoxLimit):
@@ -291,17 +316,17 @@ def read_motion_limits(
     """Return the limits of a motion from the limits file and the robot; defaults are those of pose selection.
 
     Args:
-        tables: the limits file, or its tables; None: the robot's own limits and the defaults only.
+        tables: the limits file, or its content as tables; None: only the robot's limits and the defaults.
         chain: the arm.
-        source: the robot's file, for its collision shapes.
-        stated_path: whether the user states the path; then only stated limits are used, since default capsules and a
+        source: the robot's file, from which collision shapes are read; None: no file.
+        stated_path: whether the user states the path. Then only stated limits are used, since default capsules and a
             default floor should not forbid a path that the user knows to be free.
         predicted: whether an identified model predicts torques, so that torque limits apply; they also apply if the
-            chain's masses are known.
+            masses in the robot's description are known.
 
     Raises:
-        UsageError: for an unknown key or a value that a key cannot have, and if a joint has no limit of speed, or
-            limits of neither acceleration nor torque (`MotionBounds`).
+        UsageError: for an unknown key or an invalid value, and if a joint has no velocity limit, or neither an
+            acceleration nor a torque limit (`MotionBounds`).
     """
     settings, where = read(LimitsFile, *tables_of(tables, chain, source, "limits"))
     without = ()
@@ -352,7 +377,7 @@ def read_motion_limits(
         pairs = tuple(f"{link} - {obstacle}" for link, obstacle in collision.pairs)
         constraints.append(Clearance(collision.distances, collision.gradients, pairs, pose_limits.clearance))
         if pose_limits.checked:
-            notes.append(f"kept: {', '.join(pose_limits.checked)}")
+            notes.append(f"respected: {', '.join(pose_limits.checked)}")
         if pose_limits.unchecked:
             notes.append(f"NOT checked: {', '.join(pose_limits.unchecked)}")
     return MotionLimits(
@@ -369,7 +394,7 @@ def read_motion_limits(
 
 
 def located(error: NothingFeasible) -> NothingFeasible:
-    """Return the error, with the table of the limits file that states the violated limit added to its message."""
+    """Return the error with a longer message, which names the table of the limits file with the violated limit."""
     if error.constraint not in STATED_IN:
         return error
     advice = f"the limit is that of {STATED_IN[error.constraint]} {PLACE}"
@@ -377,10 +402,14 @@ def located(error: NothingFeasible) -> NothingFeasible:
 
 
 def check_bodies(chain: Chain, torque: np.ndarray) -> None:
-    """Raise an error if torques are limited but the robot's masses or inertias are physically inconsistent.
+    """Check that masses and inertias in the robot's description are physically consistent, if torques are limited.
+
+    Args:
+        chain: the arm.
+        torque: (n,) torque limits [N m or N]; infinite: not limited.
 
     Raises:
-        UsageError: naming the inconsistent bodies.
+        UsageError: for inconsistent bodies; the message names them.
     """
     if not np.isfinite(torque).any():
         return
@@ -395,7 +424,7 @@ def check_bodies(chain: Chain, torque: np.ndarray) -> None:
 def _bounds(
     chain: Chain, robot: str, settings: LimitsFile, path: str, sizes: Sequence[np.ndarray], default: bool
 ) -> MotionBounds:
-    """Return the bounds of speed, acceleration and torque; with `default`, unlimited accelerations get a default limit.
+    """Return the bounds of velocity, acceleration and torque.
 
     Args:
         chain: the arm.
@@ -420,7 +449,13 @@ def _bounds(
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Named points of links: callable, joint values q (N, n) -> positions (N, k, 3) [m] in the base frame."""
+    """Named points of links: function of joint values q (N, n) with positions (N, k, 3) [m] in the base frame.
+
+    Attributes:
+        chain: the arm.
+        joints: for each of k points, the number (from 1) of the joint behind which it is fixed; 0: fixed to the tip.
+        places: (k, 3) coordinates of the points in the frames behind these joints [m].
+    """
 
     chain: Chain
     joints: tuple[int, ...]
@@ -430,7 +465,7 @@ class Points:
         return self._positions(q, sweep(self.chain, q).poses())
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return the gradient (N, n) of Σ G · points with respect to q, for weights G (N, k, 3)."""
+        """Return the gradient (N, n) of Σ G · points with respect to q (N, n), for weights G (N, k, 3)."""
         kinematics = sweep(self.chain, q)
         points = self._positions(q, kinematics.poses())
         gradient = np.zeros(q.shape)
@@ -456,7 +491,16 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class _PoseLimit:
-    """A constraint of pose selection, applied to the postures of a motion."""
+    """A constraint of pose selection that is applied to each sampled posture of a motion.
+
+    Attributes:
+        of: the constraint, with k values per posture.
+        name: its name in messages.
+        labels: (k,) names of the values.
+        scale: (k,) numbers [unit] by which values are divided to compare different constraints.
+        groups: (k,) group number of each value; the optimiser gets one smooth function per group.
+        unit: unit of the values.
+    """
 
     of: PoseConstraint
     name: str
@@ -477,7 +521,13 @@ class _PoseLimit:
 
 
 def _position_constraints(settings: LimitsFile, pose_limits: Limits, points: Points) -> list[MotionConstraint]:
-    """Return the constraints: workspace of the tip and of named points, and all other constraints of poses."""
+    """Return constraints on the workspace of tip and named points, and all other constraints of pose selection.
+
+    Args:
+        settings: content of the limits file.
+        pose_limits: limits of pose selection.
+        points: the named points.
+    """
     constraints: list[MotionConstraint] = []
     radius = settings.target.axis_distance
     lowest, highest = settings.target.heights
@@ -505,10 +555,13 @@ def _per_joint(
 
     Args:
         values: the table.
-        where: its name for messages.
+        where: name of the table for messages.
         chain: the arm.
         default: (n,) limits of joints that the table does not name; None: infinite.
-        quantities: name of the quantity for a revolute joint, and for a prismatic one.
+        quantities: physical quantity of a revolute joint's limit, and of a prismatic joint's limit.
+
+    Raises:
+        UsageError: for an unknown key or an invalid value.
     """
     index = {f"q{j + 1}": j for j in range(chain.n)}
     index |= {name: j for j, name in enumerate(chain.joint_names)}
@@ -548,6 +601,8 @@ def _friction(table: FrictionTable | None, chain: Chain, where: str) -> np.ndarr
     for key, coefficients in (("Fv", table.Fv), ("Fc", table.Fc)):
         joint_values = coefficients or (0.0,) * chain.n
         if len(joint_values) not in (1, chain.n):
-            raise UsageError(f"{where}: friction.{key}: {len(joint_values)} values for {chain.n} joints")
+            raise UsageError(
+                f"{where}: friction.{key}: {len(joint_values)} values for {chain.n} joints: state one per joint"
+            )
         result.append(np.broadcast_to(np.array(joint_values), (chain.n,)))
     return np.array(result)

@@ -74,12 +74,12 @@ def read_waypoints(
     Args:
         waypoints: the file; or in memory joint values (m, n) [rad or m], poses (m, 4, 4) [m], or targets.
         chain: arm with the best known geometry, whose tip is to reach the waypoints.
-        lower, upper: (n,) joint limits to stay within.
-        start: (n,) joint values of the robot before the motion: the first waypoint is solved near them; None: near the
-            middle of the limits.
+        lower, upper: (n,) joint limits of the solution.
+        start: (n,) joint values of the robot before the motion, near which the first waypoint is solved; None: near the
+            middle of the joint limits.
 
     Raises:
-        UsageError: for a waypoint out of reach, with its number and the distance.
+        UsageError: for a waypoint that cannot be reached; the message states its number and the distance.
     """
     if not isinstance(waypoints, Path):
         targets = Targets.of(waypoints)
@@ -114,8 +114,19 @@ def read_waypoints(
 def _reached(
     goal: Goal, target: np.ndarray, start_q: np.ndarray, configurations: np.ndarray, targets: Targets, k: int
 ) -> np.ndarray:
-    """Return joint values (n,) that reach a target (1, 4, 4), solved from `start_q`, or else from many
-    configurations.
+    """Return joint values (n,) at which the tip reaches a waypoint.
+
+    They are solved from the joint values `start_q` and, if this fails, from many random configurations.
+
+    Args:
+        goal: the inverse-kinematics problem.
+        target: (1, 4, 4) pose of the waypoint.
+        start_q: (n,) joint values at which the solution starts.
+        configurations: (N, n) random joint values.
+        targets, k: all waypoints and the index of this waypoint, for the message.
+
+    Raises:
+        UsageError: if the waypoint cannot be reached.
     """
     present = start_q[None]
     q = inverse.nearest(goal, target, present, inverse.reach(goal, target, present))
@@ -146,7 +157,7 @@ PerJoint = Annotated[tuple[float, ...], Expect("a list of numbers, one per joint
 @strict
 @dataclass(frozen=True)
 class _DrivesFile:
-    """The file of ``calib plan --drives``: [drives] with any of Ia, Fv, Fc, off per joint (SI, joint side)."""
+    """The file of ``calib plan --drives``: table ``[drives]`` with Ia, Fv, Fc, off per joint (SI, joint side)."""
 
     drives: Mapping[str, PerJoint] = field(default_factory=dict)
 
@@ -157,17 +168,18 @@ class Planned:
 
     Attributes:
         chain: the robot.
-        bounds: limits of speed and acceleration, and where they are stated.
-        limits: limits that the motion keeps, with the torque margins subtracted.
+        bounds: limits of velocity and acceleration, and the files that state them.
+        limits: limits for the timing, with the torque margins subtracted.
         lower, upper: (n,) joint limits.
-        timings: one per path: a single path through all waypoints, or one per straight line of the tool.
+        timings: one per path: a single path through all waypoints, or one path per straight line of the tool.
         track: the motion at the controller's rate.
-        margins: (n,) distance to the joint limits [rad or m]; None for straight lines of the tool.
+        margins: (n,) smallest distance to the joint limits [rad or m]; None for straight lines of the tool.
         deviation: (2,) largest deviation of the tool from its lines [m, rad]; None for joint paths.
-        shaped: result of the optimisation of the path's shape; None without one.
-        approach, rehearsal: tracks; None if not requested.
-        sigma: (n,) largest standard deviation of each predicted torque; `limits.torque` leaves as many of them free as
-            the limits file says (default 2); None if the model states none.
+        shaped: result of the optimisation of the path's shape; None if not requested.
+        approach, rehearsal: setpoints of the approach and the rehearsal; None if not requested.
+        sigma: (n,) largest standard deviation of each joint's predicted torque [N m or N]. Below the torque limits, the
+            number of standard deviations in the limits file (default 2) stays free. None if the model states no
+            covariance.
         notes: remarks for the user.
         source: the robot's description, as named by the user; empty if unknown.
     """
@@ -190,14 +202,14 @@ class Planned:
 
     @property
     def active_share(self) -> float:
-        """Share of the time during which the motion is close to a limit."""
+        """Share of the time during which the motion is close to one of its limits."""
         seconds = [timing.duration for timing in self.timings]
         shares = [timing.active_share for timing in self.timings]
         return float(np.average(shares, weights=seconds))
 
 
 def _silent(stage: str) -> None:
-    """Show no progress."""
+    """Ignore a progress text, `stage`."""
 
 
 def plan(
@@ -215,16 +227,19 @@ def plan(
     """Return the fastest motion of a robot through waypoints, within its limits.
 
     Args:
-        robot, base, tip: see `calib.robot.library`.
-        waypoints: see `calib.procedure.excitation.planning`.
-        settings: see `calib.procedure.excitation.settings`.
-        model: folder of an identification; its geometry and torques are used, the limits are those of the robot.
-        limits: see `calib.procedure.excitation.limits`.
-        drives: drive parameters, see `_read_drives`.
-        progress: called with the name of each step; None: silent.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
+        waypoints: CSV file of joint values or tool poses; or in memory joint values (m, n) [rad or m], poses (m, 4, 4)
+            [m], or targets.
+        settings: payloads, straight lines, rate, start, and optimisation of the path's shape.
+        model: folder of an identification, whose geometry and torques are used; the limits are those of the robot;
+            None: masses of the robot's description.
+        limits: limits file (`calib formats limits`), or its content as tables; None: limits of the robot's description.
+        drives: TOML file with a table ``[drives]`` of Ia, Fv, Fc, off per joint, or its tables; None: unknown.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
+        progress: called with a text on each step; None: silent.
 
     Raises:
-        UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
+        UsageError: for waypoints that cannot be reached, and limits that cannot be respected.
     """
     show = progress or _silent
     _check_request(settings, model)
@@ -289,7 +304,12 @@ def plan(
 
 
 def _check_request(settings: PlanSettings, model: Path | None) -> None:
-    """Refuse settings that contradict each other."""
+    """Raise a UsageError if settings contradict each other, or need an identified model that is not given.
+
+    Args:
+        settings: settings of the plan.
+        model: folder of an identification; None: no model.
+    """
     if settings.shorten and settings.lines:
         raise UsageError(
             "--shorten cannot be combined with --line: straight lines leave no path to change; leave one out"
@@ -306,7 +326,16 @@ def _shortened(
     dynamics: PathDynamics | None,
     show: Progress,
 ) -> Shaped:
-    """Return the path through the waypoints (m, n) whose shape gives the shortest time within all limits."""
+    """Return the path through the waypoints whose shape allows the shortest duration within all limits.
+
+    Args:
+        points: (m, n) waypoints [rad or m].
+        settings: number of timings, and largest deviation of the path from the spline.
+        motion_limits: joint limits, workspace and clearance.
+        timing_limits: limits of velocity, acceleration and torque.
+        dynamics: the robot's dynamics; None: no torque limits.
+        show: called with a text on the progress.
+    """
     positions = motion_limits.positions
 
     def duration(path: JointPath) -> float:
@@ -321,7 +350,12 @@ def _shortened(
 
 
 def _read_drives(tables: Tables | None, chain: Chain) -> dict[str, np.ndarray]:
-    """Read drive parameters (n,) from TOML: ``[drives]`` with Ia, Fv, Fc, off as needed (SI, joint side)."""
+    """Return drive parameters (n,) by name, from the table ``[drives]`` with Ia, Fv, Fc, off (SI, joint side).
+
+    Args:
+        tables: TOML file, or its tables; None: no parameters are stated, and the result is empty.
+        chain: the arm with n joints.
+    """
     content, where = read(_DrivesFile, tables, "drives")
     check_keys(content.drives, DRIVES, f"{where}: drives")
     drives = {}
@@ -331,10 +365,10 @@ def _read_drives(tables: Tables | None, chain: Chain) -> dict[str, np.ndarray]:
 
 
 def _check_constraints(path: JointPath, limits: MotionLimits) -> None:
-    """Raise an error if a point of a path violates the workspace or clearance of the limits file.
+    """Check that no point of a path violates the workspace or clearance in the limits file.
 
     Raises:
-        UsageError: with the violated constraint, the place, and the excess.
+        UsageError: for a violation; the message states the constraint, the position on the path, and the excess.
     """
     s = np.linspace(0, path.length, CHECKED_POINTS)
     zero = np.zeros((len(s), path.n))
@@ -345,10 +379,17 @@ def _check_constraints(path: JointPath, limits: MotionLimits) -> None:
 def _dynamics(
     chain: Chain, folder: Path | None, payloads: Sequence[str], tables: Tables | None, limits: MotionLimits
 ) -> tuple[PathDynamics | None, tuple[str, ...], Uncertainty | None]:
-    """Return dynamics, notes and uncertainty: of the identified model, or of the robot's inertias and stated drives.
+    """Return dynamics, notes and uncertainty of an identified model, or of the robot's inertias and stated drives.
 
-    Dynamics are None if the robot has neither inertias nor drives; uncertainty is None without an identified
+    The dynamics are None if the robot's description has no inertias. The uncertainty is None without an identified
     covariance.
+
+    Args:
+        chain: the arm.
+        folder: folder of an identification; None: the inertias of the robot's description are used.
+        payloads: labels of attached payloads.
+        tables: file or tables with drive parameters; None: none.
+        limits: limits of the motion, which may state friction.
     """
     if folder is not None:
         require(tables is None, "model and drives both state drive parameters; leave one of them out", UsageError)
@@ -381,7 +422,16 @@ def _dynamics(
 
 
 def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[PathDynamics, Uncertainty | None]:
-    """Return the dynamics of an identified model with the payloads, and its uncertainty; None without a covariance."""
+    """Return the dynamics of an identified model with payloads, and its uncertainty (None without a covariance).
+
+    Args:
+        chain: the arm.
+        folder: folder of the identification.
+        payloads: labels of the attached payloads.
+
+    Raises:
+        UsageError: for an unknown payload, or an identification of another arm.
+    """
     refuse_currents(folder, "a motion plan")
     refuse_other_arm(folder, chain)
     _, dynamics = read_dynamics(folder)
@@ -405,7 +455,16 @@ def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[Pa
 
 
 def _guarded(limits: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLimits:
-    """Return the limits with each torque limit reduced by a margin (n,) [N m or N]; refuse a margin above the limit."""
+    """Return the limits with each torque limit reduced by a margin.
+
+    Args:
+        limits: limits of velocity, acceleration and torque.
+        margin: (n,) margins [N m or N].
+        chain: the arm, whose joints the message names.
+
+    Raises:
+        UsageError: for a margin that reaches the torque limit.
+    """
     if (margin >= limits.torque).any():
         j = int(np.argmax(margin / limits.torque))
         raise UsageError(
@@ -416,9 +475,13 @@ def _guarded(limits: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLi
 
 
 def _paths(chain: Chain, points: np.ndarray, straight: bool) -> tuple[list[JointPath], np.ndarray | None]:
-    """Return the paths through waypoints (m, n): one spline, or straight lines of the tool.
+    """Return the paths through waypoints, and the largest deviation (2,) [m, rad] of straight lines.
 
-    The second value is the lines' largest deviation (2,) [m, rad]; None for the spline.
+    Args:
+        chain: the arm.
+        points: (m, n) waypoints [rad or m].
+        straight: whether the tool moves on straight lines, one path each; otherwise there is one spline in joint space,
+            and the deviation is None.
     """
     if not straight:
         return [spline(points)], None

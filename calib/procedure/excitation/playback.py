@@ -1,7 +1,7 @@
 """Setpoints of an exciting motion for a controller: approach, periods, and a slow rehearsal.
 
-The approach leads from the robot's present posture to the start of the motion, slowly, with limited jerk, and within
-the limits file.
+The approach leads slowly from the robot's present posture to the start of the motion, with limited jerk, and within the
+limits of the limits file.
 """
 
 from collections.abc import Sequence
@@ -21,8 +21,8 @@ from calib.trajectories.basis import Family, SampledMotion
 from calib.trajectories.constraints import BoxLimit
 from calib.trajectories.design.search import SearchResult
 from calib.trajectories.design.verify import dense_motion
-from calib.trajectories.places import Clearance
 from calib.trajectories.setpoints import Setpoints, joined, slowed
+from calib.trajectories.workspace_limits import Clearance
 
 # [1/s, 1/s^2] acceleration and jerk of an approach over its speed, where none is stated
 APPROACH_RISE = DEFAULT_RISE
@@ -41,7 +41,8 @@ class Playback:
 
     Attributes:
         run: `repeat` periods, preceded by the approach if there is one.
-        approach, rehearsal: None if not requested; the rehearsal is the approach and one period at lower speed.
+        approach: setpoints of the approach; None if not requested.
+        rehearsal: approach and one period at lower speed; None if not requested.
         repeat: number of periods.
         notes: remarks for the user.
     """
@@ -54,7 +55,14 @@ class Playback:
 
 
 def play(family: Family, result: SearchResult, inputs: ExcitationInputs, settings: ExcitationSettings) -> Playback:
-    """Return the setpoints of a designed motion: approach, periods and rehearsal, as set."""
+    """Return the setpoints of a designed motion: periods, and approach and rehearsal if the settings request them.
+
+    Args:
+        family: family of motions.
+        result: the motion, as variables of the family.
+        inputs: robot, model and limits.
+        settings: settings with rate, number of periods, start, and factor of the rehearsal.
+    """
     model, limits, chain = inputs.model, inputs.limits, inputs.chain
     # a period holds a whole number of the controller's samples
     period = family.period * result.factor
@@ -76,7 +84,12 @@ def play(family: Family, result: SearchResult, inputs: ExcitationInputs, setting
 
 
 def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
-    """Return the track with the largest predicted torques over all loads; unchanged if parameters are unknown."""
+    """Return setpoints with the largest predicted torques over all payloads; unchanged if parameters are unknown.
+
+    Args:
+        track: the setpoints.
+        dynamics: the model that predicts the torques.
+    """
     if dynamics.values is None:
         return track
     torques = []
@@ -88,7 +101,14 @@ def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
 
 
 def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Chain) -> tuple[str, ...]:
-    """Return a note if the predicted torques of a track exceed their limits; () if not."""
+    """Return a note if the predicted torques of setpoints exceed the torque limits; otherwise empty.
+
+    Args:
+        name: name of the setpoints for the note.
+        track: the setpoints; None: no setpoints.
+        limits: limits of the motion.
+        chain: the arm.
+    """
     if track is None or track.tau is None:
         return ()
     share = (np.abs(track.tau) / limits.torque).max(axis=0)
@@ -103,7 +123,7 @@ def approach_to(
 ) -> tuple[Setpoints | None, tuple[str, ...]]:
     """Return setpoints of a straight approach in joint space to the start of a motion, and notes on violated limits.
 
-    Limits of velocity, acceleration and jerk come from the limits file, else from the robot, else from our own choice.
+    Limits of velocity, acceleration and jerk are from the limits file or the robot; missing limits are our choice.
 
     Args:
         start: (n,) joint values of the robot before the motion [rad or m]; None: no approach.
@@ -142,7 +162,16 @@ def approach_to(
 
 
 def check_start(start: Sequence[float] | None, chain: Chain, limits: MotionLimits) -> np.ndarray | None:
-    """Return the start as an array (n,), None if None; refuse a wrong number of values or a violated joint limit."""
+    """Return the joint values of a start as an array (n,); None for None.
+
+    Args:
+        start: joint values of the robot before the motion [rad or m]; None: unknown.
+        chain: the arm with n joints.
+        limits: limits of the motion.
+
+    Raises:
+        UsageError: for a wrong number of values, or a value beyond the joint limits.
+    """
     if start is None:
         return None
     q = np.asarray(start, dtype=float)

@@ -1,18 +1,22 @@
 """Predicted σ of the parameters and torques that a motion identifies, before the robot moves.
 
-With Y the regressor of one sample and σ_j the standard deviation of joint j's torque error that no parameter explains,
-a log of R independent rows per joint yields the base parameters with the covariance
+With Y the regressor of one sample and σ_j the standard deviation of the torque error of joint j that no parameter
+explains, a log of R independent rows per joint yields the base parameters with the covariance
 
     C = (R · mean over the period of Σ_j Y_jᵀ Y_j / σ_j²)⁻¹,
 
-and the torque of another motion with the variance Y C Yᵀ. On a calibrated robot an error g of the geometry, which is
-the same in all logs, adds to both (`calib.identification.uncertainty.geometry_uncertainty`): the parameters err by
+and the torque of another motion with the variance Y C Yᵀ. On a calibrated robot, an error g of the geometry, which is
+equal in all logs, adds to both (`calib.identification.uncertainty.geometry_uncertainty`). It changes the parameters by
 S g = -C Σ Yᵀ (∂Y/∂g φ) g / σ², with earlier motions by C (C_before⁻¹ S_before g - …), and the torques by
-Y S g + (∂Y/∂g φ) g. A design minimises only the part from torque errors. R is the number of rows that
-`calib identify` keeps: twice the identification band, computed from the accelerations by the same rules. Before a log
-exists, σ_j is unknown: it consists of noise, and of friction that no term models. It is taken from the limits file
-([noise]), or as a share of the torque limits, stated or `DEFAULT_NOISE`; all predicted σ except the geometry's part are
-proportional to it.
+Y S g + (∂Y/∂g φ) g. A design minimises only the part from torque errors.
+
+R is the number of rows that `calib identify` uses: twice the identification band, computed from the accelerations by
+the rules of the identification. Before a log exists, σ_j is unknown: it consists of noise, and of friction that no term
+models. It is taken from the limits file ([noise]), or assumed as a share of the torque limits (stated, or
+`DEFAULT_NOISE`). All predicted σ except the geometry's part are proportional to it.
+
+After an identification, σ_j² is the spectral density of the errors that it left. Its share that grew with the torques'
+rates of change is scaled by the torques' variance on the new motion (`calib.identification.uncertainty.error_growth`).
 """
 
 from collections.abc import Callable, Sequence
@@ -58,10 +62,10 @@ class MotionPrediction:
     """σ predicted for a log of a motion.
 
     Attributes:
-        seconds: duration of the motion.
+        seconds: duration of the motion [s].
         rows_per_joint: number of independent rows per joint.
-        torque_sigma: (n,) rms of the predicted torque's σ over the typical task [N m or N].
-        torque_sigma_share: rms of `torque_sigma` over the joints, as a share of the torque limits.
+        torque_sigma: (n,) rms over the typical task of the σ of the predicted torque [N m or N].
+        torque_sigma_share: rms over the joints of `torque_sigma`, as a share of the torque limits.
     """
 
     seconds: float
@@ -71,10 +75,15 @@ class MotionPrediction:
 
 
 class PredictedSigma(NamedTuple):
-    """A row of ``prediction.csv``: a parameter, its value if known, and the σ predicted for the motion as run.
+    """A row of ``prediction.csv``: a parameter, and the σ predicted for the motion as it is to be run.
 
-    `sigma_before` is the σ of the identification that the motion complements; `sigma_geometry` the geometry's part of
-    σ.
+    Attributes:
+        name, unit: name and unit of the parameter.
+        value: its value; None if unknown.
+        sigma: predicted standard deviation.
+        rsd: `sigma` in percent of the value; None if the value is unknown.
+        sigma_before: σ by the identification that the motion complements; None: no such identification.
+        sigma_geometry: part of `sigma` that is due to the uncertain geometry; None if the geometry is taken as exact.
     """
 
     name: str
@@ -87,8 +96,11 @@ class PredictedSigma(NamedTuple):
 
 
 class Task(NamedTuple):
-    """Regressors (N, rows, c) at states of a typical task, and the torques' changes (N, rows, r) by the geometry's
-    errors.
+    """A typical task, sampled at N states.
+
+    Attributes:
+        regressors: (N, rows, c) regressors at the states.
+        felt: (N, rows, r) changes of the torques by r principal errors of the geometry.
     """
 
     regressors: np.ndarray
@@ -97,15 +109,16 @@ class Task(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MotionOutlook:
-    """Predicted σ of a designed motion, and of motions of other lengths.
+    """Predicted σ of a designed motion, and of motions with other durations.
 
     Attributes:
         noise_share: assumed torque error as a share of the torque limits.
         noise: (n,) assumed torque error [N m or N].
-        own: prediction for the motion as it is to be run.
-        by_period: predictions for other lengths: longer ones repeat the same motion, shorter ones are designed quickly.
-        before: `torque_sigma_share` of the identification that the motion complements; None without one.
-        torque_sigma_before: (n,) `torque_sigma` of that identification [N m or N]; None without one.
+        own: prediction for the designed motion as it is to be run.
+        by_period: predictions for other durations: longer ones repeat the designed motion, shorter ones are designed by
+            a quick search.
+        before: `torque_sigma_share` of the identification that the motion complements; None: no such identification.
+        torque_sigma_before: (n,) `torque_sigma` of that identification [N m or N]; None: no such identification.
     """
 
     noise_share: float
@@ -123,14 +136,16 @@ def foretell(
     motion: SearchResult,
     problem_of: Callable[[float], ExcitationProblem],
 ) -> tuple[MotionOutlook | None, Sequence[PredictedSigma]]:
-    """Return the predicted σ of torques (None if a joint has no torque limit) and of the parameters (then empty).
+    """Return the predicted σ of torques and of parameters for a designed motion.
+
+    Without torque limits of all joints, the results are None and empty.
 
     Args:
         inputs: the robot, its limits and model.
         settings: settings of the design.
         problem: optimisation problem of the design.
         motion: solution of the problem.
-        problem_of: function of a period [s] that returns the problem with this period.
+        problem_of: function that returns the optimisation problem for a period [s].
     """
     limits, noise = inputs.limits.torque, inputs.limits.noise
     if not np.isfinite(limits).all():
@@ -178,8 +193,9 @@ def _parameter_rows(
 
     Args:
         inputs: the robot and its model.
-        root, shifts: see `_prediction`.
-        sigmas_before: (c,) σ of the identification that the motion complements; None without one.
+        root: (c, c) square root of the parameters' covariance from torque errors.
+        shifts: (c, r) shifts of the parameters by the principal errors of the geometry.
+        sigmas_before: (c,) σ of the identification that the motion complements; None: no such identification.
     """
     model, columns = inputs.model, inputs.columns.kept
     values = np.full(len(model.exact.names), np.nan)
@@ -202,8 +218,14 @@ def _parameter_rows(
 
 
 def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray, float], list[float]]:
-    """Return the σ that an earlier identification states: of torques on a task (see `_torque_sigma`), and of
-    parameters.
+    """Return the σ that an earlier identification states, for the torques of a task and for the parameters.
+
+    Args:
+        inputs: the robot, its model and the earlier identification.
+        task: the typical task.
+
+    Returns:
+        σ of each joint's torque (n,) with the rms of σ / torque limit, and σ (c,) of the parameters.
     """
     root = _root(_information_root(inputs))
     shifts = _shifts_before(inputs)
@@ -212,7 +234,11 @@ def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray
 
 
 def _information_root(inputs: ExcitationInputs) -> np.ndarray:
-    """Return a square root W (c, c) of the earlier motions' information matrix Wᵀ W, for the columns of the design."""
+    """Return a square root W (c, c) of the earlier motions' information matrix Wᵀ W.
+
+    Args:
+        inputs: model and earlier motions; c is the number of columns of the design.
+    """
     assert inputs.prior is not None
     columns = inputs.columns.kept
     values, V = np.linalg.eigh(inputs.prior.information[columns][:, columns])
@@ -220,21 +246,36 @@ def _information_root(inputs: ExcitationInputs) -> np.ndarray:
 
 
 def _root(W: np.ndarray) -> np.ndarray:
-    """Return a root C^(1/2) (c, c) of the covariance (Wᵀ W)⁻¹."""
+    """Return a square root C^(1/2) (c, c) of the covariance C = (Wᵀ W)⁻¹: C^(1/2) C^(1/2)ᵀ = C.
+
+    Args:
+        W: (rows, c) weighted observation matrix, or a square root of the information matrix.
+    """
     scale = np.maximum(np.linalg.norm(W, axis=0), 1e-300)
     _, s, vt = np.linalg.svd(W / scale, full_matrices=False)
     return (vt.T / np.maximum(s, 1e-12 * s[0])) / scale[:, None]
 
 
 def _geometry_torques(inputs: ExcitationInputs, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return the torques' changes (N, rows, r) by the principal errors of the geometry; r = 0 for an exact one."""
+    """Return the changes (N, rows, r) of the torques by r principal errors of the geometry; r = 0 without them.
+
+    Args:
+        inputs: the robot with its geometry's uncertainty, and the model.
+        q, v, a: (N, n) positions, velocities and accelerations.
+    """
     if inputs.geometry is None or inputs.model.values is None:
         return np.zeros((len(q), len(inputs.model.exact.joint_of_row), 0))
     return inputs.geometry.felt(inputs.model.values, q, v, a)
 
 
 def _shifts_before(inputs: ExcitationInputs) -> np.ndarray:
-    """Return the shifts (c, r) of an earlier identification's parameters by the principal errors of the geometry."""
+    """Return the shifts (c, r) of an earlier identification's parameters by r principal errors of the geometry.
+
+    Without principal errors, r is 0.
+
+    Args:
+        inputs: the earlier identification and the geometry's uncertainty.
+    """
     if inputs.geometry is None:
         return np.zeros((len(inputs.columns.names), 0))
     return inputs.geometry.before[inputs.columns.kept]
@@ -243,11 +284,11 @@ def _shifts_before(inputs: ExcitationInputs) -> np.ndarray:
 def _torque_sigma(
     inputs: ExcitationInputs, task: Task, root: np.ndarray, shifts: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return the σ of each joint's predicted torque (n,), largest over the loads, and the rms of σ / torque limit.
+    """Return the σ of each joint's predicted torque (n,), largest over the payloads, and the rms of σ / torque limit.
 
     Args:
         inputs: the robot and its model.
-        task: states of the task.
+        task: the typical task.
         root: (c, c) square root of the parameters' covariance.
         shifts: (c, r) shifts of the parameters by the geometry's errors.
     """
@@ -260,7 +301,12 @@ def _torque_sigma(
 
 
 def task_states(inputs: ExcitationInputs, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return q, v, a (TASK_STATES, n) of a typical task, drawn with the seed."""
+    """Return random positions, velocities and accelerations q, v, a (TASK_STATES, n) of a typical task.
+
+    Args:
+        inputs: the robot and its limits.
+        seed: seed of the states.
+    """
     n = inputs.chain.n
     box = inputs.limits.positions
     low = np.where(np.isfinite(box.lower), box.lower, -np.pi)
@@ -278,7 +324,12 @@ def task_states(inputs: ExcitationInputs, seed: int) -> tuple[np.ndarray, np.nda
 
 
 def task_of(inputs: ExcitationInputs, seed: int) -> Task:
-    """Return the typical task: regressors and effects of the geometry's errors at the states of `task_states`."""
+    """Return the typical task: regressors and effects of the geometry's errors at the states of `task_states`.
+
+    Args:
+        inputs: the robot and its model.
+        seed: seed of the states.
+    """
     states = task_states(inputs, seed)
     regressors = inputs.model.exact.regressor(*states)[:, :, inputs.columns.kept]
     return Task(regressors, _geometry_torques(inputs, *states))
@@ -287,19 +338,29 @@ def task_of(inputs: ExcitationInputs, seed: int) -> Task:
 def _prediction(
     inputs: ExcitationInputs, noise: np.ndarray, task: Task, family: Family, x: np.ndarray, factor: float, repeat: float
 ) -> tuple[MotionPrediction, np.ndarray, np.ndarray]:
-    """Return the prediction for `repeat` periods of a motion, and the two parts of the parameters' errors.
+    """Return the prediction for a motion, and the two parts of the parameters' errors.
 
-    The parts are a square root (c, c) of the covariance by torque errors, and the shifts (c, r) by the geometry's
-    errors.
+    Args:
+        inputs: the robot and its model.
+        noise: (n,) assumed torque errors [N m or N].
+        task: the typical task.
+        family, x, factor: family of motions, and variables and time factor of the motion.
+        repeat: number of periods.
+
+    Returns:
+        The prediction, a square root (c, c) of the covariance from torque errors, and the shifts (c, r) of the
+        parameters by the geometry's errors.
     """
     exact, columns = inputs.model.exact, inputs.columns.kept
     period = family.period * factor
     motion = dense_motion(family, x, period / PERIOD_SAMPLES * np.arange(PERIOD_SAMPLES), factor)
     rows = 2.0 * _band(motion, period) * period * repeat
 
+    regressor = exact.regressor(motion.q, motion.v, motion.a)
     # rows are weighted by the stated density of the torques' errors, else by the noise of each independent row
     sigmas = inputs.columns.sigmas
     if sigmas is not None and inputs.errors_known:
+        sigmas = sigmas * _growth(inputs, regressor)
         weight = period * repeat / PERIOD_SAMPLES
         earlier = _information_root(inputs)
     else:
@@ -308,7 +369,7 @@ def _prediction(
         weight = rows / PERIOD_SAMPLES
         earlier = np.zeros((0, task.regressors.shape[2]))
     factors = np.sqrt(weight) / sigmas[:, None]
-    Y = exact.regressor(motion.q, motion.v, motion.a)[:, :, columns] * factors
+    Y = regressor[:, :, columns] * factors
     Y = Y.reshape(-1, len(task.regressors[0, 0]))
     geometry_torques = _geometry_torques(inputs, motion.q, motion.v, motion.a) * factors
     geometry_torques = geometry_torques.reshape(len(Y), -1)
@@ -319,8 +380,22 @@ def _prediction(
     return MotionPrediction(period * repeat, rows, torque_sigma, share), root, shifts
 
 
+def _growth(inputs: ExcitationInputs, regressor: np.ndarray) -> np.ndarray:
+    """Return the factor (rows,) of the torque errors' σ on a motion with this regressor (N, rows, b); 1: not known."""
+    values = inputs.model.values
+    if inputs.prior is None or inputs.prior.growth is None or values is None:
+        return np.ones(regressor.shape[1])
+    torques = regressor @ values
+    return np.sqrt(inputs.prior.growth.factor(torques.var(axis=0)))
+
+
 def _band(motion: SampledMotion, period: float) -> float:
-    """Return the band [Hz] in which identification compares torques: twice f_dyn (`calib.data.signals.bandwidth`)."""
+    """Return the identification band [Hz]: twice the bandwidth f_dyn of a motion (`calib.data.signals.bandwidth`).
+
+    Args:
+        motion: the motion, sampled evenly over one period.
+        period: the period [s].
+    """
     power = np.abs(np.fft.rfft(motion.a, axis=0)) ** 2
     total = np.cumsum(power, axis=0)
     lines = np.argmax(total >= SHARE * total[-1], axis=0)[total[-1] > 0]
@@ -334,8 +409,16 @@ def _shortened(
     period: float,
     evaluations: int,
 ) -> tuple[Family, SearchResult] | None:
-    """Return family and motion of a shorter period; None if there is none. The search starts from the same, scaled
-    path.
+    """Return family and solution of a motion with a shorter period; None if no such motion is possible.
+
+    The search starts from the path of the given motion, scaled in amplitude by the ratio of the periods.
+
+    Args:
+        problem: optimisation problem of the designed motion.
+        motion: the designed motion.
+        problem_of: function that returns the optimisation problem for a period [s].
+        period: the shorter period [s].
+        evaluations: largest number of evaluations of the search.
     """
     try:
         shorter = replace(problem_of(period), stretch=(1.0, 1.0))
@@ -353,8 +436,13 @@ def _shortened(
 
 
 def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
-    """Write the parameters' predicted σ as CSV and return its path; value and rsd [%] are empty if a value is
-    unknown.
+    """Write the predicted σ of the parameters as CSV and return the file's path.
+
+    Value and rsd [%] are empty for parameters with unknown values.
+
+    Args:
+        rows: the predicted parameters.
+        folder: folder of the designed motion.
     """
     header = list(PredictedSigma._fields)
     header[header.index("rsd")] = "rsd [%]"
@@ -362,9 +450,13 @@ def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
 
 
 def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> list[str]:
-    """Return the predicted σ of torques as lines of text, for this motion and for motions of other lengths.
+    """Return lines of text on the predicted σ of torques, for the designed motion and for motions of other durations.
 
-    If the motion complements an identification, the three parameters whose σ decreases most follow.
+    If the motion complements an identification, a line names the three parameters whose σ decreases most.
+
+    Args:
+        outlook: prediction for the designed motion and other durations.
+        predicted: predicted σ of the parameters; empty: no line on parameters.
     """
     by_period = ""
     if outlook.by_period:
@@ -385,7 +477,7 @@ def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> l
 
 
 def check_folder(folder: Path) -> None:
-    """Raise a UsageError if a folder contains no prediction of `calib excite`."""
+    """Raise a UsageError if a folder contains no prediction that `calib excite` wrote."""
     require((folder / NAME).is_file(), f"{folder} has no {NAME}: give the folder that calib excite wrote", UsageError)
 
 
@@ -395,7 +487,11 @@ class _Predicted:
 
 
 def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -> str:
-    """Return a line that compares the predicted σ (folder of `calib excite`) with the identified σ.
+    """Return a line of text that compares predicted and identified σ of the parameters.
+
+    Args:
+        folder: folder that `calib excite` wrote.
+        outcome: the identification.
 
     Raises:
         UsageError: if the folder contains no prediction, or a prediction for other parameters.
@@ -416,6 +512,7 @@ def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -
     ratio = sigma_ratio(predicted, identified, residual=residual, assumed=outlook.noise_share)
     if ratio is None:
         raise UsageError(
-            f"{folder} contains none of the {len(identified)} identified parameters: it belongs to another robot"
+            f"{folder} contains none of the {len(identified)} identified parameters, so it belongs to another robot: "
+            "give the excitation of this one"
         )
     return sentence(ratio)

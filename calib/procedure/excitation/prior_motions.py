@@ -1,4 +1,4 @@
-"""Information of earlier motions, recorded or designed, which a new motion complements."""
+"""Information matrices of earlier motions, recorded or designed, which a new motion complements."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from calib.dynamics.base import information
 from calib.errors import UsageError
 from calib.folders import COVARIANCE
 from calib.identification.identify_options import FileSettings
+from calib.identification.uncertainty.error_growth import ErrorGrowth
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.geometry_tables import TORQUE_COVARIANCE
 from calib.procedure.dynamic_stage.inputs import read_motion
@@ -29,15 +30,26 @@ MIN_RATE = 50
 
 
 class PrincipalErrors(Protocol):
-    """Principal errors g_i = √λ_i u_i, i = 1 … r, of a calibrated geometry with the covariance Σ λ_i u_i u_iᵀ."""
+    """Principal errors g_i (i = 1 … r) of a calibrated geometry: g_i = √λ_i u_i.
+
+    λ_i and u_i are the eigenvalues of the covariance of the geometric parameters that are not negligible, and their
+    eigenvectors.
+    """
 
     @property
     def before(self) -> np.ndarray:
-        """Shifts (b, r) of an earlier identification's parameters by each principal error; zero without one."""
+        """Shifts (b, r) of an earlier identification's parameters by each error; zero without an identification."""
         ...
 
     def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the changes of the torques (N, rows, r) by each error, at fixed base parameters `values` (b,)."""
+        """Return the changes (N, rows, r) of the torques [N m or N] by each principal error.
+
+        The base parameters are constant.
+
+        Args:
+            values: (b,) base parameters.
+            q, v, a: (N, n) positions, velocities and accelerations.
+        """
         ...
 
 
@@ -47,18 +59,26 @@ class PriorMotions:
 
     Attributes:
         names: names of the files or folders of the motions.
-        seconds: duration of the motions.
-        information: (b, b) ∫ ωᵀω dt of the design's columns, with the rows divided by `sigmas`.
-        sigmas: (rows,) square root of the torque errors' density that an identification states; None: 1.
+        seconds: duration of the motions [s].
+        information: (b, b) ∫ ωᵀω dt of the regressor ω (rows, b), restricted to the columns of the design, with the
+            rows divided by `sigmas`.
+        sigmas: (rows,) square root of the torque errors' spectral density that an identification states; None: 1.
+        growth: how these errors grow with the motion; None if unknown.
     """
 
     names: tuple[str, ...]
     seconds: float
     information: np.ndarray
     sigmas: np.ndarray | None = None
+    growth: ErrorGrowth | None = None
 
     def per_sample(self, count: int, duration: float) -> np.ndarray:
-        """Return the information (b, b) per sample of a new motion of `duration` seconds and `count` samples."""
+        """Return the information (b, b) of the earlier motions in units of one sample of a new motion.
+
+        Args:
+            count: number of samples of the new motion.
+            duration: duration of the new motion [s].
+        """
         return self.information * (count / duration)
 
 
@@ -70,32 +90,34 @@ def read_prior(
     noise: np.ndarray | None = None,
     geometry: PrincipalErrors | None = None,
 ) -> PriorMotions | None:
-    """Return the information from recordings (``log.npz@0:9.4`` cuts) and folders of `calib excite`; None if none.
+    """Return the information of earlier motions from recordings and folders; None if there are none.
 
-    Recordings are filtered and differentiated as by `calib identify`. The information of an identification `after`, its
+    Recordings are filtered and differentiated as in `calib identify`. The information of an identification `after`, its
     prior included, is the inverse of its covariance without the geometry's part.
 
     Args:
-        paths: recordings, or folders of `calib excite`.
+        paths: recordings with optional cuts (``log.npz@0:9.4``), or folders of `calib excite`.
         model: the model to excite.
         chain: the arm.
-        after: folder of an identification; None without one.
-        noise: (rows,) by which torque rows are divided if no identification states their errors; None: 1.
-        geometry: principal errors of the geometry; None if the geometry is taken as exact.
+        after: folder of an identification; None: no identification.
+        noise: (rows,) σ by which torque rows are divided if no identification states their errors; None: 1.
+        geometry: principal errors of the geometry; None: the geometry is taken as exact.
 
     Raises:
-        UsageError, MeasurementError: for a path that is neither, or belongs to another robot.
+        UsageError, MeasurementError: for a path that is neither recording nor folder of a motion, or belongs to another
+            robot.
     """
     if not paths and after is None:
         return None
     column_count = len(model.exact.names)
     total = np.zeros((column_count, column_count))
-    sigmas = None
+    sigmas = growth = None
     names: list[str] = []
     identified: tuple[str, ...] = ()
     if after is not None:
         total, sigmas = _identified_information(after, model, geometry)
         names.append("what is identified")
+        growth = _growth(after, model)
         identified = tuple(IdentificationFolder(after).metrics().identification)
     row_sigmas = noise if sigmas is None else sigmas
     seconds = 0.0
@@ -108,7 +130,7 @@ def read_prior(
             q, v, a, rate = _recorded(text, chain)
         total += information(model.exact, q, v, a, row_sigmas) / rate
         seconds += len(q) / rate
-    return PriorMotions((*names, *paths), seconds, total, sigmas)
+    return PriorMotions((*names, *paths), seconds, total, sigmas, growth)
 
 
 def _identified_information(
@@ -120,6 +142,9 @@ def _identified_information(
         folder: folder of the identification.
         model: the model to excite.
         geometry: principal errors; if given, the geometry's part of the covariance is excluded; None: included.
+
+    Raises:
+        UsageError: if the stored covariance or torque errors are missing, damaged or of another model.
     """
     metrics = IdentificationFolder(folder).metrics()
     density = metrics.error_density
@@ -152,12 +177,30 @@ def _identified_information(
     return np.linalg.inv(correlation) / scale, root_density
 
 
+def _growth(folder: Path, model: ExcitedModel) -> ErrorGrowth | None:
+    """Return how the torque errors of an identification grow with the motion; None for files of earlier versions."""
+    metrics = IdentificationFolder(folder).metrics()
+    if metrics.error_growth is None or metrics.torque_variance is None:
+        return None
+    loads = len(model.exact.loads)
+    return ErrorGrowth(np.tile(metrics.error_growth, loads), np.tile(metrics.torque_variance, loads))
+
+
 def designed_orders(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return q, v, a of all periods of a designed motion, sampled at 50 Hz or more, and the sampling rate [Hz]."""
+    """Return q, v, a (N, n) of all periods of a designed motion, sampled at 50 Hz or more, and the sampling rate [Hz].
+
+    Args:
+        folder: folder that `calib excite` wrote.
+        chain: the arm.
+
+    Raises:
+        UsageError: if the motion belongs to a robot with other joints.
+    """
     motion = coefficients.read(folder)
     if motion.joint_names != tuple(chain.joint_names):
         raise UsageError(
-            f"{folder}: the motion has joints {', '.join(motion.joint_names)}; {chain.name} has "
+            f"{folder}: the motion is of another robot: it has joints {', '.join(motion.joint_names)}, "
+            f"{chain.name} has "
             f"{', '.join(chain.joint_names)}"
         )
     count = max(MIN_SAMPLES, round(MIN_RATE * motion.period))

@@ -1,4 +1,4 @@
-"""Settings of designing and planning motions: the same defaults for commands, guided run and scripts."""
+"""Settings for designing and planning motions; commands, guided procedure and scripts use the same defaults."""
 
 import re
 from dataclasses import dataclass
@@ -23,7 +23,10 @@ AIMS = ("logdet", "smallest", "torque", "parameters")
 
 
 def split_goal(text: str) -> tuple[str, float]:
-    """Return name and value of a goal such as ``wrist=0.1``.
+    """Return name and value of a goal.
+
+    Args:
+        text: the goal, such as ``wrist=0.1``.
 
     Raises:
         UsageError: for an unknown name, or a missing number.
@@ -38,16 +41,26 @@ def split_goal(text: str) -> tuple[str, float]:
     return name, value
 
 
-def _goal(text: object, aims: tuple[str, ...] = AIMS) -> object:
+def checked_goal(text: object, aims: tuple[str, ...] = AIMS) -> object:
+    """Return the text of a goal after checking its name and number; anything but a text is returned as it is.
+
+    Args:
+        text: the goal, such as ``wrist=0.1`` or ``logdet``.
+        aims: names of goals without a number.
+
+    Raises:
+        UsageError: for an unknown name, or a missing number.
+    """
     if isinstance(text, str) and text not in aims:
         split_goal(text)
     return text
 
 
-Goal = Annotated[str, Checked(_goal)]
-HardGoal = Annotated[str, Checked(lambda text: _goal(text, ()))]
+Goal = Annotated[str, Checked(checked_goal)]
+HardGoal = Annotated[str, Checked(lambda text: checked_goal(text, ()))]
 Rate = Annotated[float, Real(above=0.0, most=1e5, unit="Hz")]
 Period = Annotated[float, Real(above=0.0, most=3600.0, unit="s")]
+Front = Annotated[int, Whole(0, 1000)]
 Slower = Annotated[float, Real(least=1.0, most=1000.0)]
 Starts = Annotated[int, Whole(1, 10_000)]
 Evaluations = Annotated[int, Whole(1, 10_000_000)]
@@ -59,26 +72,26 @@ Start = tuple[Annotated[float, Real(infinite=True, quantity="1")], ...]
 @checked
 @dataclass(frozen=True)
 class ExcitationSettings:
-    """Settings of designing and playing an exciting motion.
+    """Settings for designing and playing an exciting motion.
 
-    Without goals the logarithms of both condition numbers are minimised in equal parts.
+    Without goals, the logarithms of both condition numbers (raw and normalised) are minimised with equal weights.
 
     Attributes:
         goals: raw=35, normalised=6 (condition numbers), wrist=0.1 or joint6=0.1 (mean torque as a share of the limit,
-            at least), coverage=0.1 (share of time at low and at high speed), duration=12 [s]; repeatable.
-            Instead of condition numbers, without a number: logdet, smallest (of the information), torque or parameters
-            (predicted σ of torques on a typical task, or of parameters relative to their values)
+            at least), coverage=0.1 (share of time at low and at high speed), duration=12 [s]; repeatable. Instead of
+            condition numbers, without a number: logdet, smallest (of the information), torque or parameters (predicted
+            σ of torques on a typical task, or of parameters relative to their values)
         hard: a goal that the motion must reach, e.g. wrist=0.1; repeatable
         period: largest period of the motion [s]
         shortest: shortest period that the search may use [s]; default: the period is fixed
         harmonics: frequencies per joint, or control points of splines; default 12, or as many as are below resonance
         family: fourier (Fourier series) or bspline (splines)
-        drives: drive terms to identify, if neither an identified model nor options state them; default Ia Fv Fc off,
-            as of calib identify
+        drives: drive terms to identify, if neither an identified model nor options state them; default Ia Fv Fc off, as
+            of calib identify
         loads: payloads of one run: none, a label, or labels with +; the same motion runs once with each; repeatable.
             Default: none, then each payload of the options
-        columns: parameters that the motion has to determine, or essential: those that the identification of the
-            model kept; repeatable. Default: all
+        columns: parameters that the motion has to determine, or essential: those that the identification of the model
+            kept; repeatable. Default: all
         rate: of the controller [Hz]
         samples: instants per period at which the search evaluates limits and objectives
         starts: random starts of the search
@@ -90,8 +103,8 @@ class ExcitationSettings:
         repeat: number of periods to run one after the other
         slower: factor of a slow rehearsal, written next to the motion; 1: none
         existing: a recording (log.npz@0:9.4 cuts) or folder of an earlier design, to complement; repeatable
-        within: folder of an earlier design, whose positions, speeds and accelerations are not exceeded: for a motion
-            to validate on
+        within: folder of an earlier design, whose positions, speeds and accelerations are not exceeded: for a motion to
+            validate on
         lock: a joint that does not move: joint4, or joint4=0.5 [rad or m]; repeatable
         noise: expected torque residual as a share of the torque limits; only for predicted sigmas; default 0.01, or
             that of each joint in the limits file ([noise])
@@ -113,7 +126,7 @@ class ExcitationSettings:
     evaluations: Evaluations = 1500
     solver: Annotated[Solver, OneOf(get_args(Solver))] = "slsqp"
     seed: Seed = 0
-    front: Annotated[int, Whole(0, 1000)] = 0
+    front: Front = 0
     start: Start | None = None
     repeat: Annotated[int, Whole(1, 10_000)] = 1
     slower: Slower = 1.0
@@ -130,7 +143,7 @@ DEFAULT_DESIGN = ExcitationSettings()
 @checked
 @dataclass(frozen=True)
 class PlanSettings:
-    """Settings of planning a motion through waypoints.
+    """Settings for planning a motion through waypoints.
 
     Attributes:
         payloads: label of an identified payload that is attached; repeatable

@@ -93,12 +93,13 @@ class Export:
     """Sources of an export: nominal robot, fit and identification.
 
     Attributes:
-        source: description of the nominal robot: a URDF is edited in place; without one, a URDF is written anew.
-        fit: folder of the fit; None: export of the identified dynamics only.
-        identified: folder of the identification; None: export of the geometry only.
+        source: description of the nominal robot; a copy of a URDF is edited; None or another format: a new URDF is
+            written.
+        fit: folder of the fit; None: only the identified dynamics are exported.
+        identified: folder of the identification; None: only the geometry is exported.
         prior: regularisation of masses that the torques do not identify, see
             `calib.identification.physical_consistency.solve.PRIORS`.
-        remark: text for the head of files that a robot or a simulation uses for motion; empty: none.
+        remark: text at the head of files that a robot or a simulation uses for motion; empty: no text.
     """
 
     source: Path | None
@@ -121,14 +122,14 @@ class Export:
 
     @property
     def urdf(self) -> Path | None:
-        """Path of the source if it is a URDF; else None."""
+        """Path of the source if it is a URDF; otherwise None."""
         if self.source is not None and is_urdf(self.source):
             return self.source
         return None
 
     @cached_property
     def with_masses(self) -> tuple[str, list[str]]:
-        """URDF with identified masses and friction, and remarks."""
+        """Text of the URDF with identified masses and friction, and remarks for the user."""
         robot = self.dynamics
         if self.urdf is None:
             return identified.as_urdf(robot, urdf_write.write_new(robot.chain), "the chain's own URDF", robot.chain)
@@ -136,7 +137,10 @@ class Export:
 
     @property
     def files(self) -> list["ExportFile"]:
-        """Files that this export may write, in the order of writing."""
+        """Files that belong to this export, in the order of writing.
+
+        Files for which the robot has no data are in the list, but are not written.
+        """
         files_of_stages = []
         for file in FILES:
             of_fit = self.fit is not None and GEOMETRY in file.stages
@@ -166,8 +170,12 @@ def _corrected_urdf(export: Export, path: Path) -> list[str]:
 
 
 def _geometric_urdf(export: Export, path: Path, name: str) -> list[str]:
-    """Write a URDF of the calibrated geometry and return notes: `URDF`, or `CORRECTED_URDF` for use with
-    corrections.
+    """Write a URDF of the calibrated geometry and return remarks for the user.
+
+    Args:
+        export: sources of the export.
+        path: path of the written file.
+        name: `URDF` (rigid geometry), or `CORRECTED_URDF` (geometry for use with joint corrections).
     """
     if export.urdf is not None:
         content, programs = geometry.edited_urdf(export.robot, export.urdf, for_corrections=name != URDF)
@@ -213,7 +221,13 @@ def _mjcf(export: Export, path: Path) -> list[str]:
 
 
 def write_drives(joints: Sequence[Joint], drives: identified.Drives, path: Path) -> None:
-    """Write ``drives.csv``: the drive parameters of joints, and of couplings, with their σ."""
+    """Write ``drives.csv``: the drive parameters of joints and joint couplings, with their σ.
+
+    Args:
+        joints: the joints.
+        drives: the parameters.
+        path: path of the file.
+    """
     names = [joint.name for joint in joints]
     kinds = [joint.kind for joint in joints]
     for first, second, weight in drives.pairs:
@@ -259,12 +273,12 @@ class ExportFile:
 
     Attributes:
         name: file name.
-        write: function that writes the file to a path if the robot has such data, and returns remarks.
-        use: text on the file's use for README.txt.
-        stages: stages whose results it contains.
-        deliverable: name of the deliverable whose verdict applies to it; empty: no robot or simulation moves by the
-            file.
-        marked: whether its head states a verdict other than pass.
+        write: function that writes the file to a path if the robot has the data for it, and returns remarks.
+        use: text on the file's use, for README.txt.
+        stages: stages (geometry, dynamics) whose results the file contains.
+        deliverable: name of the deliverable whose verdict applies to the file; empty: no robot or simulation uses the
+            file for motion.
+        marked: whether a verdict other than pass is written at the head of the file.
     """
 
     name: str
@@ -297,7 +311,11 @@ FILES = (
 
 
 def deliver(export: Export, out: Path) -> list[str]:
-    """Write the calibrated robot into the folder `out`, in all formats (see the module).
+    """Write the calibrated robot into the folder `out` in all file formats; the module's docstring describes the files.
+
+    Args:
+        export: sources of the export.
+        out: the folder.
 
     Returns:
         Remarks on the written files, as text.
@@ -319,7 +337,11 @@ def deliver(export: Export, out: Path) -> list[str]:
 
 
 def deliver_single(export: Export, targets: Mapping[str, Path]) -> list[str]:
-    """Write single files of an export, each to the path given in `targets` (file name -> path).
+    """Write single files of an export.
+
+    Args:
+        export: sources of the export.
+        targets: file name -> path of the written file; other files are not written.
 
     Returns:
         Remarks on the written files, as text.
@@ -332,15 +354,16 @@ def deliver_single(export: Export, targets: Mapping[str, Path]) -> list[str]:
 
 
 def check_into(export: Export, into: Path, folder: Path) -> None:
-    """Refuse, before any work is done, an export folder that is not usable, or that contains inputs or other files.
+    """Check, before any other work, that an export can be written into a folder.
 
     Args:
         export: sources of the export.
-        into: folder to write the files to.
+        into: folder for the exported files.
         folder: folder of the fit or the identification.
 
     Raises:
-        UsageError: with the file or folder concerned.
+        UsageError: if the folder is not usable, or contains inputs or files that no export writes; the message names
+            the folder or file.
     """
     names = [file.name for file in export.files]
     marks: tuple[str, ...] = (PARAMETERS,)
@@ -351,9 +374,10 @@ def check_into(export: Export, into: Path, folder: Path) -> None:
 
 
 def fit_verdicts(folder: Path) -> Verdicts:
-    """Return the verdicts on a fit and its deliverables, from its folder; in a session, on unseen poses.
+    """Return the verdicts on a fit and its deliverables, read from the folder of the fit.
 
-    Empty if the folder is of an earlier version without verdict, or if its session has not yet judged the fit.
+    In a session, these are the verdicts on held-out poses. Empty if the folder is from an earlier version without
+    verdict, or if the session has not yet judged the fit.
     """
     try:
         record = _fit_record(folder)
@@ -363,9 +387,10 @@ def fit_verdicts(folder: Path) -> Verdicts:
 
 
 def model_verdicts(folder: Path) -> Verdicts:
-    """Return the verdict on an identification, from its folder; in a session, on unseen motion.
+    """Return the verdict on an identification, read from the folder of the identification.
 
-    Empty if the folder is of an earlier version without verdict, or if its session has not yet judged the model.
+    In a session, this is the verdict on held-out motion. Empty if the folder is from an earlier version without
+    verdict, or if the session has not yet judged the model.
     """
     try:
         record = _identification_record(folder)
@@ -375,8 +400,9 @@ def model_verdicts(folder: Path) -> Verdicts:
 
 
 def _identification_record(folder: Path) -> UnseenReport | ModelMetrics:
-    """Return the stored record of an identification: on unseen motion if a session has judged it, else of its
-    folder.
+    """Return the stored record of an identification that contains the verdict.
+
+    It is the record on held-out motion if a session has judged the model, otherwise the folder's ``metrics.json``.
     """
     identification = IdentificationFolder(folder)
     if identification.unseen.report.is_file():
@@ -385,7 +411,10 @@ def _identification_record(folder: Path) -> UnseenReport | ModelMetrics:
 
 
 def _fit_record(folder: Path) -> ValidationMetrics | FitMetrics:
-    """Return the stored record of a fit: on unseen poses if a session has judged it, else of its folder."""
+    """Return the stored record of a fit that contains the verdict.
+
+    It is the record on held-out poses if a session has judged the fit, otherwise the folder's ``metrics.json``.
+    """
     validation = ValidationFolder(folder.absolute().parent / VALIDATED)
     if folder.absolute().name == IN_SESSION and validation.judged.is_file():
         return validation.metrics()
@@ -393,12 +422,19 @@ def _fit_record(folder: Path) -> ValidationMetrics | FitMetrics:
 
 
 def _stage_verdict(stage: str, record: JudgedMetrics | ValidationMetrics) -> dict[str, Verdict]:
-    """Return stage name → verdict of a record; {} if the record has no verdict."""
+    """Return a dictionary from the stage's name to the verdict in a record; empty if the record has no verdict."""
     return {stage: Verdict(record.verdict, record.reason)} if record.verdict else {}
 
 
 def by_file(out: Path, verdicts: Verdicts) -> dict[str, Verdicts]:
-    """Return the verdicts on each existing exported file that a robot or a simulation uses for motion."""
+    """Return the verdicts on the exported files that robots or simulations use for motion: file name -> verdicts.
+
+    Only existing files are included.
+
+    Args:
+        out: folder of the export.
+        verdicts: verdicts on the stages and deliverables.
+    """
     with_dynamics = (out / PARAMETERS).exists()
     result = {}
     for file in FILES:
@@ -408,7 +444,11 @@ def by_file(out: Path, verdicts: Verdicts) -> dict[str, Verdicts]:
 
 
 def prediction(out: Path) -> ExportedPrediction | None:
-    """Return the torque prediction errors of an exported robot; None without dynamics, or if unknown."""
+    """Return the torque prediction errors of an exported robot; None without dynamics, or if unknown.
+
+    Args:
+        out: folder of the export.
+    """
     path = out / PARAMETERS
     if not path.exists():
         return None
@@ -417,14 +457,16 @@ def prediction(out: Path) -> ExportedPrediction | None:
 
 
 def mark(out: Path, verdicts: Verdicts) -> list[str]:
-    """Write verdicts other than pass at the head of the exported files, and the use of each file into README.txt.
+    """Write verdicts other than pass at the head of exported files, and README.txt with the use of each file.
+
+    A README.txt that this toolkit did not write is kept.
 
     Args:
-        out: the folder of the export.
+        out: folder of the export.
         verdicts: verdicts on the stages and deliverables.
 
     Returns:
-        A text for each file whose verdict is not pass.
+        Texts for the user on verdicts that are marginal or fail.
     """
     of_files = by_file(out, verdicts)
     for file in FILES:
@@ -451,7 +493,12 @@ def mark(out: Path, verdicts: Verdicts) -> list[str]:
 
 
 def _uses(out: Path, of_files: Mapping[str, Verdicts]) -> Iterator[str]:
-    """Yield a line of README.txt for each exported file: its use, and the verdict on it."""
+    """Yield the lines of README.txt for each exported file: its use, and the verdict on it.
+
+    Args:
+        out: folder of the export.
+        of_files: file name -> verdicts that apply to the file.
+    """
     with_dynamics = (out / PARAMETERS).exists()
     for file in FILES:
         name = file.name
@@ -473,7 +520,10 @@ def _uses(out: Path, of_files: Mapping[str, Verdicts]) -> Iterator[str]:
 
 
 def _remarked(content: bytes, remark: str) -> bytes:
-    """Return the content of an XML or YAML file with a one-line remark as a comment at its head."""
+    """Return the content of an XML or YAML file with a one-line remark as a comment at the head.
+
+    Without a remark, the content is unchanged.
+    """
     if not remark:
         return content
     # behind a byte order mark, perhaps in UTF-16; our YAML begins with a comment

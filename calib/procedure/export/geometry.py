@@ -1,4 +1,4 @@
-"""Export of the calibrated geometry: an edited URDF, and joint offsets."""
+"""Export of the calibrated geometry: an edited URDF, and a table of joint offsets."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ OFFSETS_HEADER = ("joint", "unit", "add_to_reading", "add_to_command", "sigma")
 
 
 class NoSuchArm(UsageError):
-    """Error for an arm with another kinematic structure than a file format supports."""
+    """Error for an arm whose kinematic structure a file format does not support."""
 
 
 def read(folder: Path, verb: str = "export") -> CalibratedChain:
@@ -38,10 +38,10 @@ def read(folder: Path, verb: str = "export") -> CalibratedChain:
 
     Args:
         folder: folder of a fit.
-        verb: name of the command that reads, for the message (`calib.result_kinds.TAKES`).
+        verb: name of the reading command, for the message (`calib.result_kinds.TAKES`).
 
     Raises:
-        UsageError: if it is not the folder of a fit, or does not state the nominal robot.
+        UsageError: if the folder is not that of a fit, or does not state the nominal robot.
     """
     if not FitFolder(folder).robot.is_file():
         raise UsageError(refusal(folder, verb))
@@ -52,21 +52,21 @@ def read(folder: Path, verb: str = "export") -> CalibratedChain:
 
 
 def results(folder: Path) -> list[Path]:
-    """Return the essential files of a fit's or an identification's folder, which no export may replace."""
+    """Return the essential files in the folder of a fit or an identification, which no export may overwrite."""
     return [folder / name for name in files_of(folder, (*OURS, *identification.OURS))]
 
 
 def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = False) -> tuple[bytes, str]:
-    """Return the XML of `source` with the calibrated geometry, and a sentence on the programs that verified it.
+    """Return the XML of a URDF with the calibrated geometry, and a sentence on the programs that verified it.
 
-    Only the origins of the arm's joints change. The base link and the fixed joints after the last moving joint stay as
-    in the source, since the source defines base and flange.
+    Only the origins of the arm's joints change. The base link and the fixed joints after the last moving joint remain
+    unchanged, since the source defines base and flange.
 
     Args:
         robot: the calibrated robot.
         source: a URDF of the nominal robot.
-        for_corrections: whether to write the geometry that is to be used with joint corrections; without them it is
-            less accurate than the rigid geometry.
+        for_corrections: whether to write the geometry for use with joint corrections; used without corrections, this
+            geometry is less accurate than the rigid geometry.
 
     Raises:
         RobotError: if the edited URDF, read back, has other poses than the robot.
@@ -78,18 +78,31 @@ def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = Fa
 
 
 def chain_in(tree: UrdfTree, chain: Chain, base: str | None = None) -> Chain:
-    """Return the chain of a URDF with another chain's joints and tip, if the URDF has these names."""
+    """Return the arm in a URDF that corresponds to another arm.
+
+    It has the joints and the tip of the other arm if the URDF contains these names; otherwise they are chosen by
+    default.
+
+    Args:
+        tree: the URDF.
+        chain: the other arm.
+        base: name of the first link; None: determined by the joints.
+    """
     joints = chain.joint_names if chain.joint_names[0] in tree.joints else None
     tip = chain.tip if chain.tip in tree.bodies else None
     return urdf.build(tree, urdf.ends(tree, base, tip, joints))
 
 
 def check_readback(edited: str, where: str, chain: Chain) -> str:
-    """Refuse a URDF text with other poses in Pinocchio or yourdfpy than in this toolkit (`MAX_DIFFERENCE`).
+    """Check that Pinocchio and yourdfpy compute the same poses from a URDF text as this toolkit.
+
+    Args:
+        edited: text of the URDF.
+        where: name of the file for messages.
+        chain: the arm as this toolkit computes it.
 
     Returns:
-        A sentence on the programs that have read it. A text that yourdfpy cannot read is accepted, and the reason
-        stated.
+        A sentence on the programs that have read the text. If yourdfpy cannot read the text, the sentence states why.
 
     Raises:
         RobotError: if the poses differ.
@@ -100,7 +113,8 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
     difference = float(np.abs(tip_poses(edited, urdf_chain, q) - forward(urdf_chain, q)).max())
     if difference > MAX_DIFFERENCE:
         raise RobotError(
-            f"{where}: poses differ by {difference:.2g} when Pinocchio reads the URDF; nothing was written"
+            f"{where}: poses differ by {difference:.2g} when Pinocchio reads the URDF; nothing was written: report "
+            "this as a bug"
         )
 
     q = q[:CHECKED_AGAIN]
@@ -114,17 +128,26 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
     expected = [joint_frames(urdf_chain, q) @ np.stack(turns)[:, None], forward(urdf_chain, q)[None]]
     difference = float(np.abs(T_base_links - np.concatenate(expected)).max())
     if difference > MAX_DIFFERENCE:
-        raise RobotError(f"{where}: poses differ by {difference:.2g} when yourdfpy reads the URDF; nothing was written")
+        raise RobotError(
+            f"{where}: poses differ by {difference:.2g} when yourdfpy reads the URDF; nothing was written: report "
+            "this as a bug"
+        )
     return "Pinocchio and yourdfpy read the same poses to 1e-9"
 
 
 def export_offsets(robot: CalibratedChain, out: Path) -> Path:
-    """Write each joint's offset: to be added to the controller's reading, and subtracted from commands; return the
-    path.
+    """Write a table of joint offsets, to be added to the controller's readings and subtracted from commands.
 
     The offset is calibrated minus nominal: a joint with the reading q is at q + offset in the nominal robot's model. If
     the fit has joint corrections, offsets and their σ are those of the best geometry without corrections, for users who
     do not apply them.
+
+    Args:
+        robot: the calibrated robot.
+        out: path of the CSV file.
+
+    Returns:
+        Path of the table.
     """
     nominal = nominal_of(robot)
     sigma = np.full(len(robot.chain.elements), np.nan)

@@ -1,7 +1,7 @@
-"""Joint origins as YAML: for tesseract's calibration file, and for ur_description's kinematics file.
+"""Joint origins as YAML, for tesseract's calibration file and for ur_description's kinematics file.
 
 Nested mappings are written in block style, which readers of YAML 1.1 and 1.2 understand. Numbers always have a decimal
-point, since YAML 1.1 reads 1e-05 as text; keys that could be read as another type are quoted.
+point, since YAML 1.1 reads 1e-05 as text. Keys that could be read as another type are quoted.
 """
 
 import json
@@ -20,7 +20,12 @@ _WORDS = {"yes", "no", "on", "off", "true", "false", "null"}  # no texts in YAML
 
 
 def block(value: Mapping[str, object], indent: str = "") -> str:
-    """Return the YAML lines of a mapping from texts to mappings, texts and finite floats."""
+    """Return the YAML text of a nested mapping in block style.
+
+    Args:
+        value: mapping from texts to mappings, texts and finite floats.
+        indent: blanks at the beginning of each line.
+    """
     lines = []
     for key, item in value.items():
         head = f"{indent}{_text(key)}:"
@@ -44,10 +49,10 @@ def _text(value: str) -> str:
 
 
 def joint_origins(source: str, edited: str, where: str) -> str:
-    """Return the YAML with the origins of all joints that differ between two URDF texts.
+    """Return a YAML text with the origins of all joints whose origins differ between two URDF texts.
 
     Args:
-        source, edited: URDF texts of the nominal robot, and of the calibrated robot with the same joints.
+        source, edited: texts of the nominal robot's URDF, and of the calibrated robot's URDF with the same joints.
         where: name of the file for messages.
 
     Raises:
@@ -61,7 +66,7 @@ def joint_origins(source: str, edited: str, where: str) -> str:
             continue
         turn = Rotation.from_matrix(joint.origin[:3, :3]).as_quat()
         if np.abs(Rotation.from_quat(turn).as_matrix() - joint.origin[:3, :3]).max() > max_difference:
-            refuse_robot(where, f"the rotation part of joint '{name}' is not a rotation matrix")
+            refuse_robot(where, f"the rotation part of joint '{name}' is not a rotation matrix: correct its origin")
         moved[name] = {
             "position": dict(zip("xyz", joint.origin[:3, 3].tolist())),
             "orientation": dict(zip("xyzw", turn.tolist())),

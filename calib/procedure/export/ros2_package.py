@@ -52,18 +52,18 @@ def write_package(
     control: bool = False,
     overwrite: bool = False,
 ) -> tuple[str, ...]:
-    """Write the package `name` of a calibrated robot into the folder `into`; return notes on it.
+    """Write a ROS 2 package of a calibrated robot and return remarks for the user.
 
     Args:
         export: sources of the export.
         name: name of the package.
-        into: folder that is to contain the package's folder.
+        into: folder in which the package's folder is created.
         moveit: files to copy: SRDF, joint_limits.yaml, or a folder with both.
         control: whether to write a <ros2_control> for mock hardware if the URDF has none.
         overwrite: whether to replace existing files.
 
     Raises:
-        UsageError: for a name that no ROS 2 package can have, and for MoveIt files of another robot.
+        UsageError: for a name that is not valid for a ROS 2 package, and for MoveIt files of another robot.
         RobotError: if the finished URDF, read back, differs from the robot; nothing is written.
     """
     likely = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
@@ -83,7 +83,7 @@ def write_package(
         notes.append("<ros2_control> is for mock hardware: name your robot's plugin in it")
     check_readback(content, str(target), chain)
     if lost:
-        notes.append(f"{len(lost)} meshes were not found and stay as they are written, as {lost[0]}")
+        notes.append(f"{len(lost)} meshes were not found; their file names are unchanged, such as {lost[0]}")
     needed = dict.fromkeys([*SHOWS, *(match[1] for each in lost if (match := _PACKAGE.match(each)))])
     made: dict[str, str | bytes] = {f"urdf/{robot}.urdf": content.encode(encoding)}
     made |= {place: file.read_bytes() for place, file in {**meshes, **configs}.items()}
@@ -107,8 +107,16 @@ def write_package(
 def _with_own_meshes(
     path: Path, content: str, name: str, source: Path | None
 ) -> tuple[str, dict[str, Path], list[str]]:
-    """Return a URDF's text with meshes renamed into the package, the meshes by their path in it, and those not
-    found.
+    """Return a URDF's text with mesh names changed to paths in the package, the found meshes, and names of lost ones.
+
+    Args:
+        path: path of the URDF.
+        content: text of the URDF.
+        name: name of the package.
+        source: URDF of the nominal robot, whose folder is searched for meshes; None: no search.
+
+    Returns:
+        The text, path in the package -> path of the mesh, and the names of meshes that were not found.
     """
     folders = [] if source is None else list(Path(split(str(source))[0]).resolve().parents)
     changes, meshes, lost = list[tuple[int, int, str]](), dict[str, Path](), list[str]()
@@ -130,7 +138,13 @@ def _with_own_meshes(
 
 
 def _with_control(content: str, robot: str, chain: Chain) -> str:
-    """Return a URDF's text with a <ros2_control> for mock hardware with position commands."""
+    """Return a URDF's text with an added <ros2_control> for mock hardware with position commands.
+
+    Args:
+        content: text of the URDF.
+        robot: name of the robot.
+        chain: the arm, whose joints are controlled.
+    """
     joints = "".join(
         f'    <joint name={quoteattr(name)}>\n      <command_interface name="position"/>\n'
         '      <state_interface name="position"/>\n      <state_interface name="velocity"/>\n    </joint>\n'

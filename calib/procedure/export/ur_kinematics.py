@@ -1,6 +1,6 @@
-"""Universal Robots' own geometry: the kinematics file of ur_description, in UR's frames.
+"""Export of a calibrated Universal Robots arm: the kinematics file of ur_description, in UR's frames.
 
-A nested mapping in block style (`calib.procedure.export.joint_origins.block`).
+The file is a nested mapping in block style (`calib.procedure.export.joint_origins.block`).
 """
 
 import hashlib
@@ -31,16 +31,17 @@ HEAD = """\
 
 
 def kinematics(robot: CalibratedChain, urdf: Path | None = None) -> tuple[str, str]:
-    """Return the kinematics YAML for ur_description (x y z roll pitch yaw of six joint origins [m, rad]), and a remark.
+    """Return the text of a kinematics file for ur_description, and a remark for the user (empty: none).
 
-    The frames are UR's own (base_link_inertia, then each joint about its z). They follow from the nominal arm's axes,
-    so that only the calibrated part of the numbers is new. ur_description puts its tool0 at wrist_3; fixed joints after
-    it in the robot's file (a flange, a tool) are not included, which the remark says.
+    The file states x, y, z, roll, pitch, yaw of six joint origins [m, rad]. The frames are UR's (base_link_inertia,
+    then one frame per joint with z as the joint's axis). They follow from the nominal arm's axes, so that the numbers
+    differ from UR's nominal numbers only by the calibration. ur_description places tool0 at wrist_3. Fixed joints after
+    wrist_3 in the robot's file (a flange, a tool) are not included, which the remark states.
 
     Args:
         robot: the calibrated robot, with any base and tip links.
-        urdf: URDF of the robot, for the pose of ``base_link_inertia``; None, or without this link: the pose follows
-            from the axes.
+        urdf: URDF of the robot, from which the pose of ``base_link_inertia`` is read; None, or without this link: the
+            pose follows from the axes.
 
     Raises:
         NoSuchArm: for an arm without the axes of a UR arm.
@@ -55,7 +56,11 @@ def kinematics(robot: CalibratedChain, urdf: Path | None = None) -> tuple[str, s
 
 
 def _flange_note(robot: CalibratedChain) -> str:
-    """Return a remark on the assumed position of UR's flange if a fixed joint follows the last joint; else empty."""
+    """Return a remark on the assumed position of UR's flange if a fixed joint follows the last joint; else empty.
+
+    Args:
+        robot: the calibrated robot.
+    """
     nominal = nominal_of(robot)
     zero = np.zeros((1, nominal.n))
     behind = invert(joint_frames(nominal, zero)[-1, 0]) @ forward(nominal, zero)[0]
@@ -68,22 +73,26 @@ def _flange_note(robot: CalibratedChain) -> str:
 
 
 def _wrist_offset(nominal: Chain) -> float:
-    """Return the distance of the last joint's frame from axis 5 at q = 0 [m]: UR's d6, or 0 in old URDFs."""
+    """Return the distance of the last joint's frame from axis 5 at q = 0 [m]: UR's length d6, or 0 in old URDFs.
+
+    Args:
+        nominal: the nominal arm.
+    """
     frames = joint_frames(nominal, np.zeros((1, nominal.n)))[:, 0]
     across = _axis(nominal, frames[1], int(nominal.moving[1]))
     return abs(float(across @ (frames[5, :3, 3] - frames[4, :3, 3])))
 
 
 def _inertia_frame(nominal: Chain, urdf: Path | None, up: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Return the pose (4, 4) of UR's base_link_inertia in the arm's base.
+    """Return the pose (4, 4) of UR's frame base_link_inertia in the arm's base frame.
 
-    UR's descriptions have a link with this name, turned by 180° about z relative to base_link. Without such a link, its
-    z is axis 1, its -x the direction in which the arm lies at q = 0, and its origin that of the base.
+    UR's descriptions have a link with this name, turned by 180° about z relative to base_link. Without such a link, z
+    is along axis 1, -x is the direction in which the arm is stretched at q = 0, and the origin is that of the base.
 
     Args:
         nominal: the arm.
-        urdf: its URDF; None without one.
-        up, ahead: (3,) direction of axis 1, and from axis 2 to axis 3 at q = 0, in the arm's base.
+        urdf: URDF of the arm; None: no URDF.
+        up, ahead: (3,) direction of axis 1, and from axis 2 to axis 3 at q = 0, in the arm's base frame.
     """
     if urdf is not None and urdf.is_file():
         tree = read_tree(text(urdf)[0], str(urdf))
@@ -92,7 +101,7 @@ def _inertia_frame(nominal: Chain, urdf: Path | None, up: np.ndarray, ahead: np.
                 return pose
     level = ahead - up * (up @ ahead)
     if np.linalg.norm(level) < ON_AXIS:
-        raise RobotError("axis 3 stands over axis 2 at q = 0, where a UR is stretched")
+        raise RobotError("axis 3 lies above axis 2 at q = 0, where a UR is stretched")
     x = -level / np.linalg.norm(level)
     turned = pose_of(np.stack([x, np.cross(up, x), up], axis=1))
     rounded = np.round(turned)
@@ -100,11 +109,11 @@ def _inertia_frame(nominal: Chain, urdf: Path | None, up: np.ndarray, ahead: np.
 
 
 def _template(nominal: Chain, urdf: Path | None) -> str:
-    """Return a URDF of a nominal arm in UR's frames, with the six lengths of the arm's axes at q = 0.
+    """Return the text of a URDF of a nominal arm in UR's frames, with six lengths measured between the axes at q = 0.
 
     d1: height of axis 2; a2, a3: distances of axes 2 to 3 and 3 to 4; d4: distance of axis 5 from axis 1; d5: height of
-    axis 4 over axis 6; d6: distance of the last joint's frame from axis 5, or, if this frame is on axis 5, of the tip
-    (early UR URDFs have d6 in the fixed joint to tool0).
+    axis 4 over axis 6; d6: distance of the last joint's frame from axis 5. If this frame is on axis 5, d6 is the
+    distance of the tip (early UR URDFs have d6 in the fixed joint to tool0).
     """
     if nominal.n != 6 or any(joint.kind != "revolute" for joint in nominal.joints):
         raise RobotError(f"it has {nominal.n} joints; expected six revolute joints")
@@ -154,6 +163,11 @@ def _axis(chain: Chain, frame: np.ndarray, k: int) -> np.ndarray:
 
 
 def _gap(one: np.ndarray, two: np.ndarray, direction: np.ndarray) -> float:
-    """Return the distance of two parallel lines [m], each given by a point (3,), with the unit direction (3,)."""
+    """Return the distance [m] of two parallel lines.
+
+    Args:
+        one, two: (3,) a point on each line [m].
+        direction: (3,) unit direction of the lines.
+    """
     between = two - one
     return float(np.linalg.norm(between - direction * (direction @ between)))

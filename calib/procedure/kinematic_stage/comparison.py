@@ -1,4 +1,4 @@
-"""Errors of the nominal and the calibrated arm on the same rows."""
+"""Errors of the nominal and the calibrated arm on the same measured rows."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class Intervals:
     """Position errors on a set of rows, with the predicted σ and 95 % intervals.
 
     Attributes:
-        sigma: (m,) predicted standard deviation of the tool position error, all axes together [m].
+        sigma: (m,) predicted standard deviation of the tool position error, of all three axes together [m].
         radius: (m,) predicted radius that contains 95 % of the errors [m].
         size: (m,) magnitudes of the errors [m].
-        beyond: (m,) whether a joint is outside the training range.
-        joints: names of the joints that are outside the training range.
+        beyond: (m,) whether a joint is outside the range of the fitted rows.
+        joints: names of the joints that are outside this range at some row.
     """
 
     sigma: np.ndarray
@@ -58,7 +58,10 @@ class Intervals:
 
     @property
     def record(self) -> PoseIntervalCoverage:
-        """Coverage and median radius of the 95 % intervals, and the number of rows that extrapolate."""
+        """Coverage and median radius of the 95 % intervals, and the number of rows that extrapolate.
+
+        This is the entry of ``metrics.json``.
+        """
         return PoseIntervalCoverage(
             coverage_percent=100.0 * self.covered,
             median_mm=1e3 * float(np.median(self.radius)),
@@ -80,19 +83,20 @@ class Comparison:
         pairs: errors of the distances between pairs of positions, of both arms [m].
         poses: number of robot poses.
         frames: text on the source of the base and tool placement.
-        proves: False if the rows were fitted, or if the placement did not settle or absorbed the errors.
+        proves: whether a verdict may be based on the errors; False if the rows were fitted, or if the placement of base
+            and tool did not converge or absorbed the errors.
         alone: errors of the calibrated robot as a URDF describes it, without corrections and with frames fitted to the
             same rows; None if the robot has no corrections.
-        plain: errors of the plain reference, with frames fitted to the same rows; None on the fit's own rows, and
-            without a plain reference.
         shares_frames: whether base and tool placement of another file were used.
         repeated: repeatability and accuracy from poses that were measured several times; None without such poses.
         reprojection: rms distance between detected and predicted corners, of both arms [px]; None without images.
-        intervals: errors of the calibrated arm with their predicted intervals; None without an error model of the fit.
         settled: False if the placement of base and tool on these rows did not converge; then the errors are
             meaningless.
-        placed_by: number of measured values, and of placement parameters fitted to them, if their difference is too
-            small to judge by the errors (`MARGIN`); else None.
+        placed_by: number of measured values, and number of placement parameters fitted to them, if there are too few
+            values to judge by the errors (`MARGIN`); otherwise None.
+        intervals: errors of the calibrated arm with their predicted intervals; None without an error model of the fit.
+        plain: errors of the plain reference, with frames fitted to the same rows; None on fitted rows, and without a
+            plain reference.
     """
 
     blocks: tuple[PoseMeasurements, ...]
@@ -113,13 +117,20 @@ class Comparison:
 
     @property
     def of_urdf(self) -> Comparison:
-        """The comparison for the URDF alone: without joint corrections and without intervals (these include them)."""
+        """The comparison for the URDF alone: without joint corrections and without intervals.
+
+        Intervals are left out since they include the corrections.
+        """
         if self.alone is None:
             return self
         return replace(self, errors=(self.errors[0], self.alone), intervals=None)
 
     def record(self, parameters: int = 0) -> ComparedRows:
-        """Return the entry of ``metrics.json``; `parameters` is the number of parameters fitted to these rows."""
+        """Return the entry of ``metrics.json`` on these rows.
+
+        Args:
+            parameters: number of parameters that were fitted to these rows.
+        """
         pair_distances = {}
         if len(self.pairs[0]):
             pair_distances = {arm: statistics(sizes, 1e3) for arm, sizes in zip(ARMS, self.pairs)}
@@ -148,7 +159,11 @@ class Comparison:
 
 
 def _position_means(blocks: Sequence[PoseMeasurements]) -> str:
-    """Return as text what the position errors of blocks are errors of: positions, sockets or planes."""
+    """Return as text which distance is called position error: that of positions, sockets or planes.
+
+    Args:
+        blocks: the measurements.
+    """
     kinds = [block.kind for block in blocks if block.kind not in WITHOUT_POSITIONS]
     means = dict.fromkeys(MEASURED.get(kind, "position") for kind in kinds)
     return " or ".join(means) or "position"
@@ -164,7 +179,7 @@ def compare(
         blocks: the rows.
         frames: text on the source of the base and tool placement.
         proves: whether a verdict may be based on the rows.
-        seed: seed of the pairs whose distances are compared.
+        seed: seed of the random pairs of positions whose distances are compared.
     """
     nominal, calibrated, *urdf_alone = [errors(cell, blocks) for cell in cells]
     arms = (cells[0], cells[1])
@@ -197,15 +212,15 @@ def compare_unseen(
     expected: ErrorModel | None,
     plain: Installation | None = None,
 ) -> Comparison:
-    """Return the errors of the arms on validation rows; base and tool placement are refitted where needed.
+    """Return the errors of the arms on validation rows; base and tool placement are refitted if requested.
 
     Args:
-        cells: nominal and calibrated installation, and that of the URDF alone if it differs.
+        cells: nominal and calibrated installation, and the installation of the URDF alone if it differs.
         unseen: the rows.
         settings: settings of the placement.
-        seed: seed of the pairs whose distances are compared.
-        expected: the fit's error model; None without one.
-        plain: the plain reference; None without one.
+        seed: seed of the random pairs of positions whose distances are compared.
+        expected: the fit's error model; None: no error model.
+        plain: the plain reference; None: no plain reference.
     """
     block = unseen.block
     settled = True
@@ -258,7 +273,11 @@ def compare_unseen(
 
 
 def interval_cells(comparison: Comparison) -> np.ndarray:
-    """Return the table cells (m, 3) of `INTERVAL` for all rows; NaN if the fit has no error model."""
+    """Return the values (m, 3) of the columns `INTERVAL` for all m rows; NaN if the fit has no error model.
+
+    Args:
+        comparison: errors on the m rows.
+    """
     intervals = comparison.intervals
     if intervals is None:
         row_count = sum(len(block) for block in comparison.blocks)
@@ -267,8 +286,11 @@ def interval_cells(comparison: Comparison) -> np.ndarray:
 
 
 def iso9283_sentence(repeated: RepeatedPoses, arm: str) -> str:
-    """Return a sentence with repeatability RP and accuracy AP of repeated poses (ISO 9283); `arm`: name of the fitted
-    arm.
+    """Return a sentence with repeatability RP and accuracy AP of repeated poses (ISO 9283).
+
+    Args:
+        repeated: repeatability and accuracy.
+        arm: printed name of the fitted arm.
     """
     fewest, largest = repeated.cycles
     cycles = f"{fewest}"

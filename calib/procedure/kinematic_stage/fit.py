@@ -1,4 +1,4 @@
-"""Geometric fit of the guided procedure: model selection, verdict on unseen rows, and findings."""
+"""Geometric fit of the guided procedure: model selection, verdict on held-out rows, and findings."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -47,12 +47,13 @@ class Outcome:
 
     Attributes:
         inputs: robot and measurements.
-        selection: the rungs of the ladder, the chosen model, and the fits of the nominal and the calibrated arm.
+        selection: tried models (rungs of the ladder), the chosen model, and the fits of the nominal and the calibrated
+            arm.
         rigid: the best fit without joint corrections: the geometry that a URDF can describe.
         outliers: fitted rows with large residuals, worst first.
         undetermined: findings on parameters that are not identifiable from the poses.
         findings: warnings and notes on the fit.
-        assessment: errors of both arms on fitted and on unseen rows, and the verdict.
+        assessment: errors of both arms on fitted and on held-out rows, and the verdict.
         settings, options: settings and options of fit and verdict.
         expected: error model of the calibrated arm at any pose; None if no positions were measured.
     """
@@ -70,7 +71,7 @@ class Outcome:
 
     @property
     def robot(self) -> CalibratedChain:
-        """Calibrated robot with covariance and corrections, for identification, excitation and export."""
+        """Calibrated robot with covariance and joint corrections, as used by identification, excitation and export."""
         robot = calibrated_chain(self.selection.fit, self.rigid, self.inputs.nominal)
         if robot.corrections is not None and self.inputs.masses is not None:
             # the corrections' gravity torques are those of the identified masses
@@ -83,8 +84,8 @@ class Outcome:
     def nominal_cell(self) -> Installation:
         """Installation of the arm before any calibration, with base and tool placed to fit the rows best.
 
-        When the robot comes from an earlier fit, its nominal arm is placed anew, although the fit started from its
-        calibrated geometry.
+        If the robot is from an earlier fit, the nominal arm of that fit is placed, although the new fit started from
+        the calibrated geometry of the earlier fit.
         """
         nominal = self.inputs.nominal
         if nominal is self.inputs.chain:
@@ -96,17 +97,17 @@ class Outcome:
 
     @property
     def fit(self) -> Comparison:
-        """Errors of both arms on the fitted rows."""
+        """Errors of the nominal and the calibrated arm on the fitted rows."""
         return self.assessment.fit
 
     @property
     def validation(self) -> Mapping[str, Comparison]:
-        """Errors of both arms on validation rows, by file name."""
+        """Errors of the nominal and the calibrated arm on validation rows: file name -> errors."""
         return self.assessment.validation
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings for the user."""
+        """Texts of findings and remarks for the user."""
         return self.assessment.warnings
 
     @property
@@ -119,12 +120,19 @@ T = TypeVar("T", bound=Outcome)
 
 
 def weighing_settings(options: FitOptions, settings: FitSettings) -> Settings:
-    """Return the settings of the residuals' loss: the loss of the fit's settings, else that of the options file."""
+    """Return the settings of the residuals' loss function.
+
+    The loss in the fit's settings has precedence over the loss in the options file.
+
+    Args:
+        options: content of the options file.
+        settings: settings of the fit.
+    """
     return Settings(settings.loss or options.loss, options.loss_scale)
 
 
 def _silent(stage: str) -> None:
-    """Show no progress."""
+    """Ignore a progress text, `stage`."""
 
 
 def run(
@@ -134,14 +142,15 @@ def run(
     progress: Progress | None = None,
     prediction: SelectionPrediction | None = None,
 ) -> Outcome:
-    """Return the outcome of a fit: the chosen model, errors on all rows, and the verdict.
+    """Fit the geometry, and return the chosen model, errors on all rows, and the verdict.
 
     Args:
-        inputs: see `calib.procedure.kinematic_stage.inputs.gather`.
+        inputs: robot, rows to fit, and validation rows.
         options: content of the fit options file; None: defaults.
         settings: model, loss and folds of the ladder, tolerance, seed; None: defaults.
-        progress: called with the name of each stage; None: silent.
-        prediction: accuracy predicted when the poses were chosen, to be compared with the fit's; None: no comparison.
+        progress: called with a text on each stage; None: silent.
+        prediction: accuracy predicted at pose selection, to be compared with the accuracy of the fit; None: no
+            comparison.
 
     Raises:
         NotConverged: if the fit of the chosen model did not converge.
@@ -213,9 +222,9 @@ def run(
 def _rigid_misfit(
     selection: ModelSelection, changes: Sequence[Finding], climb: Callable[..., ModelSelection], weighing: Settings
 ) -> Finding | None:
-    """Return the finding that no rigid geometry explains the rows, or that a few grossly wrong rows are the reason.
+    """Return a finding if no rigid geometry explains the rows, or if a few rows with gross errors are the reason.
 
-    None if a rigid geometry explains them.
+    Otherwise, None is returned.
 
     Args:
         selection: the selection of models.
@@ -240,7 +249,15 @@ def _residual_findings(
     rigid_misfit: Finding | None,
     weighing: Settings,
 ) -> list[Finding]:
-    """Return the findings on the residuals of a fit: changed rows, misfit, moved instrument, joints, images."""
+    """Return findings on the residuals of a fit: changed rows, misfit, moved instrument, joints, images.
+
+    Args:
+        selection: the selection of models.
+        inputs: robot and measurements.
+        changes: findings on changed rows.
+        rigid_misfit: finding that no rigid geometry explains the rows; None: a rigid geometry explains them.
+        weighing: settings of the loss function.
+    """
     notes = list(changes)
     if rigid_misfit:
         notes.append(rigid_misfit)
@@ -251,7 +268,16 @@ def _residual_findings(
 
 
 def _check_convergence(selection: ModelSelection, inputs: Inputs, options: FitOptions) -> None:
-    """Raise an error if the chosen model's fit did not converge, with the findings that may be the reason."""
+    """Check that the chosen model's fit has converged.
+
+    Args:
+        selection: the selection of models.
+        inputs: robot and measurements.
+        options: content of the options file, with the accepted findings.
+
+    Raises:
+        NotConverged: if it has not; the message contains findings that may be the reason.
+    """
     status = selection.fit.solution.status
     if status.good:
         return
@@ -263,7 +289,7 @@ def _check_convergence(selection: ModelSelection, inputs: Inputs, options: FitOp
 
 
 def assessed(outcome: T, inputs: Inputs) -> T:
-    """Return the outcome with a new verdict from the validation rows of `inputs`; nothing is fitted."""
+    """Return the outcome with a new verdict from the validation rows of `inputs`; nothing is fitted again."""
     settings, options, selection = outcome.settings, outcome.options, outcome.selection
     nominal = selection.nominal.cell
     plain = plain_reference(nominal, outcome.inputs)
@@ -281,7 +307,15 @@ def _findings(
     notes: Sequence[Finding],
     accepted: Sequence[str],
 ) -> Findings:
-    """Return the findings of a fit that do not depend on validation rows; `notes` are findings on its residuals."""
+    """Return the findings of a fit that do not depend on validation rows.
+
+    Args:
+        inputs: robot and measurements.
+        selection: the selection of models.
+        outliers: fitted rows with large residuals.
+        notes: findings on the residuals.
+        accepted: names of findings that the options accept.
+    """
     nominal = selection.nominal.cell
     cross_validated = selection.cross_validated
     contradictions = plausibility.findings(nominal, selection.fit, inputs.fit, cross_validated, nominal.reach)
@@ -304,7 +338,16 @@ def _findings(
 
 
 def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[Finding]:
-    """Return the findings of a fit that do not depend on validation rows; `notes` are findings on its residuals."""
+    """Return a finding if the instrument seems to have moved between the files; otherwise an empty list.
+
+    The finding is made if the nominal arm's errors are much smaller when each file has a separate station (position of
+    the instrument).
+
+    Args:
+        nominal: the nominal arm with base and tool placed.
+        blocks: the measurements.
+        settings: settings of the placement.
+    """
     blocks = [block for block in blocks if block.has_instrument]
     files = {block.file for block in blocks}
     stations = {block.station for block in blocks}

@@ -1,7 +1,7 @@
-"""Tables of fitted parameters and residuals; frames are given as placements, not as changes from nominal.
+"""Tables of fitted parameters and residuals; frames are stated as placements, not as changes from nominal.
 
-The fit moves a frame T by a step in its own axes, T · Trans(d) · Exp(w). The table contains the position and rotation
-vector r of T, so that the covariance of (d, w) is transformed by  position = R d,  r' = J_r⁻¹(r) w.
+The fit moves a frame T by a step in the axes of T, T · Trans(d) · Exp(w). The table contains the position and rotation
+vector r of T, so that the covariance of (d, w) is transformed by position = R d, r' = J_r⁻¹(r) w.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -52,7 +52,13 @@ NOT_FITTED = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class EstimateTable:
-    """Rows of ``estimate.csv``, and their covariance (rows, rows)."""
+    """Fitted parameters as in ``estimate.csv``.
+
+    Attributes:
+        names, units: names and units of the parameters.
+        nominal, values: nominal and fitted values.
+        covariance: (rows, rows) covariance of the values.
+    """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -61,7 +67,10 @@ class EstimateTable:
     covariance: np.ndarray
 
     def rows(self) -> list[tuple[str, str, float, float, float, float | None]]:
-        """Return name, unit, nominal, value, σ and RSD [%] of each row; RSD is empty for a value of 0."""
+        """Return name, unit, nominal value, value, σ and relative standard deviation [%] of each row.
+
+        The relative standard deviation is None for a value of 0.
+        """
         sigmas = np.sqrt(np.clip(np.diag(self.covariance), 0.0, None))
         rows = []
         for name, unit, nominal, value, sigma in zip(self.names, self.units, self.nominal, self.values, sigmas):
@@ -71,7 +80,7 @@ class EstimateTable:
 
 
 def estimate_table(fit: GeometricFit, nominal: Installation) -> EstimateTable:
-    """Return the table of fitted parameters: arm elements, placements, deflection coefficients.
+    """Return the table of fitted parameters: arm elements, placements, and coefficients of deflection terms.
 
     Args:
         fit: the fit.
@@ -94,7 +103,11 @@ def estimate_table(fit: GeometricFit, nominal: Installation) -> EstimateTable:
 
 
 def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.ndarray]:
-    """Read the covariance of a fit, for steps along its parameters (`calib.geometry.observation.step`).
+    """Read the covariance of a fit with respect to steps along the parameters (`calib.geometry.observation.step`).
+
+    Args:
+        folder: folder of the fit.
+        cell: the fitted installation.
 
     Returns:
         Indices (f,) in the parameter vector, and the covariance (f, f).
@@ -118,7 +131,11 @@ def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.nd
 
 
 def _values(cell: Installation) -> np.ndarray:
-    """Return the full parameter vector of an installation, frames as position and rotation vector."""
+    """Return the full parameter vector of an installation; frames are represented by position and rotation vector.
+
+    Args:
+        cell: the installation (arm with stations and tools).
+    """
     frames = []
     for frame in (*cell.stations, *cell.tools):
         frames += [frame[:3, 3], rotation_vector(frame[:3, :3])]
@@ -127,7 +144,11 @@ def _values(cell: Installation) -> np.ndarray:
 
 
 def _to_table(cell: Installation) -> np.ndarray:
-    """Return the Jacobian (p, p) of the tabulated values with respect to steps along the parameters."""
+    """Return the Jacobian (p, p) of the values in the table with respect to steps along the parameters.
+
+    Args:
+        cell: the installation (arm with stations and tools).
+    """
     jacobian = np.eye(len(layout(cell).names))
     start = len(cell.chain.elements)
     for frame in (*cell.stations, *cell.tools):
@@ -142,11 +163,14 @@ def _to_table(cell: Installation) -> np.ndarray:
 
 
 def residuals(outcome: Outcome) -> tuple[Iterator[Sequence[object]], list[str]]:
-    """Return the residual (measured minus predicted) of every row: fitted, held out or validation; and the header.
+    """Return a table of the residual (measured minus predicted) of every row, fitted or held out: rows and header.
 
-    Unseen rows also have the columns of `INTERVAL`, as in ``errors.csv`` of a session: ``sigma`` is the standard
-    deviation of the calibrated arm's position error by the fit's error model, ``interval95`` the radius that contains
-    95 % of such errors, ``extrapolated`` is 1 if a joint is outside the training range.
+    Held-out rows also have the columns of `INTERVAL`, as in ``errors.csv`` of a session: ``sigma`` is the standard
+    deviation of the calibrated arm's position error by the fit's error model, ``interval95`` is the radius that
+    contains 95 % of such errors, and ``extrapolated`` is 1 if a joint is outside the range of the fitted rows.
+
+    Args:
+        outcome: the fit.
     """
     sets = [("fit", outcome.fit)]
     for name, unseen in outcome.inputs.unseen.items():
@@ -164,7 +188,13 @@ def residuals(outcome: Outcome) -> tuple[Iterator[Sequence[object]], list[str]]:
 
 
 def _residual_rows(label: str, comparison: Comparison, outcome: Outcome) -> Iterator[Sequence[object]]:
-    """Yield the rows of ``residuals.csv`` for one set of measurements."""
+    """Yield the rows of ``residuals.csv`` for one set of measured rows.
+
+    Args:
+        label: name of the set: ``fit``, ``held out`` or ``validation``.
+        comparison: the measured rows, and the arms that predict them.
+        outcome: the fit.
+    """
     nominal, calibrated = comparison.cells
     nominal_blocks = prepare(nominal, comparison.blocks)
     blocks = prepare(calibrated, comparison.blocks)
@@ -202,8 +232,14 @@ def _residual_rows(label: str, comparison: Comparison, outcome: Outcome) -> Iter
 
 
 def _nominal_sizes(nominal: Installation, block: Block, count: int) -> np.ndarray:
-    """Return the size (m,) of the nominal arm's residuals [mm]: of positions if measured, else of the first
-    quantity.
+    """Return the size (m,) of the nominal arm's residuals [mm].
+
+    It is the size of the position residual if positions were measured, otherwise of the first measured quantity.
+
+    Args:
+        nominal: the nominal arm with base and tool placed.
+        block: measurements, prepared for the computation of residuals.
+        count: number m of rows.
     """
     sizes = np.full(count, np.nan)
     for part in observe(nominal, block, NO_PARAMETERS):
@@ -216,9 +252,14 @@ def _nominal_sizes(nominal: Installation, block: Block, count: int) -> np.ndarra
 def write_errors(path: Path, arm: Chain, validation: Mapping[str, Comparison]) -> None:
     """Write the errors of both arms at every validation row, and the error vectors of measured positions.
 
-    For measured positions, ``x y z`` is the measured position of the target, and ``to_nominal`` and ``to_calibrated``
-    are the vectors from it to the positions predicted by each arm, all in the calibrated arm's base. The columns of
-    `INTERVAL` follow, as in ``residuals.csv``.
+    For measured positions, ``x y z`` is the measured position of the target. ``to_nominal`` and ``to_calibrated`` are
+    the vectors from there to the positions predicted by each arm, all in the calibrated arm's base frame. The columns
+    of `INTERVAL` are as in ``residuals.csv``.
+
+    Args:
+        path: path of the table.
+        arm: the arm.
+        validation: name of a validation file -> errors on its rows.
     """
     rows: list[list[object]] = []
     for name, comparison in validation.items():
@@ -238,7 +279,12 @@ def write_errors(path: Path, arm: Chain, validation: Mapping[str, Comparison]) -
 
 
 def _error_vectors(comparison: Comparison, number: int) -> np.ndarray:
-    """Return measured positions [m] and error vectors of both arms [mm] of a block (m, 9); NaN without positions."""
+    """Return measured positions [m] and error vectors of both arms [mm] of one block (m, 9); NaN without positions.
+
+    Args:
+        comparison: errors on the blocks.
+        number: index (from 0) of the block.
+    """
     block = comparison.blocks[number]
     if not isinstance(block, Positions):
         return np.full((len(block), 9), np.nan)

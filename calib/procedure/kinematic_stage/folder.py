@@ -1,7 +1,7 @@
-"""Folders of a fit and of its validation in a session: writing and reading their files.
+"""Folders of a fit and of a fit's validation in a session: writing and reading their files.
 
-A fit's folder is written completely into a temporary folder, then moved to its final place. Only this module knows the
-names of its files.
+A fit's folder is written completely into a temporary folder, then moved to its final path. Only this module defines the
+names of the files.
 """
 
 import csv
@@ -74,7 +74,7 @@ VALIDATED = "5-validation"
 
 @dataclass(frozen=True)
 class FitFolder:
-    """Folder of a fit: paths of its files, and their content."""
+    """Folder of a fit: paths of its files, and functions that read them."""
 
     path: Path
 
@@ -86,15 +86,15 @@ class FitFolder:
 
     @property
     def tables(self) -> tuple[Path, Path]:
-        """Paths of the parameter estimate and of its covariance."""
+        """Paths of the parameter estimate (``estimate.csv``) and of its covariance (``covariance.csv``)."""
         return self.path / ESTIMATE, self.path / COVARIANCE
 
     def metrics(self) -> FitMetrics:
-        """Read the metrics: numbers, verdict and findings."""
+        """Read ``metrics.json``: numbers, verdict and findings."""
         return _read(FitMetrics, self.numbers)
 
     def findings(self) -> Findings:
-        """Read the findings of the fit; folders of schema 1 store them in the report, without the loss."""
+        """Read the findings of the fit; folders of schema 1 store them in the report, without the loss function."""
         metrics = self.metrics()
         if metrics.findings is not None:
             return metrics.findings
@@ -102,8 +102,13 @@ class FitFolder:
         return read_record(Findings, _current_form(early | {"notes": metrics.warnings}))
 
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
-        """Return calibrated and nominal arm from the folder; frames of the nominal arm are refitted to the fitted
-        rows.
+        """Return the nominal and the calibrated arm of the fit.
+
+        The calibrated arm is read from the folder; frames of the nominal arm are refitted to the fitted rows.
+
+        Args:
+            inputs: robot and fitted rows.
+            settings: settings of the placement.
         """
         findings = self.findings()
         calibrated_cell = installation.read(self.path)
@@ -119,7 +124,7 @@ class FitFolder:
         return Arms(nominal, calibrated_cell, rigid, expected, plain_reference(nominal, inputs))
 
     def learnt_joints(self, joints: Sequence[Joint]) -> np.ndarray | None:
-        """Read the joint values (m, n) [rad or m] of the fitted rows; None without a file of residuals."""
+        """Return the joint values (m, n) [rad or m] of the fitted rows; None without a file of residuals."""
         if not self.residuals.is_file():
             return None
         names = [shielded(f"{joint.name} [{joint.unit}]") for joint in joints]
@@ -133,7 +138,7 @@ class FitFolder:
 
 @dataclass(frozen=True)
 class ValidationFolder:
-    """Folder of a fit's validation in a session: paths of its files, and their content."""
+    """Folder of a fit's validation in a session: paths of its files, and functions that read and write them."""
 
     path: Path
 
@@ -143,21 +148,29 @@ class ValidationFolder:
     report = InFolder(REPORT)  # data of the certificate
 
     def write(self, assessment: Assessment, inputs: Inputs, rows: Sequence[object]) -> ValidationMetrics:
-        """Write errors, rows and, last, the metrics; return the metrics."""
+        """Write errors, rows and, last, the metrics; return the metrics.
+
+        Args:
+            assessment: errors and verdict.
+            inputs: robot and measurements.
+            rows: errors of each set of rows, for figures.
+        """
         fit_tables.write_errors(self.errors, inputs.chain, assessment.validation)
         files.write_json(self.rows, rows)
         files.write_json(self.judged, assessment.record)
         return assessment.record
 
     def metrics(self) -> ValidationMetrics:
-        """Read numbers and verdict; in schema 1, warnings of the fit are not included."""
+        """Read numbers and verdict; in files of schema 1, warnings of the fit are not included."""
         return _read(ValidationMetrics, self.judged)
 
 
 def _read(kind: type[T], path: Path) -> T:
     content = read_json(path, "fit again")
     if content.get("schema", 1) > SCHEMA:
-        raise UsageError(f"{path}: schema {content['schema']} of a later version, this one reads up to {SCHEMA}")
+        raise UsageError(
+            f"{path}: schema {content['schema']} is of a later version, this one reads up to {SCHEMA}: upgrade"
+        )
     if content.get("findings"):
         content["findings"] = _current_form(content["findings"])
     with refused_as(UsageError, ValueError, f"{path} cannot be read ({{}}); fit again"):
@@ -165,7 +178,7 @@ def _read(kind: type[T], path: Path) -> T:
 
 
 def _current_form(findings: ParsedTable) -> ParsedTable:
-    """Return findings of schema 1 or 2, which stored sentences, in the current form."""
+    """Return findings with the current keys and codes; schemas 1 and 2 stored sentences instead of codes."""
     if "odd" not in findings and "notes" not in findings:
         return findings
     noticed = []
@@ -187,20 +200,28 @@ def _current_form(findings: ParsedTable) -> ParsedTable:
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Raise a UsageError if a fit must not be written to `out`: the folder contains other results, or an input file."""
+    """Check that a fit can be written into a folder.
+
+    Args:
+        out: the folder.
+        inputs: files that the command reads; None entries are ignored.
+
+    Raises:
+        UsageError: if the folder contains other results or input files.
+    """
     folders.check_target(out, OURS, (METRICS, calibrated.ROBOT, RESIDUALS), "fit", inputs)
 
 
 def write_folder(
     outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], None] | None = None, *, owned: bool = False
 ) -> Path:
-    """Write all files of a fit to the folder `out`, or none on failure, and return its path.
+    """Write all files of a fit into a folder and return its path; on an error, nothing is written.
 
     Args:
         outcome: the fit.
         out: path of the folder.
-        plots: writes figures into the folder; None: no figures.
-        owned: whether the procedure owns the folder, so that it is not checked for foreign files.
+        plots: function that writes figures into the folder; None: no figures.
+        owned: whether the folder belongs to the procedure, so that its content is replaced without a check.
 
     Raises:
         UsageError: if a folder that is not owned contains other results, or an input file.
@@ -239,7 +260,7 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
 
 
 def metrics(outcome: Outcome) -> FitMetrics:
-    """Return the content of ``metrics.json``."""
+    """Return the content of ``metrics.json`` for the outcome of a fit."""
     tolerance_mm = None
     if outcome.settings.tolerance is not None:
         tolerance_mm = 1e3 * outcome.settings.tolerance
@@ -267,7 +288,11 @@ def metrics(outcome: Outcome) -> FitMetrics:
 
 
 def _record(outcome: Outcome) -> dict[str, object]:
-    """Return the provenance entries of robot.toml: files, model, seed, verdict and nominal frames."""
+    """Return the entries of ``robot.toml`` on the fit: files, model, seed, verdict and nominal frames.
+
+    Args:
+        outcome: the fit.
+    """
     verdict = outcome.verdict
     nominal_frames = installation.frame_tables(outcome.nominal_cell)
     record: dict[str, object] = {f"nominal_{kind}": table for kind, table in nominal_frames.items()}
@@ -281,7 +306,12 @@ def _record(outcome: Outcome) -> dict[str, object]:
 
 
 def _write_corrections(corrections: CorrectedChain, folder: Path) -> None:
-    """Write the table of joint corrections, which a URDF cannot contain, and a text on how to apply them."""
+    """Write the table of joint corrections, which a URDF cannot contain, and a text on how to apply them.
+
+    Args:
+        corrections: the arm's joint corrections.
+        folder: folder to write into.
+    """
     chain, deflection = corrections.chain, corrections.deflection
     unit_of = dict(zip(chain.names, chain.units))
     joint_of = {element.name: element.joint for element in chain.elements}

@@ -1,4 +1,4 @@
-"""Findings on the images of a fit: reprojection error, the arm's share of it, image coverage, board scale."""
+"""Findings on the images of a fit: reprojection error, the arm's share of this error, image coverage, board scale."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +20,10 @@ MAX_NOISE = 4.0
 
 
 def image_coverage(fit: GeometricFit) -> tuple[ImageCoverage, ...]:
-    """Return how the corners of a fit cover each set of images; empty without images."""
+    """Return the number of corners in each cell of the image area, and their errors, for each set of images.
+
+    Empty without images.
+    """
     result = []
     for piece in fit.pieces:
         block, part = fit.blocks[piece.block].measured, piece.part
@@ -37,7 +40,12 @@ def image_coverage(fit: GeometricFit) -> tuple[ImageCoverage, ...]:
 
 
 def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements]) -> float | None:
-    """Return the rms distance between detected and predicted corners [px]; None without images."""
+    """Return the rms distance between detected and predicted corners [px]; None without images.
+
+    Args:
+        cell: arm, camera and board, which predict the corners.
+        blocks: the measurements.
+    """
     images = [block for block in blocks if isinstance(block, Pixels)]
     no_parameters = np.array([], dtype=int)
     squares: list[np.ndarray] = []
@@ -50,12 +58,12 @@ def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements]) -> floa
 
 
 def _rms(residuals: np.ndarray) -> float:
-    """Return the rms distance of residuals (2, k) [px]."""
+    """Return the rms length of residual vectors (2, k) [px]."""
     return float(np.sqrt(np.mean(np.sum(residuals**2, axis=0))))
 
 
 def image_notes(fit: GeometricFit) -> list[Finding]:
-    """Return the findings on the images of a fit; empty without images."""
+    """Return findings on the images of a fit: reprojection error, noise, coverage and scale; empty without images."""
     notes: list[Finding] = []
     without_images = [block.measured for block in fit.blocks if not isinstance(block.measured, Pixels)]
     other_files = [Path(block.file).name for block in without_images]

@@ -1,4 +1,4 @@
-"""Inputs of a fit: the robot, the rows to fit, and the unseen rows."""
+"""Inputs of a fit: the robot, the rows to fit, and the held-out rows."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -40,10 +40,10 @@ class Unseen:
     """Validation rows: measurements that are not fitted.
 
     Attributes:
-        block: the measurements; station and tool names are those of the fit unless `own_frames`.
-        own_frames: whether base and tool placement are to be fitted on these rows.
+        block: the measurements; station and tool have the names of the fit's station and tool unless `own_frames`.
+        own_frames: whether base and tool placement are to be fitted to these rows.
         held_out: True for a held-out share of a fit file, False for a validation file.
-        seen: whether the same file was fitted, so that its errors are no evidence.
+        seen: whether these rows were fitted, too, so that their errors are no evidence.
     """
 
     block: PoseMeasurements
@@ -58,12 +58,13 @@ class Inputs:
 
     Attributes:
         chain: the nominal arm.
-        source: file that the robot was read from.
+        source: file from which the robot was read.
         fit: blocks to fit.
         unseen: name of a validation file -> its rows.
         notes: remarks for the user on the interpretation of the files.
         earlier: the robot with the results of an earlier fit, as its file contains them; None for a URDF.
-        masses: (n, 10) identified standard parameters for gravity torques; None: those of the arm's description.
+        masses: (n, 10) identified standard parameters, from which gravity torques are computed; None: parameters of the
+            robot's description.
     """
 
     chain: Chain
@@ -76,28 +77,31 @@ class Inputs:
 
     @property
     def weighed(self) -> Chain:
-        """The nominal arm with the masses that gravity torques are computed from."""
+        """The nominal arm with the masses from which gravity torques are computed."""
         if self.masses is None:
             return self.chain
         return replace(self.chain, inertias=self.masses)
 
     @property
     def known(self) -> Deflection:
-        """Joint corrections of the robot from an earlier fit."""
+        """Joint corrections that the robot has from an earlier fit; empty without an earlier fit."""
         if self.earlier is None:
             return Deflection()
         return self.earlier.deflection
 
     @property
     def bare(self) -> Chain | None:
-        """Geometry that the robot of an earlier fit has if used without its joint corrections; None if it has none."""
+        """Geometry of an earlier fit for use without its joint corrections.
+
+        None if the earlier fit has no corrections.
+        """
         if self.earlier is None or self.earlier.corrections is None:
             return None
         return self.earlier.chain
 
     @property
     def nominal(self) -> Chain:
-        """Nominal arm, before any calibration."""
+        """Nominal arm before any calibration; if the robot is from an earlier fit, the nominal arm of that fit."""
         if self.earlier is None or self.earlier.nominal is None:
             return self.chain
         return self.earlier.nominal
@@ -113,15 +117,15 @@ def gather(
     base: str | None = None,
     tip: str | None = None,
 ) -> Inputs:
-    """Return the inputs of a fit from files: the robot, the named stations and tools, fitted and unseen rows.
+    """Return the inputs of a fit from files: the robot, the named stations and tools, fitted and held-out rows.
 
     Args:
-        robot: see `calib.robot.library`; or a robot in memory.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         measured: files, or blocks in memory, to fit.
-        validate: files, or blocks in memory, to validate on.
+        validate: files, or blocks in memory, for the validation.
         options: options for reading the files; None: defaults.
-        settings: stations, tools, rows to hold out, seed of their choice; None: defaults.
-        base, tip: links of a URDF; None: see `calib.robot.library`.
+        settings: stations, tools, share of rows to hold out, and seed; None: defaults.
+        base, tip: first and last link of the arm in a URDF; None: chosen by the joint columns of the measurements.
 
     Raises:
         UsageError: without a measurement file.
@@ -182,10 +186,13 @@ def with_unseen(
     """Return the inputs with additional validation rows; copies of fitted rows are marked as seen.
 
     Args:
-        inputs: robot, fitted rows, and unseen rows so far.
+        inputs: robot, fitted rows, and previous validation rows.
         validate: files, or blocks in memory.
         options: options for reading the files.
-        settings: whether the validation rows have frames of their own.
+        settings: states whether base and tool placement are fitted to the validation rows.
+
+    Raises:
+        UsageError: if the fit has no station or tool for the rows.
     """
     unseen = dict(inputs.unseen)
     notes: list[str] = []
@@ -211,7 +218,7 @@ def with_unseen(
 
 
 def plain_reference(nominal: Installation, inputs: Inputs) -> Installation | None:
-    """Return the arm fitted by plain least squares, without joint corrections; None if there are too few rows.
+    """Return the arm fitted by plain least squares without joint corrections; None if there are too few rows.
 
     Args:
         nominal: the arm before the fit, with base and tool placed.
@@ -233,7 +240,14 @@ def load_robot(
     base: str | None = None,
     tip: str | None = None,
 ) -> tuple[Chain, Path]:
-    """Return a robot's chain and its file; from a URDF, the chain that has the joints of the measured table."""
+    """Return a robot's chain and its file; the chain of a URDF is the one with the joints of the measured table.
+
+    Args:
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
+        measured: file with joint columns; None: the table is not considered.
+        options: options for reading the file.
+        base, tip: first and last link of the arm in a URDF; None: chosen by default.
+    """
     if isinstance(robot, CalibratedChain):
         return robot.complete, Path(robot.source or robot.chain.name)
     source = resolve(robot)
@@ -257,11 +271,15 @@ def load_robot(
 def load_rigid(
     robot: str | Path | CalibratedChain, measured: Path | None = None, base: str | None = None, tip: str | None = None
 ) -> tuple[CalibratedChain, Path]:
-    """Return the robot whose chain dynamics and motion planning use, and its file.
+    """Return the robot for dynamics and motion planning, and its file.
 
-    Its chain is the best geometry without joint corrections, since neither torque models nor controllers apply
-    corrections,
-    and the geometry fitted together with corrections is less accurate without them.
+    The robot's chain is the best geometry without joint corrections, since neither torque models nor controllers apply
+    corrections. The geometry that was fitted together with corrections is less accurate without them.
+
+    Args:
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
+        measured: table whose joint columns determine the chain of a URDF; None: no table.
+        base, tip: first and last link of the arm in a URDF; None: chosen by default.
     """
     if isinstance(robot, CalibratedChain):
         return robot, Path(robot.source or robot.chain.name)
@@ -274,7 +292,17 @@ def load_rigid(
 
 
 def _check_joint_columns(chain: Chain, source: Path, measured: Path, base: str | None) -> None:
-    """Refuse a table without columns of some revolute joints of the arm, since their positions would be unknown."""
+    """Check that a table has columns for all revolute joints of the arm, since other positions would be unknown.
+
+    Args:
+        chain: the arm that was chosen by the table's columns.
+        source: file of the robot.
+        measured: the table.
+        base: first link of the arm; None: chosen by default.
+
+    Raises:
+        UsageError: if a column is missing.
+    """
     try:
         arm = urdf.read(source, base)
     except CalibError:  # the URDF does not say by itself where its arm ends
@@ -291,13 +319,16 @@ def _check_joint_columns(chain: Chain, source: Path, measured: Path, base: str |
 def read_file(
     source: Path | PoseMeasurements, chain: Chain, options: FitOptions, like: Sequence[PoseMeasurements] = ()
 ) -> list[PoseMeasurements]:
-    """Read the measurements of a file (or folder of images) for a chain, and check them against its joint limits.
+    """Return the measurements in a file (or folder of images), checked against the arm's joints and limits.
 
     Args:
         source: the file, or a block in memory, which is checked in the same way.
         chain: the arm.
         options: options for reading the file.
-        like: blocks read before; images of the same size are assumed to come from the same camera.
+        like: blocks that were read earlier; images of the same size are assumed to be from the same camera.
+
+    Raises:
+        MeasurementError: for a file that cannot be read, or implausible values.
     """
     path = _path(source)
     joints = joints_of(chain)
@@ -335,7 +366,12 @@ def read_file(
 
 
 def gravity_of(chain: Chain, q: np.ndarray) -> np.ndarray | None:
-    """Return gravity torques (m, n) [N m] at joint values (m, n); None if the robot's masses are unknown."""
+    """Return gravity torques (m, n) [N m or N] at joint values (m, n); None if the robot's masses are unknown.
+
+    Args:
+        chain: the arm with its masses.
+        q: joint values [rad or m].
+    """
     if chain.inertias is None or len(chain.driven) != chain.n:
         return None
     return gravity_torques(chain, q)
@@ -350,8 +386,16 @@ def _path(source: Path | PoseMeasurements) -> Path:
 def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeasurements, PoseMeasurements | None]:
     """Return the rows of a block to fit, and the held-out rows (None for a share of 0).
 
-    Poses are drawn, not rows, so that the reflectors of one pose, the two rows of a distance and the cycles of a
+    Whole poses are drawn at random, so that the reflectors of one pose, the two rows of a distance and the cycles of a
     repeated pose stay together.
+
+    Args:
+        block: the measurements.
+        share: share of the poses to hold out.
+        seed: seed of the random choice.
+
+    Raises:
+        MeasurementError: if the share yields no poses, or all poses.
     """
     if share == 0.0:
         return block, None
@@ -361,16 +405,16 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
     order = np.random.default_rng(seed).permutation(count)
     if held_count == 0 or held_count == count:
         raise MeasurementError(
-            f"a hold-out share of {share:g} gives {held_count} of {count} poses; change it", block.file
+            f"a hold-out share of {share:g} gives {held_count} of {count} poses; state another share", block.file
         )
     held_out = np.isin(pose, order[count - held_count :])
     return take(block, np.flatnonzero(~held_out)), take(block, np.flatnonzero(held_out))
 
 
 def _pose_of_row(block: PoseMeasurements) -> np.ndarray:
-    """Return the index (m,) of the pose (or measured pair) of each row.
+    """Return the index (m,) of the pose, or measured pair of poses, for each row of a block.
 
-    Cycles of one repeated pose are one pose.
+    Cycles of a repeated pose have the same index.
     """
     labels = np.array(block.together)
     for cycles in repeated_rows(block):
@@ -381,16 +425,23 @@ def _pose_of_row(block: PoseMeasurements) -> np.ndarray:
 
 
 def pose_count(blocks: Sequence[PoseMeasurements]) -> int:
-    """Return the number of robot poses in the blocks (several reflectors measured at once are one pose)."""
+    """Return the number of robot poses in the blocks; several reflectors measured at once count as one pose."""
     return sum(len(np.unique(block.rows)) for block in blocks)
 
 
 def _with_station_and_tool_names(
     read_blocks: Sequence[tuple[Path, PoseMeasurements]], options: FitOptions, stations: str, tools: str
 ) -> list[PoseMeasurements]:
-    """Return the blocks to fit with station and tool names from --stations and --tools; all names are distinct.
+    """Return the blocks to fit with station and tool names by the options --stations and --tools.
 
-    If an arm carried a camera and another target, or two cameras, these are several tools whatever --tools says.
+    All names are distinct. If the arm carried a camera and another target, or two cameras, these are different tools,
+    regardless of --tools.
+
+    Args:
+        read_blocks: (file, measurements) of each block.
+        options: options for reading the files, which may state names.
+        stations: ``one`` base placement for all files, or one for each.
+        tools: one tool for all files, or one for each.
     """
     carried = list(dict.fromkeys(block.carried for _, block in read_blocks))
     station_of: dict[Path, str] = {}
@@ -422,7 +473,12 @@ def _with_station_and_tool_names(
 
 
 def _carried_name(device: tuple[str, object], carried: Sequence[tuple[str, object]]) -> str:
-    """Return the name of a file's tool: its kind, with a number if it is not the first tool of this kind."""
+    """Return the name of the tool in a file: its kind, with a number if it is not the first tool of this kind.
+
+    Args:
+        device: kind and identity of what the arm carried in the file.
+        carried: kind and identity of everything that the arm carried in any file, each once.
+    """
     kind = device[0]
     of_kind = [candidate for candidate in carried if candidate[0] == kind]
     number = of_kind.index(device) + 1
@@ -432,7 +488,7 @@ def _carried_name(device: tuple[str, object], carried: Sequence[tuple[str, objec
 
 
 def _free_name(unseen: Mapping[str, Unseen], file: str) -> str:
-    """Return a file's name, or its path if another file has the same name."""
+    """Return the name of a file as a key for `unseen`, or its path if this name is already used there."""
     if Path(file).name not in unseen:
         return Path(file).name
     name = file
@@ -444,7 +500,11 @@ def _free_name(unseen: Mapping[str, Unseen], file: str) -> str:
 
 
 def _with_frames_of_fit(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: list[str]) -> PoseMeasurements:
-    """Return a validation block with the names of the fit's station and tools; appends remarks to `notes`."""
+    """Return a validation block with the names of the fit's station and tools; remarks are appended to `notes`.
+
+    Raises:
+        UsageError: if the fit has no station or tools for the block.
+    """
     fit = [fitted for fitted in fit if fitted.carried == block.carried] or fit
     if block.has_instrument:
         stations = [fitted.station for fitted in fit if fitted.has_instrument]
@@ -462,6 +522,7 @@ def _with_frames_of_fit(block: PoseMeasurements, fit: Sequence[PoseMeasurements]
     if len(block.tool_names) != len(fit[0].tool_names):
         tools = ", ".join(block.tool_names)
         raise UsageError(
-            f"{block.file}: the fit has no tool {tools}, only {', '.join(sorted(fit_tools))}; refit_frames"
+            f"{block.file}: the fit has no tool {tools}, only {', '.join(sorted(fit_tools))}; refit its frames "
+            "(--refit-frames)"
         )
     return replace(block, tool_names=fit[0].tool_names)

@@ -1,4 +1,4 @@
-"""Content of a fit's ``metrics.json``: errors of both arms, the ladder of models, outliers, the verdict."""
+"""Content of a fit's ``metrics.json``: errors of both arms, tried models, outliers, and the verdict."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,8 +18,15 @@ SCHEMA = 3
 
 @dataclass(frozen=True)
 class PoseIntervalCoverage:
-    """Share of errors within the fit's 95 % interval, median and rms width [mm], and number of rows that
-    extrapolate.
+    """Coverage of the 95 % intervals of position errors that a fit predicts.
+
+    Attributes:
+        coverage_percent: share of errors within their intervals [%].
+        median_mm: median radius of the intervals [mm].
+        sigma_rms_mm: rms of the predicted σ [mm].
+        rows: number of rows.
+        rows_beyond_learnt_range: number of rows at which a joint is outside the range of the fitted rows.
+        joints_beyond_learnt_range: names of these joints.
     """
 
     coverage_percent: float
@@ -32,21 +39,21 @@ class PoseIntervalCoverage:
 
 @dataclass(frozen=True)
 class ComparedRows:
-    """Errors of both arms on one set of rows.
+    """Errors of the nominal and the calibrated arm on one set of rows.
 
     Attributes:
         poses: number of robot poses.
         frames: text on the source of the base and tool placement.
         nominal, calibrated: errors of the nominal and the calibrated arm.
         urdf_alone: errors of the calibrated geometry without joint corrections; None without corrections.
-        pair_distance_mm: arm → errors of the distances between pairs of positions.
+        pair_distance_mm: arm -> errors of the distances between pairs of positions.
         iso9283: repeatability and accuracy from repeated poses; None without such poses.
-        unseen: False if the fit had seen the rows.
-        parameters: number of parameters fitted to these rows; 0 on unseen rows.
+        unseen: whether the rows were held out from the fit.
+        parameters: number of parameters fitted to these rows; 0 on held-out rows.
         interval95: coverage of the error intervals that the fit predicts; None without an error model.
         reprojection_px: arm -> rms distance between detected and predicted corners.
-        plain: errors of the plain reference; None on the fit's own rows.
-        position_means: meaning of the errors ``position_mm``: ``position`` if positions were measured, else the
+        plain: errors of the plain reference; None on fitted rows.
+        position_means: meaning of the errors ``position_mm``: ``position`` if positions were measured, otherwise the
             component that sockets and planes measure (`calib.geometry.accuracy`).
     """
 
@@ -65,13 +72,21 @@ class ComparedRows:
     position_means: str = "position"
 
     def words(self, nature: str) -> str:
-        """Return the name of an error (position, orientation, distance), depending on what was measured."""
+        """Return the printed name of an error, which depends on the measurements.
+
+        Args:
+            nature: kind of the error: position, orientation or distance.
+        """
         if nature == "position":
             return self.position_means
         return nature
 
     def judged(self, deliverable: str) -> ArmErrors:
-        """Return the errors on which the verdict on a deliverable (``urdf`` or ``corrections``) is based."""
+        """Return the errors of the deliverable that is judged.
+
+        Args:
+            deliverable: ``urdf`` or ``corrections``.
+        """
         if deliverable == "urdf" and self.urdf_alone is not None:
             return self.urdf_alone
         return self.calibrated
@@ -79,7 +94,14 @@ class ComparedRows:
 
 @dataclass(frozen=True)
 class Outlier:
-    """Outlier: a row with its residual, in robust standard deviations of all rows and in mm or deg."""
+    """A row with a large residual.
+
+    Attributes:
+        file, row: file and row number.
+        nature: kind of the residual: position, orientation or distance.
+        sigmas: size of the residual, in robust standard deviations of all rows.
+        size_mm, size_deg: size in mm or in degrees; the other one is None.
+    """
 
     file: str
     row: int
@@ -90,14 +112,14 @@ class Outlier:
 
     @property
     def size(self) -> str:
-        """Residual with its unit, as text."""
+        """Size of the residual with its unit, as text."""
         if self.size_deg is None:
             return f"{self.size_mm:.3g} mm"
         return f"{self.size_deg:.3g} deg"
 
     @property
     def words(self) -> str:
-        """File, row and residual, as text."""
+        """File, row number and size of the residual, as text."""
         return f"{Path(self.file).name} row {self.row} ({self.size}, {self.sigmas:.1f} sigma)"
 
 
@@ -107,15 +129,17 @@ class Findings:
 
     Attributes:
         model: the chosen model.
-        cross_validated, nominal_cross_validated: errors of the chosen model and of the nominal arm [m]; None if not
-            computed.
+        cross_validated, nominal_cross_validated: cross-validated errors of the chosen model and of the nominal arm [m];
+            None if not computed.
         outlier_share: share of outliers among the fitted rows.
         reach: reach of the arm [m].
         loss: loss function that was used; empty if unknown.
-        noticed: findings on the fit, worst first; they do not depend on unseen rows.
-        blind: stations cross-validated by regions only, since their tool is not identifiable from the other stations.
+        noticed: findings on the fit that do not depend on held-out rows, worst first.
+        blind: stations that cross-validation could not hold out as a whole, since the other stations do not determine
+            their tool; only regions of their poses were held out.
         discrepancy: distribution of the error at a pose, estimated by cross-validation; None if not estimated.
-        rigid_cross_validated: error of the best model without joint corrections [m]; None if not computed.
+        rigid_cross_validated: cross-validated error of the best model without joint corrections [m]; None if not
+            computed.
         joint_range: joint range of the fitted rows; None in files of earlier versions.
     """
 
@@ -138,12 +162,13 @@ class ValidationMetrics:
 
     Attributes:
         validation: name of a validation file -> errors of both arms.
-        verdict, reason: level of the verdict, and its reason as text.
+        verdict, reason: level of the verdict, and the reason as text.
         warnings: texts for the user.
-        noticed: the findings that the warnings render; remarks from reading the files are text only.
-        code, advice: of the finding that decided the verdict; empty for a pass.
+        noticed: the findings whose sentences are in the warnings; remarks from reading the files are text only.
+        code, advice: code and advice of the finding that decided the verdict; empty for a pass.
+        schema: version of the file's format.
         deliverables: verdict on each existing deliverable of `calib.procedure.kinematic_stage.settings.DELIVERABLES`.
-        deliverable: name of the deliverable that `verdict` and `reason` are about; empty in files of earlier versions.
+        deliverable: name of the deliverable to which `verdict` and `reason` apply; empty in files of earlier versions.
     """
 
     validation: Mapping[str, ComparedRows]
@@ -160,7 +185,19 @@ class ValidationMetrics:
 
 @dataclass(frozen=True, kw_only=True)
 class FitMetrics(ValidationMetrics):
-    """The content of ``metrics.json``; see `calib.procedure.kinematic_stage.folder`."""
+    """The content of a fit's ``metrics.json``.
+
+    Attributes:
+        fit: errors of both arms on the fitted rows.
+        model: name of the chosen model.
+        ladder: tried models with their cross-validated errors.
+        seed: seed of all random numbers.
+        tolerance_mm: largest acceptable rms on held-out poses [mm]; None: none was stated.
+        not_identifiable: texts on parameters that the poses do not identify.
+        outliers: fitted rows with large residuals, worst first.
+        findings: findings that the verdict needs besides the errors; None in files of earlier versions.
+        status: how the optimisation ended; empty in files of earlier versions.
+    """
 
     fit: ComparedRows
     model: str
@@ -174,19 +211,19 @@ class FitMetrics(ValidationMetrics):
 
     @property
     def proofs(self) -> dict[str, ComparedRows]:
-        """Errors on each set of validation rows that the fit had not seen, by name."""
+        """Errors on each set of validation rows that were held out from the fit: name -> errors."""
         return {name: rows for name, rows in self.validation.items() if rows.unseen}
 
 
 @dataclass(frozen=True)
 class ImageCoverage:
-    """Number of corners in each cell of a camera's images, and their prediction errors.
+    """Number of corners in each cell of a camera's image area, and their reprojection errors.
 
     Attributes:
-        file: the images' folder.
+        file: folder of the images.
         size: width and height of the images [px].
-        count: number of corners per cell of the image, row by row.
-        rms: rms distance between detected and predicted corners [px] per cell; 0 in cells without corners.
+        count: number of corners in each cell, row by row.
+        rms: rms distance between detected and predicted corners in each cell [px]; 0 in cells without corners.
     """
 
     file: str

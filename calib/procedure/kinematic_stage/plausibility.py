@@ -1,6 +1,6 @@
 """Findings on measurements that contradict the arm (catalogue, chapter 1): wrong columns, scale, large changes.
 
-Also: rows with large residuals, and whether rigid geometry explains the measurements.
+Further findings are on rows with large residuals, and on whether a rigid geometry explains the measurements.
 """
 
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ from calib.data.images.pixels import Pixels
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, finding
 from calib.geometry.accuracy import NATURE, errors
+from calib.geometry.checks.base_motion import base_motion
 from calib.geometry.checks.joint_range import JointRange
 from calib.geometry.checks.readings import repeated_readings
 from calib.geometry.diagnosis import Scale, length_factor, scale_of, wrong_angles, wrong_columns
@@ -40,7 +41,7 @@ MAX_IMAGES = 100
 
 
 def named_outliers(fit: GeometricFit) -> list[Outlier]:
-    """Return the outliers of a fit (above four robust sigmas), worst first; several targets of one row count once."""
+    """Return the outliers of a fit (above four robust σ), worst first; several targets of one row count once."""
     outliers: dict[tuple[str, int, str], Outlier] = {}
     for file, row, label, sigmas, size in fit.outliers():
         nature = NATURE[label]
@@ -51,12 +52,11 @@ def named_outliers(fit: GeometricFit) -> list[Outlier]:
 
 
 def misfit(selection: ModelSelection, reach: float) -> Finding | None:
-    """Return a finding if no rigid geometry explains the measurements: the error exceeds `FLOOR` of the reach.
+    """Return a finding if no rigid geometry explains the measurements; otherwise None.
 
-    The error must exceed this limit both on the fitted rows, corrected for degrees of freedom, and in cross-validation,
-    since few poses predict each other badly under any model. If the error of the chosen model, joint corrections
-    included,
-    is below `FLOOR`, the finding is a note. None if a rigid geometry explains the measurements.
+    The condition is an error above `FLOOR` times the reach, both on the fitted rows (corrected for degrees of freedom)
+    and in cross-validation, since few poses predict each other badly under any model. If the error of the chosen model,
+    joint corrections included, is below this limit, the finding is only a note.
 
     Args:
         selection: the selection of models by cross-validation.
@@ -74,10 +74,10 @@ def misfit(selection: ModelSelection, reach: float) -> Finding | None:
 
 
 def gross_rows(selection: ModelSelection, robust: ModelSelection, reach: float) -> Finding | None:
-    """Return a finding if a few grossly wrong rows cause the error that `misfit` reports; otherwise None.
+    """Return a finding if a few rows with gross errors cause the error that `misfit` reports; otherwise None.
 
     Args:
-        selection: models fitted with a loss that weighs every row.
+        selection: models fitted with a loss that gives full weight to every row.
         robust: the rigid models fitted to the same rows with a robust loss.
         reach: reach of the arm [m].
     """
@@ -107,11 +107,11 @@ def _position_rms(fit: GeometricFit) -> float:
 
 
 def of_range(measured_range: JointRange, tolerance: float | None) -> list[Finding]:
-    """Return findings on the joint range in which a calibration is valid, and on the predicted error outside.
+    """Return findings on the joint range in which a calibration is valid, and on the error outside this range.
 
     Args:
-        measured_range: the measured range, and σ over the whole range.
-        tolerance: largest acceptable rms on unseen poses [m]; None if not stated.
+        measured_range: the measured range, and the predicted σ over the arm's whole range.
+        tolerance: largest acceptable rms on held-out poses [m]; None if not stated.
     """
     sigma, nominal = measured_range.sigma, measured_range.nominal
     if sigma is None or not measured_range.moved:
@@ -129,7 +129,7 @@ def of_range(measured_range: JointRange, tolerance: float | None) -> list[Findin
 
 
 def ranges(measured_range: JointRange) -> list[str]:
-    """Return the measured range of each joint, as text [deg or mm]."""
+    """Return a text on the measured range of each joint [deg or mm]."""
     texts = []
     limits = zip(measured_range.joints, measured_range.lower, measured_range.upper, measured_range.units)
     for name, low, high, unit in limits:
@@ -167,7 +167,7 @@ def findings(
         sample.append(_as_positions(take(block, rows)))
 
     misread = _misread(nominal, sample) + _wrong_columns(nominal, sample, before, reach)
-    result = repeated_readings(nominal, sample) + (misread or _large_changes(fit, reach))
+    result = base_motion(blocks) + repeated_readings(nominal, sample) + (misread or _large_changes(fit, reach))
     result.append(finding("unexplained", rms=remains, reach=reach, share=remains / reach))
     if 0.0 < after < TOO_GOOD:
         arm, rms = ("nominal", before) if before < TOO_GOOD else ("calibrated", after)
@@ -184,7 +184,10 @@ def findings(
 
 
 def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
-    """Return the block; images are replaced by board poses, scaled by the board's square."""
+    """Return a block of measurements with positions.
+
+    Images are replaced by board poses, whose scale is that of the board's squares; other blocks are unchanged.
+    """
     if not isinstance(block, Pixels):
         return block
     rows = evenly(len(block), MAX_IMAGES)
@@ -196,7 +199,16 @@ def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
 def _wrong_columns(
     nominal: Installation, blocks: Sequence[PoseMeasurements], before: float, reach: float
 ) -> list[Finding]:
-    """Return a finding if the nominal arm explains the rows after a change of columns or rows; else []."""
+    """Return a finding if the nominal arm explains the rows after a change of columns or rows.
+
+    Otherwise, the list is empty.
+
+    Args:
+        nominal: the arm before the fit, with base and tool placed.
+        blocks: the rows.
+        before: rms error of the nominal arm [m].
+        reach: reach of the arm [m].
+    """
     if not before > FLOOR * reach:
         return []
     mirrored = before > limit("unexplained", "share") * reach
@@ -204,8 +216,13 @@ def _wrong_columns(
 
 
 def _misread(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> list[Finding]:
-    """Return a finding if the angles of the orientations fit by another convention, but not by the stated one; else
-    [].
+    """Return a finding if the measured orientations fit the arm by another convention of angles than the stated one.
+
+    Otherwise, the list is empty.
+
+    Args:
+        nominal: the arm before the fit, with base and tool placed.
+        blocks: the rows.
     """
     angle = errors(nominal, blocks).orientation
     if angle is None or not np.sqrt(np.mean(angle**2)) > limit("orientations-off", "angle"):
@@ -214,7 +231,14 @@ def _misread(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> list[
 
 
 def _explanation(change: Explanation | None, nominal: Installation) -> list[Finding]:
-    """Return the finding on a change that explains the rows if it reaches a level of the catalogue; else []."""
+    """Return a finding on a change of columns that explains the rows.
+
+    An empty list if there is no such change, or if the finding reaches no level of the catalogue.
+
+    Args:
+        change: the change of columns; None: there is none.
+        nominal: the arm, which names the joints.
+    """
     if change is None:
         return []
     before = float(np.sqrt(change.before[0]))
@@ -225,7 +249,12 @@ def _explanation(change: Explanation | None, nominal: Installation) -> list[Find
 
 
 def _large_changes(fit: GeometricFit, reach: float) -> list[Finding]:
-    """Return a finding if fitted elements differ implausibly much from nominal, largest change first."""
+    """Return a finding if fitted elements differ implausibly much from nominal; otherwise an empty list.
+
+    Args:
+        fit: the fit.
+        reach: reach of the arm [m], to which changes of lengths are compared.
+    """
     large = []
     for element, value, nominal in zip(fit.cell.chain.elements, fit.cell.chain.values, fit.start.chain.values):
         change = float(value - nominal)
@@ -246,7 +275,12 @@ def _large_changes(fit: GeometricFit, reach: float) -> list[Finding]:
 
 
 def _wrong_scale(codes: tuple[str, str], scale: Scale | None) -> list[Finding]:
-    """Return the finding on an implausible scale factor: of two codes, the first that reaches a level; else []."""
+    """Return a finding on an implausible scale factor; an empty list if the factor is plausible.
+
+    Args:
+        codes: two codes of findings; the first one that reaches a level of the catalogue is used.
+        scale: the scale factor; None: unknown.
+    """
     if scale is None:
         return []
     off = abs(scale.factor - 1.0)

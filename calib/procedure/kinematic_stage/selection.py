@@ -1,4 +1,7 @@
-"""Selection of the poses to measure: passes a robot's observation Jacobian to the package `poses`."""
+"""Selection of the poses to measure, by the optimisation in the package `poses`.
+
+This module supplies a robot's observation Jacobian and limits to the optimisation.
+"""
 
 from __future__ import annotations
 
@@ -50,13 +53,13 @@ RANDOM_POSTURES = 2000
 
 @dataclass(frozen=True, eq=False)
 class PoseOutlook:
-    """Predicted accuracy of a calibration with the chosen poses, before measuring.
+    """Accuracy of a calibration with the selected poses, predicted before the measurement.
 
     Attributes:
-        poses: prediction for a fit on the chosen poses.
-        others: predictions for other numbers of poses, chosen greedily.
+        poses: prediction for a fit to the selected poses.
+        others: predictions for other numbers of poses, selected greedily.
         blind: index and prediction without line-of-sight constraints; None if there are no such constraints.
-        comparable: index of poses chosen in the same way as `blind`, with line-of-sight constraints.
+        comparable: index of poses selected with line-of-sight constraints, by the same method as `blind`.
     """
 
     poses: Prediction
@@ -71,12 +74,12 @@ class Chosen:
 
     Attributes:
         chain: the nominal arm.
-        selection: see `calib.poses.select`.
-        parameters: number of parameters that are identifiable from the measurements.
+        selection: the selected poses with index and efficiency (`calib.poses.select.Selection`).
+        parameters: number of parameters that are identifiable from measurements at any poses.
         existing: index of the existing poses alone; None without existing poses, or if they are too few.
-        checked, unchecked: constraints that were checked, and those that could not be, as text.
+        checked, unchecked: constraints that were checked, and constraints that could not be checked, as text.
         notes: other remarks for the user.
-        outlook: predicted accuracy with these poses and with others.
+        outlook: predicted accuracy with the selected poses and with other numbers of poses.
         run: order of the poses, which is that of `selection.q`, and the paths between them.
         driven: speed and dwell time of the run.
         by_images: whether a camera measures by images of a board.
@@ -96,14 +99,14 @@ class Chosen:
 
     @property
     def prediction(self) -> SelectionPrediction | None:
-        """Prediction stored next to the poses; None if a parameter is not identifiable."""
+        """Prediction that is stored next to the poses; None if a parameter is not identifiable."""
         if not np.isfinite(self.outlook.poses.rms):
             return None
         return self.outlook.poses
 
     @property
     def figure_names(self) -> tuple[str, ...]:
-        """Names of the available figures; none if a parameter is not identifiable."""
+        """Names of the figures that can be drawn; empty if a parameter is not identifiable."""
         if self.prediction is None:
             return ()
         if self.outlook.others:
@@ -111,10 +114,10 @@ class Chosen:
         return FIGURES[:1]
 
     def kept(self) -> list[str]:
-        """Return text lines on the constraints that were checked, on those not checked, and on the run."""
+        """Return lines of text on the checked constraints, the unchecked constraints, and the run."""
         lines = []
         if self.checked:
-            lines.append(f"kept: {', '.join(self.checked)}")
+            lines.append(f"respected: {', '.join(self.checked)}")
         if self.unchecked:
             lines.append(f"NOT checked: {', '.join(self.unchecked)}")
         return lines + run_lines(self.run, self.driven)
@@ -135,12 +138,12 @@ def choose(
     """Return the m poses that determine the robot's geometry best.
 
     Args:
-        robot: see `calib.robot.library`.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         m: number of poses.
         settings: quantity to measure, index, method, seed.
-        constraints: constraints file, or its tables, see `calib.procedure.measuring.constraints_file`; None: defaults.
-        existing: poses measured before, which the selection complements: a CSV, or in memory; None: none.
-        base, tip: links of a URDF; None: see `calib.robot.library`.
+        constraints: constraints file (`calib formats constraints`), or its content as tables; None: defaults.
+        existing: poses measured earlier, which the selection complements: a CSV, or in memory; None: none.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
         map: function that runs parallel work (`calib.workers`).
         progress: called with (done, total, text); None: silent.
 
@@ -154,7 +157,7 @@ def choose(
     limits = read_limits(constraints, cell, source, settings.without)
     view = limits.camera
     if view is None:
-        jacobian = observation(cell, settings.kind, settings.sigmas, settings.seed)
+        jacobian = observation(cell, settings.kind, settings.sigmas, settings.seed, settings.reference)
     else:
         jacobian = view.observation(limits.lower, limits.upper, settings.seed)
     space = limits.space(jacobian)
@@ -215,7 +218,18 @@ def choose(
 def _draw_views(
     view: CameraView, space: SearchSpace, limits: Limits, settings: SelectionSettings, m: int
 ) -> np.ndarray:
-    """Return feasible postures (N, n) that see the board, at least twice as many as are to be chosen."""
+    """Return feasible postures (N, n) at which the camera sees the board, at least twice as many as shall be selected.
+
+    Args:
+        view: camera and board.
+        space: search space with all constraints.
+        limits: joint limits and constraints.
+        settings: settings of the selection.
+        m: number of poses to select.
+
+    Raises:
+        UsageError: if fewer postures are found.
+    """
     count = min(settings.candidates, VIEWS)
     feasible = partial(is_feasible, space)
     candidates = view.draw(count, feasible, limits.lower, limits.upper, settings.seed)
@@ -228,7 +242,7 @@ def _draw_views(
 
 
 def _search_settings(settings: SelectionSettings) -> SearchSettings:
-    """Return the settings of the search; `select_poses` checks index and method."""
+    """Return the settings of the search; index and method are checked later, by `select_poses`."""
     seconds = np.inf
     if settings.seconds is not None:
         seconds = settings.seconds
@@ -245,7 +259,12 @@ def _search_settings(settings: SelectionSettings) -> SearchSettings:
 
 
 def _in_driving_order(selection: Selection, driven: Drivable) -> Selection:
-    """Return the selection in driving order, with index and efficiency updated for replaced poses."""
+    """Return the selection in the order of the run, with index and efficiency updated for replaced poses.
+
+    Args:
+        selection: the selected poses.
+        driven: the run through the poses, with replacements of unreachable poses.
+    """
     value = selection.value
     history = selection.history
     if driven.replaced:
@@ -267,7 +286,16 @@ def _in_driving_order(selection: Selection, driven: Drivable) -> Selection:
 
 
 def _draw_feasible(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> np.ndarray:
-    """Return the candidate poses; an error names the constraints if too few poses are feasible."""
+    """Return random feasible poses as candidates.
+
+    Args:
+        space: search space with all constraints.
+        limits: joint limits and constraints.
+        settings: settings of the selection.
+
+    Raises:
+        UsageError: if too few poses are feasible; the message lists the constraints.
+    """
     feasible = partial(is_feasible, space)
     try:
         return draw_candidates(space.lower, space.upper, settings.candidates, feasible, seed=settings.seed)
@@ -289,8 +317,17 @@ def _draw_feasible(space: SearchSpace, limits: Limits, settings: SelectionSettin
 def _outlook(
     jacobian: Observation, limits: Limits, search: SearchSettings, q: np.ndarray, exchange: Exchange, comparable: float
 ) -> PoseOutlook:
-    """Return the predicted accuracy with chosen poses q (m, n), with other pose counts, and without sight
-    constraints.
+    """Return the predicted accuracy with the selected poses and in other cases.
+
+    The other cases are other numbers of poses, and no line-of-sight constraints.
+
+    Args:
+        jacobian: observation Jacobian.
+        limits: limits of poses.
+        search: settings of the search.
+        q: (m, n) selected poses [rad or m].
+        exchange: candidate poses, and Jacobians of poses measured earlier.
+        comparable: observability index of poses selected with line-of-sight constraints.
     """
     space = limits.space(jacobian, sight=False)
     existing = exchange.before
@@ -313,7 +350,13 @@ def _outlook(
 
 
 def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:
-    """Return the files written next to a selection's CSV: the prediction, and the figures by name."""
+    """Return the paths of the files next to a selection's CSV: the prediction, and the figures by name.
+
+    Args:
+        out: path of the CSV.
+        plots: whether figures are written.
+        chosen: the selection, which determines the files; None: all files that a selection may write.
+    """
     paths = {}
     if chosen is None or chosen.prediction is not None:
         paths["prediction"] = forecast.beside(out)
@@ -326,13 +369,26 @@ def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[s
 
 
 def targets(out: Path, plots: bool) -> files.Results:
-    """Return the paths of all files that a selection may write."""
+    """Return the paths of all files that a selection may write, with their allowed suffixes.
+
+    Args:
+        out: path of the selection's CSV.
+        plots: whether figures are written.
+    """
     beside = beside_poses(out, plots).values()
     return [(out, (".csv",)), *((path, (path.suffix,)) for path in beside)]
 
 
 def write(chosen: Chosen, path: Path) -> Path:
-    """Write the chosen poses to a CSV with the joints' names [rad or m], and their predicted accuracy next to it."""
+    """Write the selected poses to a CSV with the joints' names [rad or m], and the predicted accuracy next to it.
+
+    Args:
+        chosen: the selection.
+        path: path of the CSV.
+
+    Returns:
+        Path of the CSV.
+    """
     if chosen.prediction is not None:
         forecast.write(chosen.prediction, path)
     else:
@@ -342,7 +398,13 @@ def write(chosen: Chosen, path: Path) -> Path:
 
 
 def bound_words(selection: Selection) -> str:
-    """Return a text on the set of poses to which the bound of an efficiency refers, and on the bound's accuracy."""
+    """Return a text on the bound of a selection's efficiency.
+
+    It names the set of poses to which the bound applies, and the bound's accuracy.
+
+    Args:
+        selection: the selected poses with their efficiency.
+    """
     ceiling = selection.ceiling
     if ceiling.climbs:
         percent = 100 * ceiling.gap
@@ -355,7 +417,11 @@ def bound_words(selection: Selection) -> str:
 
 
 def record(chosen: Chosen) -> dict[str, object]:
-    """Return the results of the selection as numbers; `table` returns them as text."""
+    """Return the results of a selection as numbers by name; `table` returns them as text.
+
+    Args:
+        chosen: the selection.
+    """
     selection = chosen.selection
     rms = chosen.outlook.poses.rms
     return {
@@ -378,7 +444,11 @@ def record(chosen: Chosen) -> dict[str, object]:
 
 
 def table(chosen: Chosen) -> list[tuple[str, str]]:
-    """Return the results of the selection as pairs of label and value."""
+    """Return the results of a selection as pairs of label and text.
+
+    Args:
+        chosen: the selection.
+    """
     selection = chosen.selection
     index = f"{selection.index}"
     if selection.index == "O1":
@@ -401,7 +471,11 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
 
 
 def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
-    """Return the table rows of the predicted accuracy, with the accuracy lost to line-of-sight constraints."""
+    """Return table rows (label, text) on the predicted accuracy, and on the accuracy lost by lines of sight.
+
+    Args:
+        chosen: the selection.
+    """
     outlook = chosen.outlook
     rows = forecast.table(outlook.poses, outlook.others)
     if outlook.blind is None:

@@ -1,8 +1,7 @@
 """Errors of both arms on fitted rows and validation rows, and the verdict that follows from the errors.
 
-`assess` returns the same result for a new fit and for one read from its folder.
-
-The rules of the verdict have their limits and sentences in the catalogue of findings, chapter 4.
+`assess` computes errors and verdict in the same way for a new fit and for a fit read from its folder. The limits and
+sentences of the verdict's rules are in the catalogue of findings, chapter 4.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -45,8 +44,12 @@ ARM = {"urdf": "calibrated", "corrections": "with joint corrections"}
 
 @dataclass(frozen=True)
 class _Proof:
-    """Errors on which the verdict on the arms is based: rms of nominal and calibrated arm [m], and the rows of the
-    errors.
+    """Errors on which a verdict is based.
+
+    Attributes:
+        before, after: rms errors of the nominal and of the calibrated arm [m].
+        where: text on the source of the errors.
+        rows: the rows with these errors; None for cross-validation.
     """
 
     before: float
@@ -56,7 +59,7 @@ class _Proof:
 
     @property
     def ratio(self) -> float:
-        """Ratio of the calibrated to the nominal arm's error."""
+        """Error of the calibrated arm divided by the error of the nominal arm."""
         return self.after / max(self.before, TINY)
 
 
@@ -72,31 +75,31 @@ def judge(
 ) -> Verdict:
     """Return the verdict on a calibration from its validation rows; without such rows, from cross-validation.
 
-    The first group of rules that yields a finding decides; inside a group, the worst finding decides:
+    The first group of rules that yields a finding decides; within a group, the worst finding decides:
 
     1. ``placed-elsewhere``, ``far-off``; ``orientations-off``; ``above-tolerance``;
     2. if only frames were requested: the tolerance, or ``frames-only`` (not judged) without a tolerance;
-    3. if the calibrated arm is as good as the nominal one (within `MIN_GAIN`): ``nothing-to-gain`` (pass) if the error
-    is
-       below `FLOOR` of the reach, ``transfer-untested`` if no station could be held out as a whole, else
-       ``no-better-model``; also a pass if the nominal arm's error is smaller than any instrument's (`TOO_GOOD`);
-    4. ``worse-than-nominal``; from cross-validation only, if both errors are below `FLOOR` of the reach,
+    3. if the calibrated arm is as good as the nominal one (within `MIN_GAIN`): ``nothing-to-gain`` (pass) if the
+       error is below `FLOOR` times the reach, ``transfer-untested`` if no station could be held out as a whole,
+       otherwise ``no-better-model``; also a pass if the nominal arm's error is smaller than any instrument's
+       (`TOO_GOOD`);
+    4. ``worse-than-nominal``; from cross-validation only, if both errors are below `FLOOR` times the reach,
        ``keep-nominal``, since the nominal arm may have been fitted to these rows;
     5. ``no-unseen-poses``;
     6. ``rigid-misfit`` or ``gross-rows`` of the fit, ``refuted``, ``no-transfer``, ``intervals-too-narrow``,
        ``small-gain``, ``many-outliers``; without any of them: pass.
 
-    The fit's other findings, those of `calib.procedure.kinematic_stage.plausibility`, and ``gross-unseen-rows`` count
-    in every group; ``gross-unseen-rows`` replaces ``refuted``.
+    Two kinds of findings count in every group: the other findings on the fit
+    (`calib.procedure.kinematic_stage.plausibility`), and ``gross-unseen-rows``, which replaces ``refuted``.
 
     Args:
         fit: errors of both arms on the fitted rows.
         validation: name of a validation file -> errors of both arms.
         findings: warnings and notes on the fit.
-        requested_model: the model that the settings name, or auto.
-        tolerance: largest acceptable rms on unseen poses [m]; None if not stated.
+        requested_model: the model in the settings, or auto.
+        tolerance: largest acceptable rms on held-out poses [m]; None if not stated.
         cross_validated: cross-validated error of the deliverable [m]; None if not computed.
-        arm: name of the deliverable if there are several; else empty.
+        arm: name of the deliverable if there are several; otherwise empty.
     """
     unseen = {name: comparison for name, comparison in validation.items() if comparison.proves}
     nominal_rms = fit.errors[0].rms
@@ -152,8 +155,15 @@ def judge(
 
 
 def _frames_verdict(worst: _Proof, tolerance: float | None, arm: str, findings: Sequence[Finding]) -> Verdict:
-    """Return the verdict if only frames were fitted: pass within a tolerance, not judged without one, or by
-    findings.
+    """Return the verdict if only base and tool placement (frames) were fitted.
+
+    With a tolerance it is pass or follows from the findings; without a tolerance it is not judged.
+
+    Args:
+        worst: the errors on which the verdict is based.
+        tolerance: largest acceptable rms on held-out poses [m]; None if not stated.
+        arm: name of the deliverable if there are several; otherwise empty.
+        findings: findings on these errors.
     """
     if tolerance is not None:
         return Verdict.of(_figures(worst, arm, tolerance), findings)
@@ -164,7 +174,13 @@ def _frames_verdict(worst: _Proof, tolerance: float | None, arm: str, findings: 
 
 
 def _figures(worst: _Proof, arm: str, tolerance: float | None = None) -> str:
-    """Return the sentence with the nominal and the calibrated arm's error that a verdict is based on."""
+    """Return a sentence with the errors of the nominal and the calibrated arm on which a verdict is based.
+
+    Args:
+        worst: the errors on which the verdict is based.
+        arm: name of the deliverable if there are several; otherwise empty.
+        tolerance: largest acceptable rms on held-out poses [m]; None if not stated.
+    """
     figures = finding("errors", after=worst.after, before=worst.before, where=worst.where, arm=arm, tolerance=tolerance)
     return sentence(figures)
 
@@ -174,7 +190,13 @@ def _far_off(
 ) -> Iterator[Finding]:
     """Yield findings on large errors: of both arms (moved instrument or another robot), or above the tolerance.
 
-    The errors are those of positions in `proofs`, and of orientations in all sets of rows.
+    Position errors are those in `proofs`; orientation errors are those of all `sets` of rows.
+
+    Args:
+        proofs: rms position errors on which the verdict is based.
+        sets: name of a set of rows -> errors, of which orientation errors are used.
+        tolerance: largest acceptable rms position error [m]; None if not stated.
+        reach: reach of the arm [m].
     """
     for proof in proofs:
         if proof.rows is not None:
@@ -192,8 +214,13 @@ def _far_off(
 
 
 def _gross(proof: _Proof, reach: float) -> Iterator[Finding]:
-    """Yield the finding that rows with large errors of both arms, probably wrong measurements, cause most of the
-    error.
+    """Yield a finding if a few rows with large errors of both arms dominate the rms.
+
+    These rows are probably wrong measurements.
+
+    Args:
+        proof: the errors.
+        reach: reach of the arm [m].
     """
     if proof.rows is None:
         return
@@ -208,12 +235,19 @@ def _gross(proof: _Proof, reach: float) -> Iterator[Finding]:
 
 
 def _far_above_median(sizes: np.ndarray) -> np.ndarray:
-    """Return which errors (m,) are far above the median error."""
+    """Return flags (m,): whether each of m errors `sizes` [m] is above `OUTLIER_SIGMAS` times the median error."""
     return sizes > OUTLIER_SIGMAS * np.median(sizes)
 
 
 def _row_texts(comparison: Comparison, selected: np.ndarray) -> list[str]:
-    """Return number and error of the selected rows (m,) as text; [] if errors do not belong to single rows."""
+    """Return number and error of the selected rows as text.
+
+    An empty list if errors do not belong to single rows.
+
+    Args:
+        comparison: errors on the rows.
+        selected: (m,) flags of the selected rows.
+    """
     numbers = [int(row) for block in comparison.blocks for row in block.rows]
     sizes = comparison.errors[1].main
     if len(numbers) != len(selected):
@@ -222,8 +256,13 @@ def _row_texts(comparison: Comparison, selected: np.ndarray) -> list[str]:
 
 
 def _nothing_gained(proofs: Sequence[_Proof], findings: Findings) -> list[Finding]:
-    """Return a finding if the calibrated arm is as good as the nominal one: nothing to gain, or no better model; else
-    [].
+    """Return a finding if the calibrated arm is as good as the nominal one; otherwise an empty list.
+
+    The finding states that there is nothing to gain, or that no better model was found.
+
+    Args:
+        proofs: errors on which the verdict is based.
+        findings: warnings and notes on the fit.
     """
     if not proofs:
         return []
@@ -242,7 +281,12 @@ def _nothing_gained(proofs: Sequence[_Proof], findings: Findings) -> list[Findin
 
 
 def _worse(proofs: Sequence[_Proof], reach: float) -> list[Finding]:
-    """Return findings if the calibrated arm is worse than the nominal one; else []."""
+    """Return findings if the calibrated arm is worse than the nominal one; otherwise an empty list.
+
+    Args:
+        proofs: errors on which the verdict is based.
+        reach: reach of the arm [m].
+    """
     rules = [finding("worse-than-nominal", times=proof.ratio) for proof in proofs]
     worse = list(filter(level_of, rules))
     if worse and proofs[0].rows is None and proofs[0].after <= FLOOR * reach < np.inf:
@@ -257,7 +301,17 @@ def _doubts(
     unseen: Mapping[str, Comparison],
     findings: Findings,
 ) -> Iterator[Finding]:
-    """Yield the remaining findings, worst first: no transfer, narrow intervals, small gain, outliers."""
+    """Yield the findings of the last group of rules: doubts about the calibrated arm.
+
+    They are on missing transfer to held-out rows, narrow intervals, small gain, and outliers.
+
+    Args:
+        worst: the largest errors on which the verdict is based.
+        fitted_rms: rms error on the fitted rows [m].
+        cross_validated: cross-validated error [m]; None if not computed.
+        unseen: name of a validation file -> errors of both arms.
+        findings: warnings and notes on the fit.
+    """
     times = worst.after / max(fitted_rms, TINY)
     remedy = ""
     if any(rows.shares_frames for rows in unseen.values()):
@@ -288,9 +342,13 @@ def _doubts(
 
 @dataclass(frozen=True, eq=False)
 class Arms:
-    """Nominal and calibrated installation (frames fitted to the fitted rows), and the best rigid geometry.
+    """The arms whose errors are compared.
 
-    `expected` is the error model of the calibrated arm, `plain` the plain reference; None if not available.
+    Attributes:
+        nominal, calibrated: nominal and calibrated installation, with frames fitted to the fitted rows.
+        rigid: best geometry without joint corrections.
+        expected: error model of the calibrated arm; None: no error model.
+        plain: plain reference; None: no plain reference.
     """
 
     nominal: Installation
@@ -308,10 +366,10 @@ class Assessment:
         fit: errors on the fitted rows.
         validation: name of a validation file -> errors on its rows.
         verdict: verdict on the requested deliverable, with its reason.
-        noticed: findings on the fit and on the unseen rows, worst first.
+        noticed: findings on the fit and on the held-out rows, worst first.
         notes: remarks from reading the files, as text.
         deliverables: verdict on each existing deliverable (`DELIVERABLES`).
-        deliverable: name of the deliverable that `verdict` is about.
+        deliverable: name of the deliverable to which `verdict` applies.
     """
 
     fit: Comparison
@@ -324,12 +382,12 @@ class Assessment:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings for the user, worst first."""
+        """Texts of findings and remarks for the user, worst first."""
         return tuple(dict.fromkeys((*lines_of(self.noticed), *self.notes)))
 
     @property
     def record(self) -> ValidationMetrics:
-        """Unseen rows, verdict and warnings, in the form of ``metrics.json``."""
+        """Errors on validation rows, verdict and warnings, in the form of ``metrics.json``."""
         rows = {name: comparison.record() for name, comparison in self.validation.items()}
         return ValidationMetrics(
             validation=rows,
@@ -351,7 +409,7 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
         arms: the arms to compare.
         inputs: the rows.
         findings: warnings and notes on the fit.
-        weighing: requested loss settings; the loss that the fit chose replaces the requested one.
+        weighing: requested settings of the loss function; the loss that the fit chose replaces the requested one.
         settings: the requested model, tolerance, deliverable, and the seed of the pairs whose distances are compared.
     """
     weighing = replace(weighing, loss=findings.loss or weighing.loss)
@@ -402,7 +460,14 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
 
 
 def _references(name: str, rows: Comparison, deliverable: str, frames_only: bool) -> Iterator[Finding]:
-    """Yield findings on validation rows: errors of nominal arm, plain reference and deliverable, and if it is worse."""
+    """Yield findings on validation rows that compare the deliverable with the nominal arm and the plain reference.
+
+    Args:
+        name: name of the validation file.
+        rows: errors on its rows.
+        deliverable: ``urdf`` or ``corrections``.
+        frames_only: whether only base and tool placement were fitted; then the plain reference is no measure.
+    """
     if rows.plain is None or not rows.proves:
         return
     delivered = rows.errors[1].rms
@@ -418,7 +483,14 @@ def _references(name: str, rows: Comparison, deliverable: str, frames_only: bool
 def judge_deliverables(
     fit: Comparison, validation: Mapping[str, Comparison], findings: Findings, settings: FitSettings
 ) -> dict[str, Verdict]:
-    """Return the verdict on each deliverable: robot.urdf alone, and (if fitted) with joint corrections."""
+    """Return the verdict on each deliverable: ``urdf`` (robot.urdf alone), and, if fitted, ``corrections``.
+
+    Args:
+        fit: errors of both arms on the fitted rows.
+        validation: name of a validation file -> errors of both arms.
+        findings: warnings and notes on the fit.
+        settings: the requested model and tolerance.
+    """
     model = settings.model or "auto"
     judge_arm = partial(judge, findings=findings, requested_model=model, tolerance=settings.tolerance)
     if fit.alone is None:
@@ -432,7 +504,15 @@ def judge_deliverables(
 
 
 def _worst_rms(validation: Mapping[str, Comparison], findings: Findings, deliverable: str) -> float:
-    """Return the largest rms error [m] of a deliverable on validation rows; without such rows, by cross-validation."""
+    """Return the largest rms error [m] of a deliverable on validation rows.
+
+    Without such rows, it is the cross-validated error; NaN if neither is known.
+
+    Args:
+        validation: name of a validation file -> errors of both arms.
+        findings: findings on the fit with the cross-validated errors.
+        deliverable: ``urdf`` or ``corrections``.
+    """
     comparisons = [rows for rows in validation.values() if rows.proves]
     cross_validated = findings.cross_validated
     if deliverable == "urdf":
@@ -446,7 +526,11 @@ def _worst_rms(validation: Mapping[str, Comparison], findings: Findings, deliver
 
 
 def _copies(inputs: Inputs) -> list[str]:
-    """Return a note for each validation file that contains fitted rows."""
+    """Return a text for each validation file that contains fitted rows.
+
+    Args:
+        inputs: robot and measurements.
+    """
     notes = []
     for name, unseen in inputs.unseen.items():
         if not unseen.seen:
@@ -467,12 +551,16 @@ def _copies(inputs: Inputs) -> list[str]:
 
 
 def _noticed(name: str, rows: Comparison, usual: float) -> Iterator[Finding]:
-    """Yield the findings on one set of validation rows: moved instrument, doubtful rows, frames, intervals.
+    """Yield findings on one set of validation rows: moved instrument, doubtful rows, placement, intervals.
 
-    They concern errors of the nominal arm far above its `usual` error [m] (the instrument may have moved), rows that
-    may be
-    wrong measurements, a placement of base and tool that did not converge or absorbed most of the errors, and the share
-    of errors within the 95 % interval.
+    The instrument may have moved if the nominal arm's errors are far above the usual ones. Doubtful rows may be wrong
+    measurements. The placement of base and tool may not have converged, or may have absorbed most of the errors. The
+    last finding states the share of errors within the 95 % intervals.
+
+    Args:
+        name: name of the validation file.
+        rows: errors on the rows.
+        usual: median error of the nominal arm on the fitted rows [m].
     """
     before = rows.errors[0].main
     sizes = rows.errors[1].main

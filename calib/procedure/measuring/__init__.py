@@ -1,4 +1,4 @@
-"""Measuring at selected poses: limits of poses, runs, predicted accuracy, and settings of a run."""
+"""Measuring at selected poses: limits of poses, the measuring run, its settings, and the predicted accuracy."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -10,7 +10,7 @@ from calib.config_types import Real
 @checked
 @dataclass(frozen=True)
 class RunSettings:
-    """Settings of a run: speed and dwell time.
+    """Settings of a measuring run: speed of the moves and dwell time at each pose.
 
     Attributes:
         speed: speed of the run, as a share of the joints' largest speeds.

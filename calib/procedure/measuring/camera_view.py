@@ -1,6 +1,6 @@
-"""Pose selection with a camera: visibility of the board, and observation Jacobian of images.
+"""Pose selection with a camera that sees a board: visibility constraint and observation Jacobian of images.
 
-``[camera]`` of the constraints file states the camera (`calib formats constraints`).
+The table ``[camera]`` of the constraints file describes camera and board (`calib formats constraints`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ DISPLACEMENT = 2e-5
 TURN = 2e-5
 ASSUMED = (
     f"predicted σ: for corner noise of {CORNER:g} px and a repeatability of {1e3 * DISPLACEMENT:g} mm and "
-    f"{1e3 * TURN:g} mrad per axis; unmodelled effects come on top"
+    f"{1e3 * TURN:g} mrad per axis; unmodelled effects are not included"
 )
 # times that views are drawn
 TRIES = 60
@@ -56,15 +56,17 @@ FREE_LENS_PARAMETERS = 8
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """Constraint "the camera sees the whole board": callable, q (m, n) -> (m, 19), satisfied where <= 0.
+    """Constraint "the camera sees the whole board", satisfied where all values are <= 0.
+
+    It is a function of joint values q (m, n) with values (m, 19).
 
     Attributes:
         cell: the arm with approximate placements of camera and board.
-        board: the board.
+        board: the calibration board.
         mounting: ``in hand`` (the arm carries the camera) or ``to hand`` (the arm carries the board).
-        tilt: largest angle between the line of sight and the board's normal [rad].
-        span: least and largest distance of the board's centre [m].
-        margin: least distance of the board from the image's edge [px].
+        tilt: largest allowed angle between the line of sight and the board's normal [rad].
+        span: smallest and largest allowed distance of the board's centre from the camera [m].
+        margin: smallest allowed distance of the board from the image's edge [px].
     """
 
     cell: Installation
@@ -76,11 +78,11 @@ class CameraView:
 
     @property
     def lens(self) -> Lens:
-        """Lens of the camera."""
+        """Lens parameters of the camera."""
         return self.cell.optics.lenses[0]
 
     def poses(self, q: np.ndarray) -> np.ndarray:
-        """Return the board's poses (m, 4, 4) in the camera's frame."""
+        """Return the board's poses (m, 4, 4) in the camera frame at joint values q (m, n) [rad or m]."""
         poses = see(self.cell, q).poses()
         if self.mounting == IN_HAND:
             return invert(poses)
@@ -109,7 +111,7 @@ class CameraView:
 
     @property
     def stand(self) -> np.ndarray:
-        """Position (3,) of the fixed camera or of the fixed board's centre in the arm's base [m]."""
+        """Position (3,) in the arm's base frame [m] of the fixed camera, or of the fixed board's centre."""
         T_base_station = invert(self.cell.stations[0])
         middle = np.zeros(2)
         if self.mounting == IN_HAND:
@@ -117,16 +119,24 @@ class CameraView:
         return (T_base_station @ [*middle, 0.0, 1.0])[:3]
 
     def constraint(self) -> PoseConstraint:
-        """Return the visibility constraint for pose selection."""
+        """Return the visibility of the whole board as a constraint of pose selection."""
         return PoseConstraint("board in view of the camera", self)
 
     @property
     def assumed(self) -> str:
-        """Sentence on the measurement noise that is assumed to predict σ."""
+        """Sentence for the user that states the measurement noise assumed in the prediction of σ."""
         return ASSUMED
 
     def observation(self, lower: np.ndarray, upper: np.ndarray, seed: int = 0) -> ImageObservation:
-        """Return the observation Jacobian of images for the parameters that views of the board can identify."""
+        """Return the observation Jacobian of images, limited to the parameters that images of the board can identify.
+
+        Args:
+            lower, upper: (n,) joint limits [rad or m].
+            seed: seed of the random postures at which identifiability is examined.
+
+        Raises:
+            UsageError: if the board is in view at too few of these postures.
+        """
         columns = layout(self.cell).rigid_index
 
         def in_view(q: np.ndarray) -> np.ndarray:
@@ -142,7 +152,10 @@ class CameraView:
         return ImageObservation(self.cell, True, columns[split.kept], view=self)
 
     def block(self, q: np.ndarray) -> list[Block]:
-        """Return blocks of images at joint values q (m, n), ready for a fit, with all corner pixels set to zero."""
+        """Return an image measurement at joint values q (m, n), prepared for a fit, whose corner pixels are all zero.
+
+        Only the Jacobian of this measurement is used, and it does not depend on the measured pixels.
+        """
         pixel = np.zeros((len(q), len(corners(self.board)), 2))
         block = Pixels(
             q,
@@ -164,14 +177,14 @@ class CameraView:
         upper: np.ndarray,
         seed: int | np.random.Generator,
     ) -> np.ndarray:
-        """Return up to `count` random postures (·, n) with the board in view.
+        """Return random postures (at most `count`, n) [rad or m] at which the board is in view.
 
-        Views are drawn, and joint values are solved for them, since only one in a thousand random postures sees the
-        board.
+        Random relative poses of board and camera are drawn and solved by inverse kinematics, since only about one in a
+        thousand random postures has the board in view.
 
         Args:
             count: number of postures.
-            feasible: function q (m, n) -> (m,) whether each posture is feasible.
+            feasible: function q (m, n) -> (m,) that returns whether each posture is feasible.
             lower, upper: (n,) joint limits [rad or m].
             seed: seed or generator of random numbers.
         """
@@ -196,7 +209,12 @@ class CameraView:
         return result[:count]
 
     def _views(self, count: int, stream: np.random.Generator) -> np.ndarray:
-        """Return random poses (count, 4, 4) of the board in front of the camera."""
+        """Return random poses (count, 4, 4) of the board in the camera frame, at allowed distance and tilt.
+
+        Args:
+            count: number of poses.
+            stream: generator of the random numbers.
+        """
         azimuth = stream.uniform(-np.pi, np.pi, count)
         tilt = self.tilt * np.sqrt(stream.uniform(0.0, 1.0, count))
         axis = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(count)])
@@ -210,13 +228,14 @@ class CameraView:
 
 @dataclass(frozen=True, eq=False)
 class ImageObservation(Observation):
-    """Whitened observation Jacobian of images for the p identifiable parameters: q (m, n) -> (m, rows, p).
+    """Whitened observation Jacobian of images, as a function of joint values.
 
-    An image's corners are condensed to the information on the board's pose and the lens; the noise of corners and of
-    the arm's repeatability is our choice (`CORNER`, `DISPLACEMENT`, `TURN`).
+    It maps q (m, n) to the derivatives (m, rows, p) of the measured quantities, divided by their noise, by p
+    identifiable parameters. The corners of one image are condensed to their information on the board's pose and the
+    lens. The assumed noise of corners and of the arm's repeatability is our choice (`CORNER`, `DISPLACEMENT`, `TURN`).
 
     Attributes:
-        view: camera and board.
+        view: placements of camera and board.
     """
 
     _: KW_ONLY
@@ -224,7 +243,13 @@ class ImageObservation(Observation):
     product = None  # type: ignore[assignment]
 
     def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the position (m, 3) [m] of the carried camera or board, and its Jacobian (m, 3, p), not whitened."""
+        """Return the position (m, 3) [m] of the carried camera or board, and its Jacobian (m, 3, p).
+
+        The Jacobian is not divided by the measurement noise.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+        """
         target = see(self.cell, q, -1)
         columns = target_jacobian(self.cell, target, self.free, -1, np.zeros(len(q), dtype=int))
         return target.point.T, columns[:, :3].transpose(2, 1, 0)
@@ -237,19 +262,19 @@ class ImageObservation(Observation):
 
 
 def camera_view(table: CameraTable, chain: Chain, where: str, folder: Path) -> CameraView:
-    """Return the camera view described by a constraints file.
+    """Return the camera view that the table ``[camera]`` of a constraints file describes.
 
     Args:
-        table: table [camera] of the file.
+        table: table ``[camera]`` of the file.
         chain: the nominal arm.
-        where: name of the file for messages.
-        folder: folder that contains the lens's and the board's files.
+        where: name of the constraints file for messages.
+        folder: folder that contains the lens file and the board file.
 
     Raises:
-        UsageError, MeasurementError, RobotError: for a missing file, or an impossible placement.
+        UsageError, MeasurementError, RobotError: for a missing file or an invalid placement.
     """
     for name in (table.lens, table.board):
-        require((folder / name).is_file(), f"{where}: camera: no file '{name}' next to it", UsageError)
+        require((folder / name).is_file(), f"{where}: camera: no file '{name}' next to it: copy it there", UsageError)
     if not table.range[0] < table.range[1]:
         raise UsageError(f"{where}: camera.range: {table.range[0]:g} is not below {table.range[1]:g}")
     lens = read_lens(folder / table.lens)

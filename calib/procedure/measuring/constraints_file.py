@@ -99,7 +99,11 @@ _SPAN_OR_MARGIN = {"anyOf": [_PAIR, {"type": ["number", "string"]}]}
 
 
 def _directions(value: object) -> object:
-    """Return directions as a list; a single direction or an axis name becomes a list of one."""
+    """Return a list of directions; a single direction or an axis name becomes a list of one direction.
+
+    Args:
+        value: a direction (3 numbers), the name of an axis such as ``-x``, or a list of these.
+    """
     if isinstance(value, str):
         value = AXES.get(value, value)
     if isinstance(value, list | tuple) and len(value) > 0 and not isinstance(value[0], list | tuple):
@@ -110,7 +114,7 @@ def _directions(value: object) -> object:
 @strict
 @dataclass(frozen=True)
 class TargetTable:
-    """Table ``[target]`` of the constraints file, see the module."""
+    """Table ``[target]`` of the constraints file; the module's docstring explains the keys."""
 
     height: Annotated[float | tuple[float, ...], OneOrMany(Real(quantity="length"))] | None = None
     axis_distance: Distance | None = None
@@ -122,13 +126,13 @@ class TargetTable:
 
     def __post_init__(self) -> None:
         if not self.facing or not all(map(np.any, self.facing)):
-            raise ValueError("facing: [0, 0, 0] is not a direction")
+            raise ValueError("facing: [0, 0, 0] is not a direction; state one such as [0, 0, 1]")
         if isinstance(self.height, tuple):
             rising(self.height, "height")
 
     @property
     def heights(self) -> tuple[float | None, float | None]:
-        """The least and the largest height of the target [m]."""
+        """Smallest and largest allowed height of the target [m]; None: not limited."""
         if isinstance(self.height, tuple):
             return self.height[0], self.height[1]
         return self.height, None
@@ -137,7 +141,7 @@ class TargetTable:
 @strict
 @dataclass(frozen=True)
 class PlacedTable:
-    """A table with a placement: xyz [m] and rpy [rad], or a matrix."""
+    """A table that states a placement: position xyz [m] and angles rpy [rad], or a matrix."""
 
     xyz: Point | None = None
     rpy: Turns | None = None
@@ -145,7 +149,7 @@ class PlacedTable:
 
     @property
     def stated(self) -> dict[str, object]:
-        """The placement keys of the table that have a value."""
+        """The placement keys (xyz, rpy, matrix) to which the file gives a value, with these values."""
         placement = {"xyz": self.xyz, "rpy": self.rpy, "matrix": self.matrix}
         return {key: value for key, value in placement.items() if value is not None}
 
@@ -153,7 +157,7 @@ class PlacedTable:
 @strict
 @dataclass(frozen=True)
 class InstrumentTable(PlacedTable):
-    """Table ``[instrument]`` of the constraints file, see the module."""
+    """Table ``[instrument]`` of the constraints file; the module's docstring explains the keys."""
 
     roll: Span | None = None
     pitch: Span | None = None
@@ -169,7 +173,7 @@ class InstrumentTable(PlacedTable):
 @strict
 @dataclass(frozen=True)
 class CollisionTable:
-    """Table ``[collision]`` of the constraints file, see the module."""
+    """Table ``[collision]`` of the constraints file; the module's docstring explains the keys."""
 
     margin: Distance = MARGIN
     radius: Annotated[float, Real(above=0, quantity="length")] | None = None
@@ -182,7 +186,7 @@ class CollisionTable:
 @strict
 @dataclass(frozen=True, kw_only=True)
 class ObstacleTable(PlacedTable):
-    """Entry ``[[obstacle]]`` of the constraints file, see the module."""
+    """Entry ``[[obstacle]]`` of the constraints file; the module's docstring explains the keys."""
 
     kind: Annotated[str, OneOf(("box", "sphere", "cylinder"))]
     size: Size
@@ -190,7 +194,11 @@ class ObstacleTable(PlacedTable):
 
 
 def _span_or_margin(value: object) -> object:
-    """Return the value after a check that it is a range (two numbers or texts with units) or a single margin."""
+    """Return the value unchanged if it is a range (two numbers or texts with units) or a single number.
+
+    Raises:
+        ValueError: for any other value.
+    """
     parts: tuple[object, ...] = (value,)
     pair = False
     if isinstance(value, list | tuple) and len(value) == 2:
@@ -214,7 +222,10 @@ Place = Annotated[Any, Checked(_place_or_unknown, {"anyOf": [{"type": "object"},
 @strict
 @dataclass(frozen=True, kw_only=True)
 class CameraTable:
-    """Table ``[camera]``, see the module; if keys are ``unknown``, the camera's view of the board is not checked."""
+    """Table ``[camera]`` of the constraints file; the module's docstring explains the keys.
+
+    If the value of a key is ``unknown``, the camera's view of the board is not checked.
+    """
 
     mounting: Annotated[str, OneOf((IN_HAND, TO_HAND, UNKNOWN))]
     lens: Name
@@ -227,7 +238,7 @@ class CameraTable:
 
     @property
     def unknown(self) -> tuple[str, ...]:
-        """Keys needed to check the camera's view whose value is ``unknown``."""
+        """Keys whose value is ``unknown``, of those needed to check the camera's view."""
         names = ("mounting", "lens", "board", "carried", "stands")
         return tuple(name for name in names if getattr(self, name) == UNKNOWN)
 
@@ -235,7 +246,7 @@ class CameraTable:
 @strict
 @dataclass(frozen=True)
 class ConstraintsFile:
-    """The content of a constraints file."""
+    """The tables and keys of a constraints file."""
 
     joints: Mapping[str, Annotated[Any, Checked(_span_or_margin, _SPAN_OR_MARGIN)]] = field(default_factory=dict)
     target: TargetTable = field(default_factory=TargetTable)
@@ -247,7 +258,10 @@ class ConstraintsFile:
 
 
 def beside(path: Path) -> dict[str, Path]:
-    """Return the camera lens and board files that a constraints file names, by name."""
+    """Return the lens file and the board file that a constraints file names: file name -> path.
+
+    The paths are in the folder of the constraints file; empty without a table ``[camera]``.
+    """
     camera = read(ConstraintsFile, path, "", MOTION)[0].camera
     if camera is None:
         return {}
@@ -255,6 +269,11 @@ def beside(path: Path) -> dict[str, Path]:
 
 
 def rising(span: tuple[float, ...], where: str) -> None:
-    """Raise a ValueError unless a span has two numbers, the lower one first."""
+    """Raise a ValueError unless a range consists of two numbers with the lower one first.
+
+    Args:
+        span: the range.
+        where: name of the key for the message.
+    """
     require(len(span) == 2, f"{where}: expected a list of 2 numbers, lower and upper, found {len(span)}", ValueError)
     require(span[0] < span[1], f"{where}: {span[0]:g} is not below {span[1]:g}", ValueError)

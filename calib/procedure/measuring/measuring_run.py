@@ -1,16 +1,17 @@
 """A measuring run: poses in the fastest order, collision-free paths between them, and the duration.
 
-Moves are straight in joint space, like a controller's joint moves. They are checked against the arm, the floor and
-obstacles at samples so dense that no point of the arm moves further than the clearance between two samples. If a
-straight move collides, via-points lead around; the arm is assumed to stop at each of them.
+Moves are straight in joint space, like a controller's joint moves. Each move is sampled so densely that no point of the
+arm moves further than the clearance between two samples; each sample is checked for collisions with the arm itself, the
+floor and obstacles. If a straight move collides, a path through via-points replaces it; the arm is assumed to stop at
+each via-point.
 
-The file of a run has a row per stop, in time order::
+The file of a run has one row per stop, in time order::
 
-    t [s], pose, joint1 [deg], …     pose: number of the pose in its list, counted from 1; 0 for a via-point
+    t [s], pose, joint1 [deg], …  pose: number of the pose in its list, counted from 1; 0 for a via-point
 
-If no collision-free path leads to a pose, a reachable candidate replaces it. The same pose with a joint turned by 360°
-is tried first; then the candidate that keeps most of the criterion among those reached by a straight move, or, if there
-are none, among the best few reached by via-points.
+If no collision-free path leads to a pose, a reachable candidate replaces it. First, the same pose with joints turned by
+360° is tried. Then the candidates are tried in the order of their observability index, best first: a larger number by
+straight moves, and if none is reached, the best few by moves with via-points.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from calib import files
 from calib.data.poses.pose_lists import joint_columns
 from calib.poses.by_index import merits
 from calib.poses.indices import Index, observability
-from calib.poses.information import log_det
+from calib.poses.scaled_jacobians import log_det
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
 from calib.robot.chain import Chain
 from calib.trajectories.tour import move_times, tour
@@ -75,45 +76,45 @@ SAME_POSE = 1e-9
 
 
 class MoveLimits(Protocol):
-    """Limits that moves must respect, see `calib.procedure.measuring.pose_limits.Limits`."""
+    """Limits that moves must respect; `calib.procedure.measuring.pose_limits.Limits` implements this protocol."""
 
     @property
     def lower(self) -> np.ndarray:
-        """Joint limits (n,) [rad or m]."""
+        """Lower joint limits (n,) [rad or m]."""
         ...
 
     @property
     def upper(self) -> np.ndarray:
-        """Joint limits (n,) [rad or m]."""
+        """Upper joint limits (n,) [rad or m]."""
         ...
 
     @property
     def collision(self) -> DistanceModel | None:
-        """Collision model; None if collisions are not checked."""
+        """Collision model; None: collisions are not checked."""
         ...
 
     @property
     def clearance(self) -> float:
-        """Least distance that the collision model has to keep [m]."""
+        """Smallest allowed distance between links, and from obstacles [m]."""
         ...
 
 
 def _silent(stage: str) -> None:
-    """Show no progress."""
+    """Ignore a progress text, `stage`."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuringRun:
-    """A run through m poses: order, paths between poses, and times.
+    """A run through m poses: order, paths between poses, and durations.
 
     Attributes:
         order: (m,) indices of the poses in the order in which they are visited.
-        ways: m - 1 paths (k, n) from each pose to the next, both included [rad or m].
+        ways: m - 1 paths (k, n) from each pose to the next, with start and end pose included [rad or m].
         times: (m - 1,) duration of each path [s].
         dwell: time at each pose [s].
-        found: duration of the run in the input order of the poses, by straight moves, collision-free or not [s].
+        found: duration of a run in the input order of the poses with straight moves, collisions ignored [s].
         around: number of paths with via-points.
-        blocked: indices of the paths for which no collision-free one was found; they are straight.
+        blocked: indices of the paths that are straight because no collision-free path was found.
     """
 
     order: np.ndarray
@@ -126,7 +127,10 @@ class MeasuringRun:
 
     @property
     def found_ways(self) -> Ways:
-        """The collision-free paths, keyed by the input numbers of start and end pose."""
+        """The collision-free paths: indices of two poses, the smaller one first -> path between these poses.
+
+        The path leads from the pose with the smaller index to the other pose.
+        """
         clear_ways = {}
         for k, (start, end) in enumerate(pairwise(self.order)):
             if k in self.blocked:
@@ -137,7 +141,7 @@ class MeasuringRun:
 
     @property
     def cut_off(self) -> tuple[int, ...]:
-        """Indices of the poses (in input order) without a collision-free path from the largest connected group."""
+        """Input indices of the poses that no collision-free path connects to the largest group of connected poses."""
         groups = np.split(self.order, np.array(self.blocked, dtype=int) + 1)
         largest = max(groups, key=len)
         separate: list[int] = []
@@ -148,7 +152,7 @@ class MeasuringRun:
 
     @property
     def seconds(self) -> float:
-        """Duration of the run [s]."""
+        """Duration of the run: paths and dwell times [s]."""
         return float(self.times.sum()) + self.dwell * len(self.order)
 
 
@@ -161,19 +165,19 @@ def plan_run(
     progress: Progress | None = None,
     clear: Ways | None = None,
 ) -> MeasuringRun:
-    """Return the run through poses q (m, n) [rad or m]: their order, and the paths between them.
+    """Return the run through poses q (m, n) [rad or m]: the order of the poses and the paths between them.
 
-    If no collision-free path was found between consecutive poses, a path through other poses replaces it.
+    If no collision-free path is found between consecutive poses, the path leads through other poses of the list.
 
     Args:
-        chain: the arm, for its speeds.
+        chain: the arm, whose joint speeds determine the durations.
         q: the poses.
-        limits: lower, upper, collision and clearance (`calib.procedure.measuring.pose_limits.Limits`).
+        limits: joint limits, collision model and clearance (`calib.procedure.measuring.pose_limits.Limits`).
         settings: speed and dwell time.
         seed: seed of the search for via-points.
         progress: called with a text on the progress; None: silent.
-        clear: collision-free paths from an earlier run, see `MeasuringRun.found_ways`; paths between other postures are
-            ignored; None: none.
+        clear: collision-free paths of an earlier run (`MeasuringRun.found_ways`); a path whose ends differ from the
+            poses with these indices is ignored; None: no known paths.
     """
     show = progress or _silent
     velocity, acceleration = _speeds(chain, settings.speed)
@@ -235,11 +239,17 @@ def plan_run(
 
 
 def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the poses (m, n) with each revolute joint within one turn, cut in the largest gap between its angles.
+    """Return the poses (m, n) with each revolute joint's angles moved by whole turns into one interval of 360°.
 
-    A joint with a range above one turn reaches every angle at two values. The cut is the middle of the largest gap
-    between the poses' angles (if above 30 degrees, else half a turn from the middle of the range), so that moves are
-    short.
+    Joints with a range of up to 360° are not changed. Other joints reach some angles at several joint values. To keep
+    moves short, the interval begins in the middle of the largest gap between the poses' angles if this gap exceeds 30°;
+    otherwise half a turn below the middle of the joint's range. An angle that would leave the joint limits remains
+    unchanged.
+
+    Args:
+        chain: the arm.
+        q: the poses [rad or m].
+        lower, upper: (n,) joint limits [rad or m].
     """
     full = 2 * np.pi
     result = q.copy()
@@ -261,7 +271,14 @@ def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray)
 
 
 def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
-    """Return the fastest order, in which moves may pass through other poses, and the paths between the poses."""
+    """Return the fastest order of the poses and the paths between consecutive poses.
+
+    A path may lead through other poses.
+
+    Args:
+        clear: collision-free paths: indices of two poses -> path between them.
+        cost: (m, m) durations of the moves between the poses [s].
+    """
     from scipy.sparse.csgraph import shortest_path  # slow to load
 
     direct = np.full(cost.shape, np.inf)
@@ -289,7 +306,13 @@ def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
 
 
 def turns(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return the postures (k, n) within limits that differ from q (n,) by whole turns of revolute joints."""
+    """Return all postures (k, n) within joint limits that differ from q (n,) by whole turns of revolute joints.
+
+    Args:
+        chain: the arm.
+        q: the posture [rad or m].
+        lower, upper: (n,) joint limits [rad or m].
+    """
     values = []
     for j, joint in enumerate(chain.joints):
         positions = q[j : j + 1]
@@ -309,10 +332,20 @@ def way_to(
     straight: bool,
     seed: int = 0,
 ) -> tuple[int, np.ndarray] | None:
-    """Return a collision-free path (k, n) from one of m starts to one of p postures, and the start's index; or None.
+    """Return the index of a start posture and a collision-free path (k, n) from it to one of the goal postures.
 
-    For each of the `MAX_NEIGHBOURS` nearest postures, the moves of shortest duration are tried: straight moves from the
-    `MAX_NEIGHBOURS` nearest starts, or (without `straight`) moves with via-points from the nearest start.
+    The goals nearest to a start are tried in the order of move duration, at most `MAX_NEIGHBOURS` of them. For each
+    goal, straight moves from the `MAX_NEIGHBOURS` nearest starts are tried or, without `straight`, moves with
+    via-points from the nearest start. None: no collision-free path was found.
+
+    Args:
+        chain: the arm.
+        limits: joint limits, collision model and clearance.
+        settings: speed of the moves.
+        postures: (p, n) goal postures [rad or m].
+        starts: (m, n) start postures [rad or m].
+        straight: whether only straight moves are tried.
+        seed: seed of the search for via-points.
     """
     velocity, acceleration = _speeds(chain, settings.speed)
     room = _room(chain, limits, velocity)
@@ -331,8 +364,13 @@ def _pair(start: int, end: int) -> tuple[int, int]:
 
 
 def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
-    """Return (m, m) flags: whether straight moves are clear at `PLACES` samples (an estimate, used to order the
-    poses).
+    """Return (m, m) flags: whether the straight move between two poses is collision-free at `PLACES` samples.
+
+    The flags are an estimate that is used only to order the poses.
+
+    Args:
+        room: joint limits and the test for collision.
+        q: (m, n) poses [rad or m].
     """
     start, end = np.triu_indices(len(q), 1)
     share = ((np.arange(PLACES) + 0.5) / PLACES)[:, None, None]
@@ -344,7 +382,12 @@ def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
 
 
 def lines(run: MeasuringRun, settings: RunSettings) -> list[str]:
-    """Return the lines on a run: duration, paths around obstacles, and poses without a clear path."""
+    """Return lines of text on a run: duration, paths with via-points, and moves without a collision-free path.
+
+    Args:
+        run: the run.
+        settings: its speed and dwell time.
+    """
     minutes, before = run.seconds / 60, run.found / 60
     result = [
         f"run: {len(run.order)} poses in {minutes:.1f} min at {settings.speed:.0%} of the joints' speed, "
@@ -359,7 +402,18 @@ def lines(run: MeasuringRun, settings: RunSettings) -> list[str]:
 
 
 def write_run(path: Path, run: MeasuringRun, chain: Chain) -> Path:
-    """Write the file of a run (format: see the module), its poses numbered in visiting order."""
+    """Write a run as a CSV file with poses numbered in the order of the visits.
+
+    The module's docstring states the columns.
+
+    Args:
+        path: path of the file.
+        run: the run.
+        chain: the arm, which names the joints.
+
+    Returns:
+        Path of the file.
+    """
     header, factors = joint_columns(chain.joint_names, [joint.kind for joint in chain.joints])
     velocity, acceleration = _speeds(chain, 1.0)
     rows = []
@@ -396,7 +450,16 @@ def _speeds(chain: Chain, share: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _room(chain: Chain, limits: MoveLimits, velocity: np.ndarray) -> Room:
-    """Return the collision test of paths: it requires half the clearance at samples at most one clearance apart."""
+    """Return the collision test of paths.
+
+    A path is free if the distance between parts is at least half the clearance at samples that are at most one
+    clearance apart. Without a collision model, every posture is free.
+
+    Args:
+        chain: the arm.
+        limits: joint limits, collision model and clearance.
+        velocity: (n,) joint speeds of the run [rad/s or m/s], by which distances in joint space are measured.
+    """
     model, clearance = limits.collision, limits.clearance
     reach = np.array([chain.stretched_length() if joint.kind == "revolute" else 1.0 for joint in chain.joints])
 
@@ -414,10 +477,11 @@ class Exchange:
     """Candidate poses that may replace unreachable ones, and the observability index that ranks the candidates.
 
     Attributes:
-        jacobian: q (m, n) -> whitened observation Jacobians (m, rows, p).
+        jacobian: function q (m, n) -> whitened observation Jacobians (m, rows, p): derivatives of the measured
+            quantities by p parameters, divided by the noise.
         candidates: (N, n) feasible poses [rad or m].
-        before: (k, rows, p) Jacobians of poses measured before; None without them.
-        index: observability index that ranks the candidates.
+        before: (k, rows, p) Jacobians of poses measured earlier; None: no earlier poses.
+        index: name of the observability index that ranks the candidates.
     """
 
     jacobian: Callable[[np.ndarray], np.ndarray]
@@ -426,14 +490,18 @@ class Exchange:
     index: Index
 
     def value(self, q: np.ndarray) -> tuple[float, float]:
-        """Return the index, and log det(WᵀW) / p, of poses (m, n) together with the poses measured before."""
+        """Return the observability index and log det(WᵀW) / p of poses q (m, n) and the poses measured earlier.
+
+        W is the observation matrix that stacks the Jacobians of all these poses, p the number of parameters.
+        """
         rows = self._rows(q)
         flat = rows.reshape(-1, rows.shape[2])
         return observability(rows, self.index), float(log_det(flat.T @ flat)) / rows.shape[2]
 
     def ranked(self, q: np.ndarray) -> np.ndarray:
-        """Return the indices (N,) of the candidates, sorted by the index of each together with poses (m, n), best
-        first.
+        """Return the indices (N,) of the candidates, best first.
+
+        A candidate is ranked by the observability index of the poses q (m, n) together with this candidate.
         """
         rows = self._rows(q)
         flat = rows.reshape(-1, rows.shape[2])
@@ -446,7 +514,7 @@ class Exchange:
 
     @cached_property
     def _information(self) -> np.ndarray:
-        """Information matrices (N, p, p) of the candidates."""
+        """Information matrices WᵀW (N, p, p) of the candidates, with W the observation Jacobian of one candidate."""
         jacobians = self.jacobian(self.candidates)
         return jacobians.transpose(0, 2, 1) @ jacobians
 
@@ -462,11 +530,11 @@ class Drivable:
     """Reachable poses, and the run through them.
 
     Attributes:
-        q: (m, n) poses in input order, each revolute joint on the turn that the run uses [rad or m].
+        q: (m, n) poses in input order [rad or m], with revolute joints at the whole turns that the run uses.
         run: run through the poses.
         replaced: index of a pose that no collision-free path reached -> index of the candidate that replaces it.
         value: observability index before and after the replacements.
-        gain: change of log det(WᵀW) / p by the replacements.
+        gain: change, by the replacements, of log det(WᵀW) / p, with W the observation matrix of the poses.
     """
 
     q: np.ndarray
@@ -477,7 +545,10 @@ class Drivable:
 
     @property
     def words(self) -> str:
-        """Sentence on the replaced poses, numbered from 1 in the order of the run; empty without replacements."""
+        """Sentence for the user on the replaced poses, numbered from 1 in the order of the run.
+
+        Empty without replacements.
+        """
         if not self.replaced:
             return ""
         numbers = [f"{k}" for k, index in enumerate(self.run.order, 1) if index in self.replaced]
@@ -500,12 +571,12 @@ def drivable(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Drivable:
-    """Return the run through poses q (m, n), in which poses without a collision-free path are replaced by candidates.
+    """Return a run through poses q (m, n) in which candidates replace the poses without a collision-free path.
 
     Args:
-        chain, limits, settings, seed, progress: see `calib.procedure.measuring.measuring_run.plan_run`.
+        chain, limits, settings, seed, progress: as for `plan_run`.
         q: the poses [rad or m].
-        exchange: candidates for replacements.
+        exchange: candidate poses that may replace unreachable ones.
     """
     show = progress or _silent
     replaced: dict[int, int] = {}
@@ -534,7 +605,17 @@ def _rejoined(
     settings: RunSettings,
     seed: int,
 ) -> tuple[np.ndarray, dict[int, int], Ways]:
-    """Return the poses (m, n) with unreachable ones replaced, replacements (pose -> candidate index), and all paths."""
+    """Return poses with unreachable ones replaced, the replacements, and all collision-free paths.
+
+    Args:
+        chain, limits, settings, seed: as for `plan_run`.
+        q: (m, n) the poses [rad or m].
+        run: run through the poses, which leaves out unreachable ones.
+        exchange: candidate poses that may replace unreachable ones.
+
+    Returns:
+        Poses (m, n) in input order, pose index -> index of the replacing candidate, and paths by pair of pose indices.
+    """
     q = q.copy()
     replacements: dict[int, int] = {}
     clear_ways = run.found_ways

@@ -40,10 +40,16 @@ TABLES = {"velocity": "velocity", "acceleration": "acceleration", "jerk": "jerk"
 
 
 def moveit_files(path: Path) -> list[Path]:
-    """Return the SRDF and ``joint_limits.yaml`` that a path names, by itself or as a folder; none for other files.
+    """Return the ``joint_limits.yaml`` and the SRDF file at a path.
+
+    Args:
+        path: one of these files, or a folder that contains them.
+
+    Returns:
+        The files; an empty list if the path is a file of another type.
 
     Raises:
-        UsageError: for a folder without them, or with several SRDF.
+        UsageError: for a folder without such files, or with several SRDF files.
     """
     if not path.is_dir():
         if path.suffix in (".yaml", ".yml", SRDF):
@@ -58,16 +64,19 @@ def moveit_files(path: Path) -> list[Path]:
     if len(srdf) > 1:
         raise UsageError(f"{path} has {len(srdf)} SRDF files: give one of them, as {srdf[0]}")
     if not limits and not srdf:
-        raise UsageError(f"{path}: neither {JOINT_LIMITS} nor *{SRDF} in this folder or its config")
+        raise UsageError(
+            f"{path}: neither {JOINT_LIMITS} nor *{SRDF} in this folder or its config folder: give the MoveIt package"
+        )
     return [*limits[:1], *srdf]
 
 
 def limit_tables(path: Path, chain: Chain, source: Path | None) -> ParsedTable | None:
-    """Return the tables of a limits file from MoveIt's files; None if the path is not a MoveIt file or folder.
+    """Return MoveIt's limits in the form of a limits file; None if the path is not a MoveIt file or folder.
 
     Args:
-        path: a file, or a folder with both files.
-        chain, source: the arm, and its file.
+        path: a MoveIt file, or a folder with both files.
+        chain: the arm.
+        source: file of the arm; None: joints and links outside the arm are not known.
 
     Raises:
         UsageError: for files that cannot be read, or that belong to another robot.
@@ -82,7 +91,13 @@ def limit_tables(path: Path, chain: Chain, source: Path | None) -> ParsedTable |
 
 
 def _limits(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
-    """Return the tables [joints], [velocity] … of a ``joint_limits.yaml``."""
+    """Return the limits of a ``joint_limits.yaml`` as tables ``[joints]``, ``[velocity]`` … of a limits file.
+
+    Args:
+        path: the ``joint_limits.yaml``.
+        chain: the arm.
+        source: file of the arm; None: joints outside the arm are not known.
+    """
     content = _yaml(path)
     entries = None
     if isinstance(content, dict):
@@ -113,12 +128,25 @@ def _limits(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
         if upper is None:
             upper = joint.upper
         tables.setdefault("joints", {})[joint.name] = [lower, upper]
-    require(tables, f"{path}: limits no joint of the arm ({', '.join(chain.joint_names)})", UsageError)
+    require(
+        tables,
+        f"{path}: limits no joint of the arm ({', '.join(chain.joint_names)}): is it for another robot?",
+        UsageError,
+    )
     return tables
 
 
 def _limit(limits: Mapping[str, object], quantity: str, end: str, where: str) -> float | None:
-    """Return a joint's limit; None if it is not stated, or switched off by ``has_..._limits: false``."""
+    """Return a joint's limit in MoveIt's unit; None if the file does not state it or disables it.
+
+    A limit is disabled by ``has_..._limits: false``.
+
+    Args:
+        limits: the joint's entry in ``joint_limits.yaml``.
+        quantity: ``position``, ``velocity``, ``acceleration``, ``jerk`` or ``effort``.
+        end: ``min`` or ``max``.
+        where: name of the entry for messages.
+    """
     key = f"{end}_{quantity}"
     if not limits.get(f"has_{quantity}_limits", True) or key not in limits:
         return None
@@ -131,7 +159,7 @@ def _yaml(path: Path) -> object:
     from ruamel.yaml.error import YAMLError
 
     class Angles(SafeConstructor):
-        """YAML reader for numbers and texts, and for angles with ``!degrees`` or ``!radians``."""
+        """YAML reader that converts values with the tags ``!degrees`` and ``!radians`` to radians."""
 
     def angle(factor: float) -> Callable[[object, ScalarNode], float]:
         return lambda loader, node: factor * number(node.value.strip(), f"{path}: {node.tag}")
@@ -145,7 +173,15 @@ def _yaml(path: Path) -> object:
 
 
 def _pairs(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
-    """Return the table [collision] of an SRDF: its disabled pairs of links that the robot has."""
+    """Return the table ``[collision]`` for an SRDF: the pairs of links whose collisions are not checked.
+
+    Pairs with links that do not exist are omitted.
+
+    Args:
+        path: the SRDF.
+        chain: the arm.
+        source: file of the arm; None: links outside the arm are not known.
+    """
     with refused_as(UsageError, (OSError, UnicodeDecodeError), f"{path}: cannot be read: {{}}"):
         root = parse(path.read_text(encoding="utf-8"), str(path))
     attributes = [node.attributes for node in root.all("disable_collisions")]
@@ -154,7 +190,7 @@ def _pairs(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
     ignored = [list(pair) for pair in pairs if {*pair} <= links]
     if pairs and not ignored:
         raise UsageError(
-            f"{path}: none of its {len(pairs)} disabled pairs is of links of {chain.name}, as {shown(pairs[:1])}: "
-            "is it another robot's?"
+            f"{path}: none of its {len(pairs)} disabled pairs has links of {chain.name}, e.g. {shown(pairs[:1])}: "
+            "is it for another robot?"
         )
     return {"ignored": ignored}

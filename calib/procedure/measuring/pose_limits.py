@@ -1,8 +1,8 @@
 """Limits on the arm's poses during measurement, from the constraints file, the cell and the defaults.
 
-By default, poses keep a margin to the joint limits, a distance between the arm's own links, and a distance from the
-floor that the arm stands on. `Limits.checked` lists the limits that were checked, `Limits.unchecked` those that could
-not be checked because they were not stated.
+By default, poses keep a margin to the joint limits, a distance between the arm's links, and a distance from the floor
+on which the arm stands. `Limits.checked` lists the checked limits. `Limits.unchecked` lists the limits that were not
+checked because the user did not state them.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from calib.config_types import number
 from calib.errors import RobotError, UsageError, listing, one_of, refused_as, require
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, TargetJacobian, TargetPose
-from calib.poses import constraints
+from calib.poses import pose_constraints
 from calib.poses.space import PoseConstraint, SearchSpace
 from calib.procedure.measuring import constraints_file
 from calib.procedure.measuring.camera_view import camera_view
@@ -55,18 +55,18 @@ SIGHT_NAMES = {"line of sight": "cone of acceptance"}
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Limits of poses: joint limits (n,), constraints of the target, collisions and lines of sight.
+    """Limits of poses: joint limits, constraints on the target, collisions and lines of sight.
 
     Attributes:
         lower, upper: (n,) joint limits [rad or m].
-        constraints: constraints on the target.
-        notes: other remarks for the user.
+        constraints: constraints on the target's position and orientation.
+        notes: remarks for the user.
         collision: a `calib.robot.collision.Collision` or `calib.robot.capsules.Capsules`; None: not checked.
-        clearance: least distance between links, and from obstacles [m].
-        sight: lines of sight from an instrument; None without conditions on them.
+        clearance: smallest allowed distance between links, and from obstacles [m].
+        sight: lines of sight from an instrument to the targets; None: no conditions on them.
         checked: names of the checked limits.
-        unchecked: names of the limits that are not checked because they were not stated.
-        camera: view of a camera (`calib.procedure.measuring.camera_view.CameraView`) that measures; None without one.
+        unchecked: names of the limits that are not checked because the user did not state them.
+        camera: view of the measuring camera (`calib.procedure.measuring.camera_view.CameraView`); None: no camera.
         views: constraints under which the camera sees the board.
     """
 
@@ -83,11 +83,12 @@ class Limits:
     views: tuple[PoseConstraint, ...] = ()
 
     def space(self, observation: Observation, sight: bool = True) -> SearchSpace:
-        """Return the search space of pose selection: the observation Jacobian, joint limits and constraints.
+        """Return the search space of pose selection: observation Jacobian, joint limits and constraints.
 
         Args:
             observation: observation Jacobian with the rows of all targets.
-            sight: whether line-of-sight and view constraints apply; False to compute the accuracy lost by them.
+            sight: whether line-of-sight and view constraints apply; without them, the accuracy that they cost can be
+                computed.
         """
         # constraints that are quick to compute, and exclude most, come first
         constraints = [*self.constraints]
@@ -122,13 +123,15 @@ def read_limits(
     """Return the pose limits of an arm with its targets, read from a constraints file.
 
     Args:
-        tables: the file, or its tables, which may include tables of motions (`MOTION`); None: defaults only.
-        cell: the arm, see `calib.geometry.observability.targets_of`.
-        source: the robot's file; the collision shapes of a URDF are used.
-        without: names of `DEFAULTS` that do not apply, and of `CELL` objects that the cell does not have.
+        tables: path of the file, or its content as tables; tables for motions (`MOTION`) are ignored; None: only
+            defaults apply.
+        cell: the arm with its targets, as `calib.geometry.observability.targets_of` returns it.
+        source: the robot's file; if it is a URDF, its collision shapes are used; None: no file.
+        without: defaults that do not apply (self-collision, floor, joint-margin, view), and objects that the cell does
+            not have (instrument, box, obstacles).
 
     Raises:
-        UsageError: for an unknown key or a value that a key cannot have.
+        UsageError: for an unknown key or an invalid value.
     """
     names = (*constraints_file.DEFAULTS, *constraints_file.CELL)
     unknown = sorted(set(without) - {*names})
@@ -146,13 +149,15 @@ def read_limits(
 
 
 def tables_of(tables: Tables | None, chain: Chain, source: Path | None, name: str) -> tuple[Tables | None, str]:
-    """Return the limits as a file or tables (MoveIt's files are converted to tables), and their name for messages.
+    """Return the limits as a file or tables, and the name of their source for messages.
+
+    MoveIt's files are converted to tables.
 
     Args:
-        tables: a file, a folder, or tables; None: none.
+        tables: a file, a folder, or tables; None: no limits, returned as None.
         chain: the arm.
-        source: the arm's file.
-        name: name of tables in messages.
+        source: the arm's file; None: no file.
+        name: name in messages for tables that are not from MoveIt.
     """
     if isinstance(tables, str | Path):
         content = limit_tables(Path(tables), chain, source)
@@ -164,7 +169,18 @@ def tables_of(tables: Tables | None, chain: Chain, source: Path | None, name: st
 def _with_camera(
     limits: Limits, camera: CameraTable, cell: Installation, where: str, folder: Path, absent: set[str]
 ) -> Limits:
-    """Return the limits with the camera's view of the board added, if camera and board are known."""
+    """Return the limits with the camera's view of the board added.
+
+    If the placement or the files of camera or board are unknown, the view is instead listed as unchecked.
+
+    Args:
+        limits: the other limits.
+        camera: table ``[camera]`` of the constraints file.
+        cell: the arm with its targets.
+        where: name of the constraints file for messages.
+        folder: folder with the lens file and the board file.
+        absent: names of defaults and objects that do not apply, such as ``view``.
+    """
     unchecked = tuple(name for name in limits.unchecked if not name.startswith("line of sight"))
     if camera.unknown:
         name = f"{constraints_file.VIEW_UNCHECKED} (not known: {', '.join(camera.unknown)})"
@@ -192,10 +208,19 @@ def limits_of(
     without: Sequence[str] = (),
     measured: bool = True,
 ) -> Limits:
-    """Return the pose limits of an arm from the content of a constraints file; see `read_limits`.
+    """Return the pose limits of an arm from the parsed content of a constraints file.
 
     Args:
-        measured: whether the poses are measured; False for motions, without lines of sight.
+        settings: content of the constraints file.
+        cell: the arm with its targets.
+        source: the robot's file; if it is a URDF, its collision shapes are used; None: no file.
+        where: name of the constraints file for messages.
+        without: defaults that do not apply (self-collision, floor, joint-margin, view), and objects that the cell does
+            not have (instrument, box, obstacles).
+        measured: True for poses at which an instrument measures; False for motions, which need no line of sight.
+
+    Raises:
+        UsageError: for an invalid value.
     """
     absent = {*settings.without, *without}
     collision = settings.collision or CollisionTable()
@@ -230,7 +255,13 @@ def limits_of(
 
 
 def _unchecked(settings: ConstraintsFile, absent: set[str], measured: bool) -> tuple[str, ...]:
-    """Return the names of the limits that are not checked, for poses (if `measured`) or for motions."""
+    """Return the names of the limits that are not checked.
+
+    Args:
+        settings: content of the constraints file.
+        absent: defaults and objects that do not apply, such as ``floor`` or ``instrument``.
+        measured: True for poses at which an instrument measures; False for motions.
+    """
     instrument = settings.instrument or InstrumentTable()
     collision = settings.collision or CollisionTable()
     placed = bool(instrument.stated)
@@ -258,7 +289,15 @@ def _joint_margin(spans: Mapping[str, object], where: str) -> float:
 def _joints(
     spans: Mapping[str, object], cell: Installation, where: str, margin: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return lower and upper joint limits (n,), and notes on given ranges that have no effect."""
+    """Return lower and upper joint limits (n,) [rad or m], and notes for the user on ranges in the file without effect
+    or in the wrong unit.
+
+    Args:
+        spans: table ``[joints]``: joint name -> range.
+        cell: the arm.
+        where: name of the constraints file for messages.
+        margin: share of each joint's range that stays free at either end.
+    """
     chain = cell.chain
     lower, upper = (limit.copy() for limit in chain.sampling_limits())
     limited = np.isfinite(chain.lower) & np.isfinite(chain.upper)
@@ -307,11 +346,11 @@ def _target(settings: ConstraintsFile, cell: Installation) -> list[PoseConstrain
     result = []
     low, high = table.heights
     if low is not None:
-        result.append(constraints.height(target, low, np.inf if high is None else high, jacobian))
+        result.append(pose_constraints.height(target, low, np.inf if high is None else high, jacobian))
     if table.axis_distance is not None:
-        result.append(constraints.axis_distance(target, table.axis_distance, jacobian))
+        result.append(pose_constraints.axis_distance(target, table.axis_distance, jacobian))
     if table.reach is not None:
-        result.append(constraints.reach(target, table.reach, jacobian=jacobian))
+        result.append(pose_constraints.reach(target, table.reach, jacobian=jacobian))
     return result
 
 
@@ -322,13 +361,20 @@ def _orientation(settings: ConstraintsFile, cell: Installation, where: str) -> l
     stand = placement(table.stated, where)
     roll = _span(table.roll or (-np.pi, np.pi), f"{where}.roll", "angle")
     pitch = _span(table.pitch or (-np.pi / 2, np.pi / 2), f"{where}.pitch", "angle")
-    return [constraints.orientation(TargetPose(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
+    return [pose_constraints.orientation(TargetPose(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
 
 
 def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: DistanceModel | None) -> Sight | None:
-    """Return the lines of sight: cone and range if stated, and no link of the arm in between; None if not required.
+    """Return the lines of sight: acceptance cone and range if stated, and no link of the arm in between.
 
-    An instrument for which only roll and pitch are stated is a camera, whose view these limit.
+    None if the file states no instrument or no condition on its lines of sight. An instrument for which only roll and
+    pitch are stated is a camera; the two ranges limit the target's orientation in its image.
+
+    Args:
+        settings: content of the constraints file.
+        cell: the arm with its targets.
+        where: name of the constraints file for messages.
+        model: collision model of the arm's links; None: links in between are not checked.
     """
     table, facing = settings.instrument, settings.target.facing
     if table is None:
@@ -349,7 +395,15 @@ def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: Dis
 def _collision(
     settings: ConstraintsFile, cell: Installation, source: Path | None, where: str, absent: set[str]
 ) -> tuple[DistanceModel, tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Return the collision model, the names of its checks, notes, and the names of what it does not check."""
+    """Return the collision model, the names of the checked collisions, notes, and the names of unchecked collisions.
+
+    Args:
+        settings: content of the constraints file.
+        cell: the arm with its targets.
+        source: the robot's file, with collision shapes if it is a URDF; None: no file.
+        where: name of the constraints file for messages.
+        absent: names of defaults and objects that do not apply.
+    """
     table = settings.collision or CollisionTable()
     floor = table.floor
     if floor is None and "floor" not in absent:
@@ -392,10 +446,18 @@ def _collision(
 def _never_act(
     table: CollisionTable, obstacles: Sequence[Obstacle], walls: Sequence[Wall], cell: Installation, where: str
 ) -> tuple[set[str], tuple[str, ...]]:
-    """Return the names of walls and obstacles that the arm cannot reach, and a note on each.
+    """Return the names of walls and obstacles that the arm cannot reach, and one note on each.
+
+    Args:
+        table: table ``[collision]`` of the constraints file.
+        obstacles: the obstacles.
+        walls: floor and walls.
+        cell: the arm with its targets.
+        where: name of the constraints file for messages.
 
     Raises:
-        UsageError: for a wall or obstacle at `MAX_REACHES` times the reach, and for links thicker than the arm is long.
+        UsageError: for a wall or obstacle further away than `MAX_REACHES` times the arm's reach, and for a link radius
+            above the reach.
     """
     strokes = [max(-joint.lower, joint.upper) for joint in cell.chain.joints if joint.unit == "m"]
     reach = cell.reach + sum(strokes)
@@ -433,7 +495,17 @@ def _model(
     self_collision: bool,
     floor: float | None,
 ) -> tuple[DistanceModel, str, tuple[str, ...], tuple[str, ...]]:
-    """Return the collision model, the name of its link shapes, notes, and the links that it does not contain."""
+    """Return the collision model, a text on the link shapes, notes, and the links that the model does not contain.
+
+    Args:
+        cell: the arm with its targets.
+        source: the robot's file, with collision shapes if it is a URDF; None: no file.
+        table: table ``[collision]`` of the constraints file.
+        obstacles: the obstacles.
+        walls: floor and walls.
+        self_collision: whether collisions between links are checked.
+        floor: height of the floor in the arm's base frame [m]; None: no floor.
+    """
     from calib.robot import capsules, collision
     from calib.robot.beside import links_beside
 
@@ -488,10 +560,15 @@ def _model(
 
 
 def _posture(values: Mapping[str, object], chain: Chain, source: Path | None) -> dict[str, float]:
-    """Return the values [rad or m] of joints outside the arm.
+    """Return the joint values [rad or m] of joints outside the arm: joint name -> value.
+
+    Args:
+        values: joint name -> value in the constraints file; joints that it does not name are at zero.
+        chain: the arm.
+        source: the robot's file; None: no file.
 
     Raises:
-        RobotError: for a joint of the arm, or one that its URDF does not have.
+        RobotError: for a joint of the arm, or a joint that is not in the robot's URDF.
     """
     if not values:
         return {}
@@ -510,9 +587,14 @@ def _posture(values: Mapping[str, object], chain: Chain, source: Path | None) ->
 
 
 def _description(source: Path | None, chain: Chain) -> Path | None:
-    """Return the arm's URDF: its file, or the source of a fit's ``robot.toml``; None if it is not found.
+    """Return the path of the arm's URDF; None if it is not found.
 
-    The source is searched at the path that the fit stored, and next to a session's fit.
+    It is the source itself, or the URDF from which a fit's ``robot.toml`` was made. The URDF of a fit is searched at
+    the path stored in ``robot.toml`` and in the session's folder.
+
+    Args:
+        source: the robot's file; None: no file.
+        chain: the arm, whose links the URDF must contain.
     """
     if source is None or is_urdf(source):
         return source
@@ -530,7 +612,12 @@ def _description(source: Path | None, chain: Chain) -> Path | None:
 
 
 def _walls(box: tuple[tuple[object, object], ...] | None, where: str) -> list[Wall]:
-    """Return the two walls across each axis of a box; [] without a box."""
+    """Return the two walls perpendicular to each axis of a box; an empty list without a box.
+
+    Args:
+        box: ranges along x, y and z in the arm's base frame [m]; None: no box.
+        where: name of the box for messages.
+    """
     walls = []
     for axis, normal, span in zip("xyz", np.eye(3), box or ()):
         low, high = _span(span, f"{where}: {axis}", "length")

@@ -1,8 +1,9 @@
-"""Predicted accuracy of a set of poses before the robot moves: σ of parameters and of the tool's position.
+"""Accuracy predicted for a set of poses before the measurement: σ of parameters and of the tool's position.
 
-With W the whitened observation Jacobian of the poses, C = (WᵀW)⁻¹ is the covariance that the fit will state if the
-assumed noise is right and the model is the geometry that the poses were chosen for; a tool's position with the Jacobian
-J then has the variance tr(J C Jᵀ). Further effects in the fitted model, and errors that no parameter models, add to it.
+With W the whitened observation Jacobian of the poses, C = (WᵀW)⁻¹ is the covariance of the fitted parameters, provided
+that the assumed noise is right and the fitted parameters are those for which the poses were selected. A tool position
+with Jacobian J then has the variance tr(J C Jᵀ). Additional parameters in the fitted model and unmodelled errors
+increase the actual error.
 
 ``calib select --out poses.csv`` writes ``poses_prediction.json``; ``calib fit --selection poses.csv`` reads it.
 """
@@ -21,7 +22,7 @@ from calib.geometry.weighing import GeometricFit
 from calib.poses.design import Pool
 from calib.poses.errors import NotIdentifiable, TooFewCandidates
 from calib.poses.exchange import greedy
-from calib.poses.information import prepared
+from calib.poses.scaled_jacobians import prepared
 from calib.records import Array, read_json
 
 SUFFIX = "_prediction.json"
@@ -39,7 +40,7 @@ QUANTITIES = (("m", "lengths", "mm"), ("rad", "angles", "mrad"))
 
 @dataclass(frozen=True, eq=False)
 class SelectionPrediction:
-    """The prediction for a selection: robot, number of poses, and σ of the parameters.
+    """The prediction stored with a selection of poses: robot, number of poses, and σ of the parameters.
 
     Attributes:
         joints: (n,) names of the robot's joints.
@@ -54,22 +55,22 @@ class SelectionPrediction:
     sigmas: Array
 
     def check_robot(self, joints: Sequence[str]) -> None:
-        """Raise a UsageError if the selection belongs to a robot with other joints."""
+        """Raise a UsageError if the selection was made for a robot with other joint names."""
         if self.joints != tuple(joints):
             selection_joints = ", ".join(self.joints)
             raise UsageError(
                 f"the selection belongs to another robot: its joints are {selection_joints}; "
-                f"this robot has {', '.join(joints)}"
+                f"this robot has {', '.join(joints)}: choose poses for it"
             )
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction(SelectionPrediction):
-    """Predicted accuracy of a fit to m poses: σ of the parameters, and of the tool's position.
+    """Predicted accuracy of a fit: σ of the parameters, and σ of the tool's position at s typical poses.
 
     Attributes:
-        points: (s, 3) positions of the tool at typical poses [m].
-        spread: (s,) σ of the tool's position at these poses [m]; infinite if a parameter is not identifiable.
+        points: (s, 3) positions of the tool [m].
+        spread: (s,) σ of the tool's position [m]; infinite if a parameter is not identifiable.
     """
 
     points: np.ndarray
@@ -77,13 +78,14 @@ class Prediction(SelectionPrediction):
 
     @property
     def rms(self) -> float:
-        """σ of the tool's position, rms over typical poses [m]; infinite if a parameter is not identifiable."""
+        """rms over typical poses of the σ of the tool's position [m]; infinite if a parameter is not identifiable."""
         return float(np.sqrt(np.mean(self.spread**2)))
 
     @property
     def worst(self) -> float:
-        """σ of the tool's position, 95 % quantile over typical poses [m]; infinite if a parameter is not
-        identifiable.
+        """95 % quantile over typical poses of the σ of the tool's position [m].
+
+        Infinite if a parameter is not identifiable.
         """
         if not np.isfinite(self.spread).all():
             return float("inf")
@@ -93,13 +95,14 @@ class Prediction(SelectionPrediction):
 def predicted(
     observation: Observation, jacobians: np.ndarray, typical: np.ndarray, poses: int | None = None
 ) -> Prediction:
-    """Return the predicted accuracy of a fit from its Jacobians (m, rows, p), at typical poses (s, n).
+    """Return the predicted accuracy of a fit: σ of the parameters, and σ of the tool's position at typical poses.
 
     Args:
-        observation: observation Jacobian that the Jacobians were computed with.
-        jacobians: whitened Jacobians of all poses to be fitted, including those measured before.
-        typical: joint values at which the tool's accuracy is predicted [rad or m].
-        poses: number of poses that the prediction states; None: m.
+        observation: observation Jacobian with which the Jacobians were computed.
+        jacobians: (m, rows, p) Jacobians, divided by the measurement noise, of all poses to be fitted, including those
+            measured earlier.
+        typical: (s, n) joint values at which the tool's accuracy is predicted [rad or m].
+        poses: number of poses stated in the result; None: m.
     """
     rows = jacobians.reshape(-1, jacobians.shape[2])
     scale = np.maximum(np.linalg.norm(rows, axis=0), TINY)
@@ -130,12 +133,16 @@ def predicted(
 def by_count(
     observation: Observation, candidates: np.ndarray, typical: np.ndarray, before: np.ndarray | None = None
 ) -> tuple[Prediction, ...]:
-    """Return the predicted accuracy with each of `COUNTS` poses, chosen greedily among candidates (N, rows, p).
+    """Return the predicted accuracy for each number of poses in `COUNTS`, with poses chosen greedily.
+
+    Numbers above the number N of candidates, and numbers that do not identify all parameters, are left out; the result
+    may be empty.
 
     Args:
-        observation, typical: see `predicted`.
-        candidates: whitened Jacobians of the candidates.
-        before: (k, rows, p) Jacobians of poses measured before; None without them.
+        observation: observation Jacobian with which the Jacobians were computed.
+        candidates: (N, rows, p) Jacobians of the candidate poses, divided by the measurement noise.
+        typical: (s, n) joint values at which the tool's accuracy is predicted [rad or m].
+        before: (k, rows, p) Jacobians of poses measured earlier; None: no earlier poses.
     """
     counts = [count for count in COUNTS if count <= len(candidates)]
     if not counts:
@@ -157,11 +164,16 @@ def by_count(
 
 
 def table(prediction: Prediction, by_pose_count: tuple[Prediction, ...]) -> list[tuple[str, str]]:
-    """Return the rows (label, values) of a table: sigmas of tool and parameters, also for other pose counts."""
+    """Return table rows (label, text) on the predicted σ of the tool's position and of the parameters.
+
+    Args:
+        prediction: prediction for the selected poses.
+        by_pose_count: predictions for other numbers of poses, of which the σ of the tool's position is listed.
+    """
     label = "predicted σ of the tool's position"
     if not np.isfinite(prediction.rms):
         return [(label, "not available: these poses do not identify all parameters")]
-    rows = [(label, f"{1e3 * prediction.rms:.3g} mm rms, {1e3 * prediction.worst:.3g} mm at 95 %")]
+    rows = [(label, f"{1e3 * prediction.rms:.3g} mm rms, {1e3 * prediction.worst:.3g} mm at 95 %, by noise alone")]
     sigmas = []
     for unit, quantity, printed_unit in QUANTITIES:
         indices = [k for k, parameter_unit in enumerate(prediction.units) if parameter_unit == unit]
@@ -181,12 +193,12 @@ def table(prediction: Prediction, by_pose_count: tuple[Prediction, ...]) -> list
 
 
 def beside(poses: Path) -> Path:
-    """Return the path of the prediction that belongs to a CSV of chosen poses."""
+    """Return the path of the file with the prediction for `poses`, the CSV of selected poses."""
     return poses.parent / (poses.stem + SUFFIX)
 
 
 def write(prediction: SelectionPrediction, poses: Path) -> Path:
-    """Write the prediction for a selection next to its CSV, and return its path."""
+    """Write the prediction for a selection next to the CSV of poses, and return the path of the written file."""
     content = {field.name: getattr(prediction, field.name) for field in fields(SelectionPrediction)}
     return files.write_json(beside(poses), content)
 
@@ -195,10 +207,10 @@ def read(selection: Path) -> SelectionPrediction:
     """Read the prediction for a selection.
 
     Args:
-        selection: the CSV that `calib select` wrote, or a folder with the prediction of one (``2-poses`` of a session).
+        selection: the CSV that `calib select` wrote, or a folder with one prediction (``2-poses`` of a session).
 
     Raises:
-        UsageError: if no prediction, or more than one, is found, or it cannot be read.
+        UsageError: if no prediction or more than one is found, or if the file cannot be read.
     """
     if selection.is_dir():
         predictions = sorted(selection.glob(f"*{SUFFIX}"))
@@ -213,7 +225,10 @@ def read(selection: Path) -> SelectionPrediction:
 
 
 def compared_with_fit(prediction: SelectionPrediction, fit: GeometricFit) -> Finding | None:
-    """Return a finding on the ratio of the fit's σ to those predicted at pose selection; None without common names."""
+    """Return a finding on the ratio of the fit's σ to the σ predicted at pose selection, over common parameters.
+
+    None: the fit and the prediction have no parameter names in common.
+    """
     names = layout(fit.cell).names
     estimated = {names[k]: float(sigma) for k, sigma in zip(fit.base, fit.base_sigma())}
     predicted = dict(zip(prediction.names, prediction.sigmas))
@@ -226,11 +241,11 @@ def sigma_ratio(
     residual: float | None = None,
     assumed: float | None = None,
 ) -> Finding | None:
-    """Return a finding on the ratios of estimated to predicted σ of parameters; None without common names.
+    """Return a finding on the ratios of estimated to predicted σ; None without common parameter names.
 
     Args:
         predicted, estimated: parameter name -> σ.
-        residual, assumed: measured and assumed torque error as shares of the torque limits; None if unknown.
+        residual, assumed: measured and assumed torque error as shares of the torque limits; None: unknown.
     """
     common = [name for name in predicted if estimated.get(name, 0.0) > 0.0 and predicted[name] > 0.0]
     if not common:

@@ -1,7 +1,7 @@
 """Lines of sight from an instrument to its targets: limits on acceptance cone, range, and links in between.
 
-With several targets (reflectors on a plate, each with its own direction), a pose is feasible if one target is seen, and
-the observation Jacobian contains only the rows of the targets that are seen.
+With several targets (such as reflectors on a plate, each facing its own direction), a pose is feasible if at least one
+target is seen; the observation Jacobian then contains only the rows of the targets that are seen.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, TargetJacobian, TargetPose
-from calib.poses import constraints
+from calib.poses import pose_constraints
 from calib.poses.space import PoseConstraint, constraint_gradient
 from calib.robot.capsules import ALWAYS, SAMPLES
 from calib.robot.chain import Chain, random_joints
@@ -32,14 +32,15 @@ SEEN = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class _Behind:
-    """Constraint (m, `DISTANCES`) that keeps links off a line of sight: `BEAM` minus the nearest links' distances.
+    """Constraint that keeps links off a line of sight: `BEAM` minus the distances of the `DISTANCES` nearest links [m].
 
     Attributes:
-        arm: collision model with a method ``beam``, see `calib.robot.capsules.Capsules.beam`.
+        arm: collision model with a method ``beam`` (distances of links from a line of sight), see
+            `calib.robot.capsules.Capsules.beam`.
         target: pose of the target as a function of q.
-        velocity: Jacobian of the target as a function of q.
-        instrument: (3,) position of the instrument in the arm's base [m].
-        links: indices of the links that can block the view; links next to the target in every posture are excluded,
+        velocity: Jacobian of the target's pose as a function of q.
+        instrument: (3,) position of the instrument in the arm's base frame [m].
+        links: indices of the links that can block the view. Links next to the target in every posture are excluded,
             since the direction that the target faces accounts for them.
     """
 
@@ -72,23 +73,27 @@ class Sight:
     """The lines of sight from an instrument to the targets of an arm.
 
     Attributes:
-        targets: for each target, the constraints under which it is seen.
+        targets: for each target, the constraints that must all be satisfied for the instrument to see it.
     """
 
     targets: tuple[tuple[PoseConstraint, ...], ...]
 
     def constraints(self) -> tuple[PoseConstraint, ...]:
-        """Return the constraints of a pose: of the only target, or of the best visible one of several targets."""
+        """Return the line-of-sight constraints of a pose; with several targets, those of the best visible target."""
         if len(self.targets) == 1:
             return self.targets[0]
         return (PoseConstraint("line of sight to one of the targets", self._best, self._best_gradient),)
 
     def visible(self, q: np.ndarray) -> np.ndarray:
-        """Return flags (m, T): targets seen at poses q (m, n)."""
+        """Return flags (m, T): whether each of T targets is seen at poses q (m, n)."""
         return self._values(q).max(axis=2) <= SEEN
 
     def _values(self, q: np.ndarray) -> np.ndarray:
-        """Return the constraint violations (m, T, k) of each target."""
+        """Return the constraint values (m, T, k) of each of T targets; a target is seen where all k values are <= 0.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+        """
 
         def violations(parts: Sequence[PoseConstraint]) -> np.ndarray:
             return np.concatenate([constraint.function(q) for constraint in parts], axis=1)
@@ -113,7 +118,7 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class SeenOnly:
-    """Observation Jacobian whose rows are zero for targets that are not seen."""
+    """Observation Jacobian J in which the rows of targets that are not seen are zero."""
 
     of: Observation
     sight: Sight
@@ -122,7 +127,14 @@ class SeenOnly:
         return self.of(q) * self._mask(q)
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return the gradient (m, n) of Σ G · J with respect to q, for an unchanged set of seen targets."""
+        """Return the gradient (m, n) of Σ G · J with respect to q, for weights G and the Jacobian J (m, rows, p).
+
+        The set of seen targets is taken as constant.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+            G: (m, rows, p) weights.
+        """
         return self.of.product(q, G * self._mask(q))
 
     def _mask(self, q: np.ndarray) -> np.ndarray:
@@ -140,14 +152,14 @@ def sight_of(
     span: tuple[float, float],
     arm: DistanceModel | None,
 ) -> Sight | None:
-    """Return the lines of sight to the targets of an arm; None if no condition is stated.
+    """Return the lines of sight from an instrument to the targets of an arm; None if there is no condition on them.
 
     Args:
         cell: the arm with its T targets.
-        instrument: (3,) position of the instrument in the arm's base [m].
-        facing: (T, 3) direction that each target faces, in its own frame; a single one applies to all.
+        instrument: (3,) position of the instrument in the arm's base frame [m].
+        facing: (T, 3) direction that each target faces, in the target's frame; a single direction applies to all.
         half_angle: half angle of the acceptance cone [rad]; None: no limit.
-        span: least and largest distance [m].
+        span: smallest and largest allowed distance of the target from the instrument [m].
         arm: model of the arm's links, which may block the view (`_Behind`); None: not checked.
     """
     directions = [*facing]
@@ -160,9 +172,9 @@ def sight_of(
         velocity = TargetJacobian(cell, number)
         parts: list[PoseConstraint] = []
         if half_angle is not None:
-            parts.append(constraints.line_of_sight(target, instrument, direction, half_angle, velocity))
+            parts.append(pose_constraints.line_of_sight(target, instrument, direction, half_angle, velocity))
         if nearest > 0.0 or np.isfinite(largest):
-            parts.append(constraints.distance(target, nearest or -np.inf, largest, instrument, velocity))
+            parts.append(pose_constraints.distance(target, nearest or -np.inf, largest, instrument, velocity))
         if arm is not None:
             links = _blocking_links(arm, cell.chain, target)
             behind = _Behind(arm, target, velocity, np.asarray(instrument, dtype=float), links)
@@ -174,7 +186,13 @@ def sight_of(
 
 
 def _blocking_links(arm: DistanceModel, chain: Chain, target: TargetPose) -> np.ndarray:
-    """Return the indices of links that can block the view: all except those next to the target in every posture."""
+    """Return the indices of links that can block the view: all except those next to the target in every posture.
+
+    Args:
+        arm: model of the arm's links.
+        chain: the arm.
+        target: pose of the target as a function of the joint values.
+    """
     q = random_joints(chain, SAMPLES)
     position = target(q)[1]
     # a beam of almost no length: the distances of the links from the target itself

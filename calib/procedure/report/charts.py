@@ -1,6 +1,7 @@
-"""Figures as values: a `Chart` is a grid of `Panel`s, a panel has layers over two axes; `figure` draws a chart.
+"""Figures as values: a `Chart` is a grid of `Panel`s, and a panel contains layers over two axes; `figure` draws a
+chart.
 
-Layers are lines, bars, marked levels, texts, coloured dots, heat maps, histograms and boxes.
+Layers are lines, bars, marked levels, texts, coloured dots, heat maps, histograms and box plots.
 """
 
 import pickle
@@ -37,9 +38,9 @@ Layer = Callable[..., None]  # draws onto the axes of a panel, whose scales are 
 
 
 def layer(draw: Callable[Concatenate[Axes, P], None]) -> Callable[P, Layer]:
-    """Return a function that makes a layer from a drawing function; it takes the same arguments except the axes.
+    """Return a function that makes a layer of a panel; it takes the arguments of a drawing function, except the axes.
 
-    Its layers can be pickled, which the cache of drawn pictures needs.
+    The layers can be pickled, as the cache of drawn pictures requires.
     """
 
     @wraps(draw)
@@ -64,10 +65,18 @@ def line(
     label: str = "",
     spread: ArrayLike | None = None,
 ) -> None:
-    """Draw a curve or points (k,) in a matplotlib format (``-``, ``o``, ``o-``); long curves are thinned.
+    """Draw a curve or points (k,); curves with many points are thinned.
 
     Args:
-        spread: (k,) half lengths of error bars; None: none.
+        axes: axes to draw on.
+        x, y: (k,) coordinates.
+        form: matplotlib format, such as ``-``, ``o`` or ``o-``.
+        colour: colour of line and points.
+        width: width of the line [pt].
+        size: size of the points [pt].
+        hollow: whether points are drawn as outlines only.
+        label: text in the legend; empty: none.
+        spread: (k,) half lengths of error bars; None: no error bars.
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if form == "-":
@@ -98,8 +107,18 @@ def bars(
     spread: ArrayLike | None = None,
     label: str = "",
 ) -> None:
-    """Draw bars (k,) from `base` at 0, 1, …; one colour for all or one per bar; `spread` (k,): half the error bars'
-    length.
+    """Draw k bars from `base` to their values, at the positions 0, 1, … of the other axis.
+
+    Args:
+        axes: axes to draw on.
+        values: (k,) ends of the bars.
+        colours: one colour for all bars, or one per bar.
+        upright: whether the bars are vertical.
+        shift: offset of the positions.
+        thick: thickness of the bars.
+        base: value at which the bars begin.
+        spread: (k,) half lengths of error bars; None: no error bars.
+        label: text in the legend.
     """
     values = np.asarray(values, dtype=float)
     position = np.arange(len(values)) + shift
@@ -123,7 +142,17 @@ def level(
     words: str = "",
     height: float = 0.98,
 ) -> None:
-    """Draw a horizontal or vertical line across the panel, with a label (for a vertical line at the given height)."""
+    """Draw a horizontal or vertical line across the panel, with a label.
+
+    Args:
+        axes: axes to draw on.
+        at: position of the line.
+        colour: colour of line and label.
+        form: matplotlib line style, such as ``--``.
+        upright: whether the line is vertical.
+        words: the label.
+        height: height of a vertical line's label, as a share of the panel's height.
+    """
     if upright:
         axes.axvline(at, color=colour, linewidth=0.8, linestyle=form)
         # the label of a line at the right edge stands on its left
@@ -167,13 +196,31 @@ def text(
     across: str = "left",
     along: str = "baseline",
 ) -> None:
-    """Draw a text at a point, shifted by an offset [pt]."""
+    """Draw a text at a point, shifted by an offset.
+
+    Args:
+        axes: axes to draw on.
+        words: the text.
+        x, y: the point.
+        offset: shift to the right and upwards [pt].
+        colour: colour of the text.
+        size: font size [pt].
+        across, along: matplotlib's horizontal and vertical alignment of the text.
+    """
     axes.annotate(words, (x, y), offset, textcoords="offset points", color=colour, fontsize=size, ha=across, va=along)
 
 
 @layer
 def dots(axes: Axes, x: ArrayLike, y: ArrayLike, values: ArrayLike, least: float, most: float, unit: str = "") -> None:
-    """Draw points (k,) coloured by their values (k,) from `least` to `most`, with a colour bar if `unit` is given."""
+    """Draw points (k,) coloured by their values.
+
+    Args:
+        axes: axes to draw on.
+        x, y: (k,) coordinates.
+        values: (k,) values.
+        least, most: values of the first and the last colour.
+        unit: title of the colour bar; empty: no colour bar.
+    """
     # the largest on top
     order = np.argsort(values)
     x, y, values = np.asarray(x)[order], np.asarray(y)[order], np.asarray(values)[order]
@@ -194,14 +241,15 @@ def heat(
     colours: str = "cividis_r",
     written: bool = False,
 ) -> None:
-    """Draw a colour map of values (rows, columns) with a colour bar, row 0 at the top, NaN white.
+    """Draw a colour map of values (rows, columns) with a colour bar; row 0 is at the top, and NaN is white.
 
     Args:
+        axes: axes to draw on.
         unit: title of the colour bar.
-        extent: left, right, bottom, top of the map; None: cell k is at k.
+        extent: coordinates of the map's left, right, bottom and top edge; None: cell k is at coordinate k.
         limits: values of the first and the last colour; None: the largest value.
         colours: name of the colour map.
-        written: whether each cell shows its value.
+        written: whether each value is printed in its cell.
     """
     low, high = limits
     aspect: Literal["equal", "auto"] = "equal" if extent else "auto"
@@ -215,14 +263,30 @@ def heat(
 
 @layer
 def histogram(axes: Axes, counts: ArrayLike, edges: ArrayLike, colour: str = AFTER) -> None:
-    """Draw a histogram of counts (k,) between edges (k + 1,)."""
+    """Draw a histogram of k counts (k,) between bin edges (k + 1,).
+
+    Args:
+        axes: axes to draw on.
+        counts: number in each bin.
+        edges: bin edges, rising.
+        colour: colour of the bars.
+    """
     axes.stairs(counts, edges, fill=True, color=colour, alpha=0.9)
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
 @layer
 def box(axes: Axes, values: ArrayLike, place: float, colour: str = AFTER) -> None:
-    """Draw a box plot of values (k,) at a y position: quartiles and median, 5th and 95th percentile, points beyond."""
+    """Draw a horizontal box plot of values (k,) at a y position.
+
+    It shows quartiles and median, 5th and 95th percentile, and all points beyond these percentiles.
+
+    Args:
+        axes: axes to draw on.
+        values: the values.
+        place: the y position.
+        colour: colour of the box.
+    """
     axes.boxplot(
         [values],
         positions=[place],
@@ -240,7 +304,14 @@ def box(axes: Axes, values: ArrayLike, place: float, colour: str = AFTER) -> Non
 
 
 def _scale(axes: Axes, mappable: ScalarMappable, unit: str, **options: Any) -> None:
-    """Draw the colour bar of a layer, with its unit."""
+    """Draw the colour bar of a coloured layer.
+
+    Args:
+        axes: axes of the layer.
+        mappable: the layer, as matplotlib's drawing function returned it.
+        unit: title of the colour bar; empty: no colour bar.
+        **options: options of matplotlib's ``colorbar``.
+    """
     figure = axes.figure
     scale = figure.colorbar(mappable, ax=axes, pad=0.02, aspect=30, **options)
     scale.ax.set_title(unit, fontsize=7.0, fontweight="normal")
@@ -253,12 +324,12 @@ class Panel:
     Attributes:
         layers: layers in drawing order.
         title, x, y: title, and labels of the axes.
-        xlim, ylim: limits of the axes; None: as the layers need.
-        log: letters of the axes that are logarithmic (their limits are required).
+        xlim, ylim: limits of the axes; None: chosen by the content.
+        log: letters of the logarithmic axes, whose limits are required.
         xnames, ynames: labels at 0, 1, … instead of numbers; x labels of one line are vertical; None: numbers.
         grid: axes with grid lines: ``x``, ``y``, ``both`` or empty.
         equal: whether both axes have the same scale.
-        symlog: the y axis is linear between ± this value and logarithmic beyond; 0: all linear.
+        symlog: the y axis is linear between ± this value and logarithmic beyond; 0: linear everywhere.
         ticks: approximate largest number of ticks per axis; 0: default.
     """
 
@@ -296,7 +367,14 @@ class Panel:
     def _set_axis(
         self, axes: Axes, axis: XAxis | YAxis, names: Sequence[str] | None, limits: tuple[float, float] | None
     ) -> None:
-        """Set limits, scale and labels of an axis."""
+        """Set limits, scale and labels of an axis.
+
+        Args:
+            axes: the panel's axes.
+            axis: the axis to set.
+            names: labels at 0, 1, … instead of numbers; None: numbers.
+            limits: limits of the axis; None: chosen by the content.
+        """
         letter = axis.axis_name
         if limits:
             axes.set(**{f"{letter}lim": limits})
@@ -320,8 +398,9 @@ class Chart:
         panels: at least one panel.
         height, width: size of the figure [in].
         columns: number of panels in a row.
-        title: title of the figure, next to which the legend of the first panel is drawn; empty: none.
-        shared: letters of the axes that are labelled only at the lowest panel of a column and at the first of a row.
+        title: title of the figure, beside the legend of the first panel; empty: neither title nor legend.
+        shared: letters of the axes whose labels are drawn only at the edge of the grid: ``x`` at the lowest panel of
+            each column, ``y`` at the first panel of each row.
     """
 
     panels: Sequence[Panel]
@@ -336,7 +415,7 @@ Captioned = tuple[Chart, str]  # with what it shows, in a sentence
 
 
 def figure(chart: Chart) -> Figure:
-    """Return the matplotlib figure of a chart, without a window."""
+    """Return a chart drawn as a matplotlib figure, without opening a window."""
     with style.styled(quiet_titles=bool(chart.title)):
         rows = -(-len(chart.panels) // chart.columns)
         head = 0.25 if chart.title else 0.0
@@ -358,17 +437,17 @@ def figure(chart: Chart) -> Figure:
 
 
 def picture(chart: Chart, caption: str) -> Picture:
-    """Return a chart with a caption as a picture for a page; charts drawn before come from a cache."""
+    """Return a chart with a caption as a picture for a page; a chart that was drawn earlier is taken from a cache."""
     return Picture(_drawn(pickle.dumps(chart)), caption, chart.width > style.HALF_WIDTH, chart)
 
 
 def pictures(charts: Mapping[str, Captioned]) -> dict[str, Picture]:
-    """Return charts with their captions as pictures, by name."""
+    """Return charts with captions as pictures for a page, by name."""
     return {name: picture(chart, caption) for name, (chart, caption) in charts.items()}
 
 
 def vector(chart: Chart, caption: str) -> Picture:
-    """Return a chart with a caption as a picture of lines and outlines (SVG), for print."""
+    """Return a chart with a caption as a vector picture (SVG) for print."""
     return Picture(style.svg(figure(chart)), caption, chart.width > style.HALF_WIDTH)
 
 
@@ -378,12 +457,12 @@ def _drawn(chart: bytes) -> bytes:
 
 
 def saved(charts: Mapping[str, Captioned], folder: Path) -> dict[str, Picture]:
-    """Write charts into a folder, as ``plot_<name>.png``; return them as pictures, by name."""
+    """Write charts into a folder as ``plot_<name>.png``, and return them as pictures by name."""
     save_all({name: chart for name, (chart, _) in charts.items()}, folder)
     return pictures(charts)
 
 
 def save_all(charts: Mapping[str, Chart], folder: Path) -> None:
-    """Write charts into a folder, as ``plot_<name>.png``."""
+    """Write charts into a folder as ``plot_<name>.png``."""
     for name, chart in charts.items():
         files.write(folder / f"plot_{name}.png", picture(chart, "").image)

@@ -1,4 +1,4 @@
-"""Figures of the dynamics: from an identification's outcome, or from the files of its folder."""
+"""Figures on the dynamics, made from an identification's outcome or from the files in its folder."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +13,7 @@ from calib.procedure.dynamic_stage.geometry_tables import GEOMETRIES, MIN_SHIFT,
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.metrics import TorqueCurves, UnseenReport
 from calib.procedure.report.charts import Captioned, Chart, Panel, bars, level, line, text
-from calib.procedure.report.dynamics_section import DynamicReport, IdentifiedParameter, percent, proof_of
+from calib.procedure.report.dynamics_section import SIGNIFICANT, DynamicReport, IdentifiedParameter, percent, proof_of
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET, thinned
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import read_rows
@@ -25,8 +25,6 @@ MAX_HALF_PAGE_ROWS = 8
 MAX_ELEMENTS = 15
 # parameters along an axis: more cannot be read on A4
 MAX_LABELS = 40
-# sigmas from which on a change or a value is significant
-SIGNIFICANT = 2.0
 # points of a cloud of friction, and of its curve
 MAX_CLOUD_POINTS = 1400
 CURVE_POINTS = 400
@@ -36,8 +34,9 @@ def captioned(report: DynamicReport, folder: Path | None = None) -> dict[str, Ca
     """Return the charts of an identification's report with captions, by name; charts without data are omitted.
 
     Args:
-        report: report of the identification.
-        folder: folder of the identification, for its comparison with the nominal geometry; None: without this chart.
+        report: stored results of the identification.
+        folder: folder of the identification, with the comparison of nominal and calibrated geometry; None: no chart of
+            this comparison.
     """
     unseen = report.unseen
     result = _error_charts(unseen)
@@ -52,7 +51,11 @@ def captioned(report: DynamicReport, folder: Path | None = None) -> dict[str, Ca
 
 
 def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:
-    """Return the charts of an identification by name: torques of every recording, residuals, friction."""
+    """Return the charts of an identification by name: torques of every recording, residuals, and friction.
+
+    Args:
+        outcome: the identification.
+    """
     report = UnseenReport.of(outcome.inputs, outcome)
     result = {}
     cases = (*outcome.inputs.unseen, *outcome.inputs.cases)
@@ -65,7 +68,12 @@ def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:
 
 
 def recorded(curves: TorqueCurves, report: UnseenReport) -> Captioned:
-    """Return the chart of one recording's torques, measured and predicted."""
+    """Return a chart of one recording's measured and predicted torques, with a caption.
+
+    Args:
+        curves: torques of the recording.
+        report: report on the model's errors.
+    """
     scores = {**report.fit, **report.validation}
     raw = scores[curves.name].raw
     if curves.name in report.fit:
@@ -81,10 +89,13 @@ def recorded(curves: TorqueCurves, report: UnseenReport) -> Captioned:
 
 
 def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
-    """Return the chart of friction over velocity as ``friction`` -> chart; {} for mechanisms.
+    """Return a chart of friction over velocity, as a dictionary with the key ``friction``; empty for mechanisms.
 
-    It shows the friction model, and the torques of the first training recording minus the rigid-body model. If a torque
-    row belongs to several joints (power), it shows the model only.
+    The chart shows the friction model, and as points the torques of the first training recording minus the rigid-body
+    model. If a torque row depends on several joints (such as power), only the friction model is shown.
+
+    Args:
+        outcome: the identification.
     """
     if isinstance(outcome.inputs.robot, Mechanism):
         return {}
@@ -127,7 +138,12 @@ def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
 
 
 def _friction(column: DriveTerm, velocity: np.ndarray) -> np.ndarray:
-    """Return the values (N,) of a friction term at velocities (N,), with position and acceleration zero."""
+    """Return the values (N,) of a friction term at velocities (N,), with zero position and acceleration.
+
+    Args:
+        column: the friction term.
+        velocity: velocities of its joint [rad/s or m/s].
+    """
     zero = np.zeros(len(velocity))
     return column.values(TermMotion(zero, velocity, zero))
 
@@ -142,15 +158,15 @@ def torques(
     errors: Sequence[float] | np.ndarray = (),
     band: float = np.nan,
 ) -> Chart:
-    """Return the chart of measured torques, predicted torques and residuals over time.
+    """Return a chart of measured torques, predicted torques and residuals over time.
 
     Args:
         t: (N,) times [s].
-        measured, predicted: (N, rows) torques [units].
+        measured, predicted: (N, rows) torques.
         rows, units: names of the torque rows, and their units.
         title: title of the chart.
-        errors: relative error of each row [%]; empty if unknown.
-        band: cutoff to which the torques are low-passed [Hz]; NaN: as recorded.
+        errors: relative error of each row [%]; empty: unknown.
+        band: cutoff to which the torques are low-passed [Hz]; NaN: not filtered.
     """
     time_label = "time [s]"
     if np.isfinite(band):
@@ -176,7 +192,7 @@ def torques(
 def autocorrelations(
     whiteness: Sequence[Whiteness | None], rows: Sequence[str], title: str = "", width: float = PAGE_WIDTH
 ) -> Chart:
-    """Return the chart of the autocorrelation of each row's residual, with the bounds of white noise.
+    """Return a chart of the autocorrelation of each torque row's residual, with the bounds for white noise.
 
     Args:
         whiteness: autocorrelation of each torque row; None for rows with too few samples.
@@ -205,7 +221,12 @@ def autocorrelations(
 
 
 def _geometry_charts(effects: Sequence[GeometricEffect], comparison_file: Path | None) -> dict[str, Captioned]:
-    """Return the charts on the geometry's effect on the dynamics, by name."""
+    """Return charts, by name, on the effect of geometric errors on the dynamic parameters.
+
+    Args:
+        effects: effects of geometric errors; empty: no chart.
+        comparison_file: table of the parameters on nominal and calibrated geometry; None: no chart.
+    """
     result: dict[str, Captioned] = {}
     compared: list[TwoGeometries] = []
     if comparison_file and comparison_file.is_file():
@@ -231,7 +252,13 @@ def _geometry_charts(effects: Sequence[GeometricEffect], comparison_file: Path |
 
 
 def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
-    """Return the chart of the parameters' values on both geometries, and of their differences in σ, largest first."""
+    """Return a chart of the parameters on the nominal and the calibrated geometry, and of their differences in σ.
+
+    If there are too many parameters, only those with the largest differences are shown.
+
+    Args:
+        rows: the parameters on both geometries.
+    """
     nominal = np.array([row.nominal for row in rows])
     calibrated = np.array([row.calibrated for row in rows])
     sigma_nominal = np.array([row.sigma_nominal for row in rows], dtype=float)
@@ -282,7 +309,11 @@ def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
 
 
 def _effects(rows: Sequence[GeometricEffect]) -> Chart:
-    """Return the chart of geometric errors, ranked by the largest parameter shift they cause."""
+    """Return a chart of geometric errors, ranked by the largest parameter shift that one σ of the error causes.
+
+    Args:
+        rows: effects of the geometric errors.
+    """
     shifts = np.array([row.shift_sigma or 0.0 for row in rows])
     shifts = np.nan_to_num(shifts, posinf=0.0)
     matters = shifts > MIN_SHIFT
@@ -299,7 +330,13 @@ def _effects(rows: Sequence[GeometricEffect]) -> Chart:
 
 
 def _error_charts(unseen: UnseenReport) -> dict[str, Captioned]:
-    """Return the charts of each row's error [%] and autocorrelation, for the recording that decides the verdict."""
+    """Return charts of each torque row's error [%] and residual autocorrelation, by name.
+
+    The errors are those of the recording that decides the verdict.
+
+    Args:
+        unseen: report on the model's errors.
+    """
     _, proof, motion = proof_of(unseen)
     training = next(iter(unseen.fit.values()))
     training_errors = np.nan_to_num(training.raw.joints)
@@ -323,7 +360,7 @@ def _error_charts(unseen: UnseenReport) -> dict[str, Captioned]:
 
 
 def _significance(parameters: Sequence[IdentifiedParameter]) -> Captioned:
-    """Return the chart of each parameter's distance from zero in σ; below two, a parameter is not significant."""
+    """Return a chart of |value| / σ of each parameter, with a caption; below two, a parameter is not significant."""
     value = np.array([row.value for row in parameters])
     sigma = np.array([row.sigma or 0.0 for row in parameters])
     # a logarithmic axis starts at 0.1

@@ -1,4 +1,4 @@
-"""The dynamics section of reports, for the console output of an identification and for its report."""
+"""The report section on the dynamics, which is also the console output of an identification."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,6 +24,7 @@ from calib.identification.loop import (
 from calib.identification.prediction import Score
 from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import geometry_tables
+from calib.procedure.dynamic_stage.computed_torque import torque_tests
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
@@ -39,8 +40,10 @@ from calib.units import small
 MAX_RSD = 50.0
 # letters of a parameter's expression that are printed
 EXPRESSION_LETTERS = 46
-# geometric errors listed
+# geometric errors listed, and parameters that they change
 MAX_EFFECTS = 8
+# change of a parameter [σ] from which on it counts as changed
+SIGNIFICANT = 2.0
 # share of autocorrelations beyond the bound below which a residual may be called white (0.05 if it is)
 WHITE = 0.10
 ERROR_NOTE = (
@@ -81,7 +84,16 @@ FED_FORWARD = {
 
 
 class IdentifiedParameter(NamedTuple):
-    """A row of ``estimate.csv``; RSD in percent; σ is None if not measured."""
+    """A row of ``estimate.csv``.
+
+    Attributes:
+        name, unit: name and unit of the parameter.
+        expression: text that explains the parameter: the combination of standard parameters that it stands for, or its
+            drive term.
+        value: the estimate.
+        sigma: standard deviation, from torque noise and geometry; None if it was not estimated.
+        rsd: `sigma` in percent of the value; None if it is unknown.
+    """
 
     name: str
     expression: str
@@ -98,18 +110,20 @@ class DynamicReport:
     Attributes:
         metrics: metrics of the identification.
         estimate: the parameters.
-        effects: effects of the geometry's errors on the parameters; empty if the geometry is taken as exact.
-        unseen: report of the model on unseen motion, with the verdict.
+        effects: effects of geometric errors on the parameters; empty if the geometry is taken as exact.
+        unseen: report on the model's errors on held-out motion, with the verdict.
+        geometries: each parameter identified on the nominal and on the calibrated geometry; empty for one geometry.
     """
 
     metrics: ModelMetrics
     estimate: tuple[IdentifiedParameter, ...]
     effects: tuple[geometry_tables.GeometricEffect, ...]
     unseen: UnseenReport
+    geometries: tuple[geometry_tables.TwoGeometries, ...] = ()
 
 
 def read(folder: Path) -> DynamicReport:
-    """Read the results of an identification and of its validation from the folder of the identification.
+    """Read the results of an identification and its validation from the folder of the identification.
 
     Raises:
         UsageError: if files are missing or were written by another version.
@@ -122,26 +136,38 @@ def read(folder: Path) -> DynamicReport:
         effects: tuple[geometry_tables.GeometricEffect, ...] = ()
         if effects_file.exists():
             effects = read_rows(geometry_tables.GeometricEffect, effects_file)
-        return DynamicReport(metrics, estimate, effects, identification.judged)
+        geometries: tuple[geometry_tables.TwoGeometries, ...] = ()
+        if (folder / geometry_tables.GEOMETRIES).exists():
+            geometries = read_rows(geometry_tables.TwoGeometries, folder / geometry_tables.GEOMETRIES)
+        return DynamicReport(metrics, estimate, effects, identification.judged, geometries)
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder}: {error}; identify again: calib redo … identify") from error
 
 
 def read_lines(inputs: IdentificationInputs) -> list[str]:
-    """Return text lines on the robot and the recordings, as read."""
+    """Return lines of text that list the robot and the recordings that were read.
+
+    Args:
+        inputs: robot and recordings of the identification.
+    """
     chain = inputs.chain
     lines = [str(inputs.robot)]
     if isinstance(chain, Chain):
         geometry = "calibrated" if inputs.robot.moved else "nominal geometry"
         lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}, {geometry}"]
-    lines += [_recording_line(case, "to learn from") for case in inputs.cases]
+    lines += [_recording_line(case, "for training") for case in inputs.cases]
     lines += [_recording_line(case, "unseen") for case in inputs.unseen]
     lines += [f"  {page.single_colons(note)}" for note in inputs.notes]
     return lines
 
 
 def _recording_line(case: Case, role: str) -> str:
-    """Return the line on a recording: name, duration, rate, kind of motion, payload, and what it is used for."""
+    """Return a line of text on a recording: name, duration, rate, kind of torque, payload, and use.
+
+    Args:
+        case: the recording.
+        role: its use, such as ``unseen``.
+    """
     motion = case.motion
     # a recording cut as log.npz@10: ends with a colon
     name = case.name.rstrip(":")
@@ -152,7 +178,7 @@ def _recording_line(case: Case, role: str) -> str:
 
 
 def of_outcome(outcome: IdentificationOutcome, folder: Path | None = None) -> DynamicReport:
-    """Return the report of an identification.
+    """Return the report on an identification.
 
     Args:
         outcome: the identification.
@@ -169,7 +195,11 @@ def of_outcome(outcome: IdentificationOutcome, folder: Path | None = None) -> Dy
 
 
 def outcome_section(outcome: IdentificationOutcome) -> page.Section:
-    """Return the section for the console on an identification: that of its report, without figures and parameters."""
+    """Return the console output on an identification: the report section without figures and parameters.
+
+    Args:
+        outcome: the identification.
+    """
     return report_section(of_outcome(outcome), {})
 
 
@@ -179,18 +209,24 @@ def report_section(
     exported: Sequence[str] = (),
     tolerance: float = 0.0,
     delivered: float | None = None,
+    tolerances: Sequence[float] = (),
+    joint_count: int = 0,
 ) -> page.Section:
-    """Return the section of a report: errors on unseen motion, torques, excitation, and parameters.
+    """Return the report section on the dynamics: errors on held-out motion, torques, excitation, and parameters.
 
     Args:
-        report: report of the identification.
-        figures: figures by name (`dynamics_figures.captioned`); missing ones are omitted.
-        exported: remarks of the export.
-        tolerance: largest acceptable torque error on unseen motion [%]; 0: no tolerance.
-        delivered: torque error of the exported robot on unseen motion [%]; None if unknown.
+        report: stored results of the identification.
+        figures: figures by name (`dynamics_figures.captioned`); absent figures are left out of the section.
+        exported: remarks on the export.
+        tolerance: largest acceptable torque error on held-out motion [%]; 0: no tolerance.
+        delivered: torque error of the exported robot on held-out motion [%]; None: unknown.
+        tolerances: largest acceptable rms torque error of each joint, or one for all [N m or N]; empty: none.
+        joint_count: number of joints to which the tolerances apply; 0: as many as there are torque rows.
     """
     metrics, unseen = report.metrics, report.unseen
     blocks: list[page.Block] = [_error_table(unseen), _reference_table(unseen), _interval_table(unseen)]
+    if tolerances:
+        blocks.insert(0, _test_table(unseen, tolerances, joint_count or len(unseen.rows)))
 
     torque_figures = [name for name in figures if name.startswith("torque_")]
     blocks.append(page.pictures("", figures, ("errors", "residuals")))
@@ -202,6 +238,7 @@ def report_section(
     blocks.append(page.Text("The model", _model_sentences(metrics)))
     blocks.append(page.Text("What the motion identifies", _identifiability(report)))
     blocks += _geometry_blocks(metrics, report.effects)
+    blocks += _comparison_blocks(report.geometries)
     blocks.append(page.pictures("", figures, ("geometries", "geometry_effects")))
     blocks.append(page.pictures("Dynamic parameters", figures, ("significance",)))
     blocks.append(_parameter_table(report.estimate))
@@ -216,9 +253,31 @@ def report_section(
     return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, key_figures)
 
 
+def _test_table(unseen: UnseenReport, tolerances: Sequence[float], joint_count: int) -> page.ReportTable:
+    """Return the table of the computed-torque test: rms error of each torque row beside its tolerance.
+
+    Args:
+        unseen: report on the model's errors on held-out motion.
+        tolerances: tolerance of each joint, or one for all [N m or N].
+        joint_count: number of joints.
+    """
+    words = {True: "yes", False: "no", None: "not tested"}
+    units = dict(zip(unseen.rows, unseen.units))
+    rows = []
+    for test in torque_tests(tolerances, unseen.proofs, unseen.rows, joint_count):
+        rms = "–" if test.passed is None else f"{test.rms:.3g} {units[test.row]}"
+        rows.append([test.row, rms, f"{test.tolerance:g} {units[test.row]}", words[test.passed], test.recording])
+    header = ("torque", "rms error", "tolerance", "within", "recording")
+    return page.ReportTable("Computed-torque test on unseen motion", header, rows, numbers=[1, 2])
+
+
 def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.ReportTable:
-    """Return the table of identified parameters."""
-    header = ("parameter", "unit", "value", "σ", "RSD", "what it holds")
+    """Return the table of identified parameters with value, σ and relative standard deviation.
+
+    Args:
+        estimate: the parameters.
+    """
+    header = ("parameter", "unit", "value", "σ", "RSD", "contents")
     rows = []
     for parameter in estimate:
         sigma = "" if parameter.sigma is None else f"{parameter.sigma:.2g}"
@@ -230,7 +289,13 @@ def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.ReportTabl
 
 
 def warnings_of(report: DynamicReport) -> list[str]:
-    """Return the warnings of identification and validation, each once, without those that validation refuted."""
+    """Return the warnings of identification and validation without duplicates.
+
+    The warning that there is no held-out motion is omitted if the validation has such motion.
+
+    Args:
+        report: stored results of the identification.
+    """
     refuted: list[str] = []
     if report.unseen.proofs:
         early = [finding for finding in report.metrics.noticed if finding.code == "no-unseen-motion"]
@@ -240,7 +305,14 @@ def warnings_of(report: DynamicReport) -> list[str]:
 
 
 def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
-    """Return name, errors and kind of motion of the deciding recording: the worst unseen one, else the fitted one."""
+    """Return name, score and kind of motion of the recording that decides the verdict.
+
+    It is the held-out recording with the largest error; without held-out motion, the training recording with the
+    largest error.
+
+    Args:
+        unseen: report on the model's errors.
+    """
     scores, motion = unseen.fit, "the training motion"
     if unseen.proofs:
         scores, motion = unseen.proofs, "unseen motion"
@@ -249,7 +321,13 @@ def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
 
 
 def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None) -> list[page.KeyFigure]:
-    """Return the torque errors that decide the verdict: those of the worst unseen recording."""
+    """Return the torque errors on which the verdict is based: those of the worst held-out recording.
+
+    Args:
+        unseen: report on the model's errors.
+        tolerance: largest acceptable torque error [%]; 0: no tolerance.
+        delivered: torque error of the exported robot [%]; None: unknown.
+    """
     name, proof, _ = proof_of(unseen)
     count = len(unseen.proofs)
     basis = {0: "the training motion", 1: "1 unseen motion"}.get(count, f"worst of {count} unseen motions")
@@ -264,6 +342,8 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
     error, in_band = "torque unexplained", "torque unexplained in the motion's band"
     if proof.stands:
         error += " in motion"
+    if proof.noisy:
+        error += f" below {proof.band:.3g} Hz"
     identified = percent(proof.judged.total)
     allowed = f"{tolerance:g} %" if tolerance else "none"
     if delivered is None:
@@ -278,6 +358,8 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
         ]
     if proof.stands:
         figures.append(page.KeyFigure("torque unexplained at rest", "", percent(proof.standing.total), "", basis))
+    if proof.noisy:
+        figures.append(page.KeyFigure("torque unexplained at all frequencies", "", percent(proof.raw.total), "", basis))
     figures.append(page.KeyFigure(in_band, "", percent(proof.filtered.total), "", basis))
 
     finite = [(share, row) for share, row in zip(proof.filtered.joints, unseen.rows) if np.isfinite(share)]
@@ -287,17 +369,21 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
 
 
 def percent(value: float) -> str:
-    """Return a percentage with three digits as text; a dash if not finite."""
+    """Return a percentage `value` [%] with three significant digits as text; a dash if it is not finite."""
     return _number(value, " %")
 
 
 def _rsd(percent: float) -> str:
-    """Return an RSD [%] as text; "above 1000 %" if larger."""
+    """Return a relative standard deviation [%] as text; "above 1000 %" for larger values."""
     return f"{percent:.0f} %" if percent < 1000.0 else "above 1000 %"
 
 
 def _error_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table of torque errors, per row and recording."""
+    """Return the table of torque errors for each recording and torque row.
+
+    Args:
+        unseen: report on the model's errors.
+    """
     groups = {}
     for name, score in unseen.fit.items():
         groups[f"{name} (fitted)"] = _error_rows(score, unseen)
@@ -308,8 +394,11 @@ def _error_table(unseen: UnseenReport) -> page.ReportTable:
 
 
 def _error_rows(score: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
-    """Yield the rows of the error table, with the columns `ERROR_HEADER`: all torques together, then each torque
-    row.
+    """Yield the rows of the error table for one recording: first all torques together, then each torque row.
+
+    Args:
+        score: score of the model on the recording.
+        unseen: report on the model's errors, with the names of the torque rows.
     """
     parts = score.raw, score.filtered, score.moving, score.standing
     totals = [percent(part.total) for part in parts]
@@ -322,7 +411,13 @@ def _error_rows(score: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
 
 
 def rms_words(score: Score, unseen: UnseenReport, row: int) -> tuple[str, str]:
-    """Return the rms error of a torque row in its unit, and in per cent of its limit; "–" where that is not known."""
+    """Return as texts a torque row's rms error in its unit, and in percent of its limit; "–" if unknown.
+
+    Args:
+        score: score of the model on a recording.
+        unseen: report with units and limits of the torque rows.
+        row: index of the torque row, from 0.
+    """
     rms = score.raw.rms[row]
     if not np.isfinite(rms):
         return "–", "–"
@@ -337,18 +432,26 @@ def _of_all(row: Sequence[str]) -> bool:
 
 
 def _reference_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table of errors of plain references on held-out motion beside the model's; may be empty."""
+    """Return the table of errors on held-out motion by the plain references and by the model; may be empty.
+
+    Args:
+        unseen: report on the model's errors.
+    """
     header = ("recording", "nominal masses, no friction", "plain least squares", "this model")
     rows = []
     for recording, references in unseen.references.items():
         errors = references.nominal, references.plain, references.delivered
         rows.append([recording, *map(percent, errors)])
-    title = "Beside plain references: torque unexplained on held-out motion"
+    title = "Comparison with plain references: torque unexplained on held-out motion"
     return page.ReportTable(title, header, rows, REFERENCE_NOTE, numbers=[1, 2, 3])
 
 
 def _interval_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table of the coverage of predicted 95 % intervals, per row of unseen recordings; may be empty."""
+    """Return the table of the coverage of predicted 95 % intervals on held-out recordings; may be empty.
+
+    Args:
+        unseen: report on the model's errors.
+    """
     groups = {}
     for name, score in unseen.validation.items():
         coverage = score.interval95
@@ -370,7 +473,11 @@ def _interval_table(unseen: UnseenReport) -> page.ReportTable:
 
 
 def _friction_table(metrics: ModelMetrics) -> page.ReportTable:
-    """Return the table of friction models with their errors on held-out time, for all rows and for each row."""
+    """Return the table of the tried friction models with their errors on held-out time, in total and by torque row.
+
+    Args:
+        metrics: metrics of the identification.
+    """
     count = max(len(step.joints_percent) for step in metrics.ladder)
     joints = [str(j + 1) for j in range(count)]
     header = ["friction", "p", "total", *joints, "kept at joints"]
@@ -394,7 +501,11 @@ def _rounded(share: float, digits: int) -> str:
 
 
 def _model_sentences(metrics: ModelMetrics) -> list[str]:
-    """Return sentences on the model: number of parameters, method, and eliminated parameters."""
+    """Return sentences on the model: ripple, couplings, method, number of parameters, and eliminated parameters.
+
+    Args:
+        metrics: metrics of the identification.
+    """
     lines = [_ripple_sentence(ripple) for ripple in metrics.ripple]
     lines += _coupling_sentences(metrics)
     lines.append(f"method {metrics.method}: assumes that {metrics.method_assumes}")
@@ -419,7 +530,7 @@ def _model_sentences(metrics: ModelMetrics) -> list[str]:
 
 
 def _ripple_sentence(ripple: RippleWaves) -> str:
-    """Return the sentence on a joint's torque ripple: its orders, and how much of the residual it explains."""
+    """Return a sentence on a joint's torque ripple: its orders, and the share of the residual that it explains."""
     orders = []
     for wave in ripple.waves:
         gear = "" if wave.gear == ripple.joint else f" of joint {wave.gear}"
@@ -436,7 +547,13 @@ def _condition(number: float) -> str:
 
 
 def _coupling_sentences(metrics: ModelMetrics) -> list[str]:
-    """Return what coupling terms do to the errors of their joints: what they are in the drives nobody measured."""
+    """Return sentences on how much each coupling term between two joints lowers the errors of these joints.
+
+    The physical cause of a coupling is not stated, since nobody measured it in the drives.
+
+    Args:
+        metrics: metrics of the identification.
+    """
     lines: list[str] = []
     if not metrics.ladder:
         return lines
@@ -458,7 +575,7 @@ def _coupling_sentences(metrics: ModelMetrics) -> list[str]:
 
 
 def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.GeometricEffect]) -> list[page.Block]:
-    """Return the blocks on the effect of geometric errors on the dynamics: summary, and the largest effects."""
+    """Return the summary of how geometric errors affect the dynamic parameters, and a table of the largest effects."""
     geometry = metrics.geometry
     if geometry is None:
         return []
@@ -476,8 +593,30 @@ def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.Ge
     return blocks
 
 
+def _comparison_blocks(rows: Sequence[geometry_tables.TwoGeometries]) -> list[page.Block]:
+    """Return the table of the parameters that the calibrated geometry changes most, in σ; empty for one geometry."""
+    if not rows:
+        return []
+    with_sigma = [row for row in rows if row.sigma_calibrated > 0.0]
+    changes = np.array([(row.calibrated - row.nominal) / row.sigma_calibrated for row in with_sigma])
+    table = []
+    for k in np.argsort(-np.abs(changes), kind="stable")[:MAX_EFFECTS]:
+        row = with_sigma[k]
+        nominal = f"{row.nominal:.4g} ± {row.sigma_nominal:.2g}"
+        calibrated = f"{row.calibrated:.4g} ± {row.sigma_calibrated:.2g}"
+        table.append([row.name, row.unit, nominal, calibrated, f"{changes[k]:.2g} σ", row.essential])
+    count = int(np.sum(np.abs(changes) > SIGNIFICANT))
+    note = (
+        f"{count} of {len(rows)} parameters change by more than {SIGNIFICANT:g} σ between the nominal and the "
+        "calibrated geometry, identified from the same torques; all: geometries.csv."
+    )
+    header = ("parameter", "unit", "nominal geometry", "calibrated geometry", "change", "essential")
+    title = "What the calibrated geometry changed in the dynamics"
+    return [page.ReportTable(title, header, table, note, numbers=[2, 3, 4])]
+
+
 def _effect_table(effects: Sequence[geometry_tables.GeometricEffect]) -> page.ReportTable:
-    """Return the table of geometric errors with the parameter that each shifts most, and its effect on the torque."""
+    """Return the table of geometric errors, with the parameter that each shifts most, and the effect on the torque."""
     header = (
         "geometric error",
         "sigma",
@@ -496,7 +635,7 @@ def _effect_table(effects: Sequence[geometry_tables.GeometricEffect]) -> page.Re
 
 
 def _loop_sentences(loop: LoopMetrics) -> list[str]:
-    """Return sentences on the closed-loop simulation, and on the bias of least squares."""
+    """Return sentences on the closed-loop simulation, and on the bias of least squares that it reveals."""
     lines = list(loop.notes)
     test = loop.durbin_wu_hausman
     if test is None:
@@ -543,7 +682,12 @@ def _number(value: float, unit: str = "") -> str:
 
 
 def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[page.Block]:
-    """Return the blocks on the simulated tracking errors with the model as feedforward."""
+    """Return tables and texts on simulated tracking errors with the model as feedforward.
+
+    Args:
+        replays: name of a recording -> simulated tracking.
+        failure: reason why no tracking was simulated; empty: none.
+    """
     if failure:
         line = f"tracking with the model as feedforward was not simulated:  {failure}"
         return [page.Text("Tracking, simulated", [line])]
@@ -580,7 +724,11 @@ def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[pa
 
 
 def _identifiability(report: DynamicReport) -> list[str]:
-    """Return sentences on the parameters that the motion identifies, and on the residuals."""
+    """Return sentences on parameters that are not distinguishable from zero, and on whether the residuals are white.
+
+    Args:
+        report: stored results of the identification.
+    """
     lines = []
     weak = [row.name for row in report.estimate if row.rsd is not None and row.rsd > MAX_RSD]
     if weak:

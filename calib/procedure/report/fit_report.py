@@ -1,4 +1,4 @@
-"""Data of a fit's report and certificate, stored as plain numbers in ``report.json``, from which both are rendered."""
+"""Content of a fit's report and certificate as plain numbers, stored in ``report.json``; both are rendered from it."""
 
 from __future__ import annotations
 
@@ -40,7 +40,10 @@ NATURES = ("position", "orientation", "distance")
 
 
 class FittedParameter(NamedTuple):
-    """One parameter of the fit; `rsd` in percent, `group` arm, station, tool or deflection."""
+    """One fitted parameter.
+
+    The relative standard deviation `rsd` is in percent (None: undefined); `group` is arm, station, tool or deflection.
+    """
 
     name: str
     unit: str
@@ -52,7 +55,7 @@ class FittedParameter(NamedTuple):
 
 
 class CorrelatedPair(NamedTuple):
-    """Two correlated parameters."""
+    """Names of two correlated parameters, and their correlation coefficient."""
 
     first: str
     second: str
@@ -61,7 +64,7 @@ class CorrelatedPair(NamedTuple):
 
 @dataclass(frozen=True)
 class CorrelationMatrix:
-    """Correlation matrix of the most correlated parameters."""
+    """Names and correlation matrix of the most strongly correlated parameters."""
 
     names: tuple[str, ...]
     matrix: tuple[tuple[float, ...], ...]
@@ -69,17 +72,19 @@ class CorrelationMatrix:
 
 @dataclass(frozen=True)
 class RowErrors:
-    """Error sizes on one set of rows.
+    """Error sizes on one set of measured rows.
 
     Attributes:
         name: name of the set: ``fit``, or the validation file's name.
-        unseen: whether the fit had not seen the rows.
+        unseen: whether the rows were held out from the fit.
         poses: number of robot poses.
-        nominal, calibrated, urdf_alone: nature (position, orientation, distance) -> errors of this arm [m, rad].
-        expected: predicted radius that contains 95 % of the calibrated arm's errors [m]; empty if unknown.
-        q: (rows, n) joint values, if there is one error per row; so are `points`, (rows, 3) in the arm's base [m], and
-            `rows`, row numbers in the file.
-        worst: the row with the calibrated arm's largest error, if the set is only a sample of the rows; else None.
+        nominal, calibrated, urdf_alone: errors of the nominal arm, the calibrated arm, and the calibrated arm without
+            joint corrections: nature (position, orientation, distance) -> errors [m, rad].
+        expected: predicted radius that contains 95 % of the calibrated arm's errors [m]; empty: unknown.
+        q: (rows, n) joint values [rad or m]; empty if several rows share an error, as are `points` and `rows`.
+        points: (rows, 3) target positions in the arm's base frame [m].
+        rows: row numbers in the file.
+        worst: the row with the calibrated arm's largest error, if the set is only a sample of the rows; otherwise None.
     """
 
     name: str
@@ -95,34 +100,47 @@ class RowErrors:
     worst: RowErrors | None = None
 
     def judged(self, deliverable: str) -> Mapping[str, tuple[float, ...]]:
-        """Return nature -> errors of the deliverable on which the verdict is based."""
+        """Return the errors of the deliverable that is judged, by nature (position, orientation, distance) [m, rad].
+
+        Args:
+            deliverable: ``urdf`` or ``corrections``.
+        """
         if deliverable == "urdf" and self.urdf_alone:
             return self.urdf_alone
         return self.calibrated
 
     def judged_arm(self, deliverable: str) -> str:
-        """Return the name, as text, of the deliverable on which the verdict is based."""
+        """Return the printed name of the deliverable that is judged.
+
+        Args:
+            deliverable: ``urdf`` or ``corrections``.
+        """
         with_corrections = deliverable != "urdf" and self.urdf_alone
         return ARM["corrections"] if with_corrections else ARM["urdf"]
 
 
 @dataclass(frozen=True)
 class Report:
-    """The outcome of a fit, as stored in JSON.
+    """The results of a fit, as stored in ``report.json``.
 
     Attributes:
-        robot: name of the robot, with its `base` and `tip` links.
-        joints: names of the joints; `prismatic` states which are prismatic.
+        schema: version of the file's format.
+        robot: name of the robot.
+        base, tip: names of the first and the last link.
+        joints: names of the joints.
+        prismatic: whether each joint is prismatic.
         metrics: content of ``metrics.json``.
         parameters: all fitted parameters.
-        kept: arm parameters that kept their nominal values.
+        kept: names of the arm parameters that kept their nominal values.
         correlations: pairs of strongly correlated parameters.
         correlated: correlation matrix of the most correlated parameters.
-        singular_values: singular values of the scaled observation matrix; `rank` of them are kept.
-        sets: errors per set of rows.
-        noise: nature -> rms that the stated σ alone cause [m, rad]; None if no σ was stated.
-        images: corner coverage of each camera's images; empty without images.
-        files: files that were read, see `file_row`.
+        singular_values: singular values of the scaled observation matrix.
+        rank: number of singular values that are kept.
+        sets: errors on each set of rows.
+        noise: nature (position, orientation) -> rms error that the instrument's stated σ alone causes [m, rad]; None:
+            no σ was stated.
+        images: density of detected corners over each camera's images; empty: no images.
+        files: files that were read: name, role, size in bytes, SHA-256.
         source: path of the robot's description.
     """
 
@@ -146,7 +164,12 @@ class Report:
     source: str = ""
 
     def with_unseen(self, validation: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:
-        """Return the report, extended by unseen rows (`rows_of`) and updated verdict, reason and warnings."""
+        """Return the report with further held-out rows (`rows_of`), and with updated verdict, reason and warnings.
+
+        Args:
+            validation: new results on validation rows, with the verdict.
+            sets: errors on the further rows; a set with the name of an earlier one replaces it.
+        """
         metrics = replace(self.metrics, **vars(validation))
         replaced = {rows.name for rows in sets}
         remaining = [rows for rows in self.sets if rows.name not in replaced]
@@ -154,7 +177,7 @@ class Report:
 
 
 def collect(outcome: Outcome) -> Report:
-    """Return the report of a fit's outcome, for its certificate."""
+    """Return the report on the outcome of a fit."""
     chain, fit = outcome.inputs.chain, outcome.selection.fit
     table = estimate_table(fit, outcome.selection.nominal.cell)
     names = layout(fit.cell)
@@ -196,18 +219,34 @@ def collect(outcome: Outcome) -> Report:
 
 
 def file_row(name: str, role: str, path: Path) -> FileRow:
-    """Return the entry of a file in the certificate: name, content, bytes, SHA-256."""
+    """Return the entry of a file in the certificate: name, role, size in bytes, SHA-256.
+
+    Args:
+        name: printed name.
+        role: use of the file, such as "nominal robot".
+        path: the file.
+    """
     return name, role, str(path.stat().st_size), files.fingerprint(path)
 
 
 def unseen_role(role: str, seen: bool, judged: str) -> str:
-    """Return the role of a validation file, and whether the file was unseen by `judged` (fit or identification)."""
+    """Return a validation file's role as text, with a remark on whether the file was held out.
+
+    Args:
+        role: role of the file.
+        seen: whether fit or identification used the file.
+        judged: what is judged: ``the fit`` or ``the identification``.
+    """
     unseen = "NOT unseen" if seen else "unseen"
     return f"{role}, {unseen} by {judged}"
 
 
 def _file_rows(inputs: Inputs) -> tuple[FileRow, ...]:
-    """Return the entries of the robot's description and of the files for fit and validation."""
+    """Return the certificate's entries of the robot's description and of the files for fit and validation.
+
+    Args:
+        inputs: robot and measurements.
+    """
     roles = {inputs.source: "nominal robot"}
     for block in inputs.fit:
         if block.file:
@@ -219,9 +258,15 @@ def _file_rows(inputs: Inputs) -> tuple[FileRow, ...]:
 
 
 def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
-    """Return the errors of one set of rows, with joint values and target positions if each row has one error.
+    """Return the errors on one set of rows.
 
-    From more than `MAX_ROWS` such rows, a random sample and the worst row are taken.
+    Joint values and target positions are included if there is one error per row; distances between two rows, for
+    example, have no row of their own. From more than `MAX_ROWS` rows, a random sample and the worst row are taken.
+
+    Args:
+        name: name of the set.
+        comparison: errors of the arms on the rows.
+        unseen: whether the rows were held out from the fit.
     """
     sizes = comparison.errors[1].main
     if len(sizes) != sum(map(len, comparison.blocks)):
@@ -237,7 +282,14 @@ def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
 
 
 def _errors_by_nature(name: str, comparison: Comparison, unseen: bool, selection: slice | np.ndarray) -> RowErrors:
-    """Return the selected errors of the nominal and the calibrated arm, and of the latter without corrections."""
+    """Return the selected errors of three arms: nominal, calibrated, and calibrated without joint corrections.
+
+    Args:
+        name: name of the set.
+        comparison: errors of the arms on the rows.
+        unseen: whether the rows were held out from the fit.
+        selection: indices of the selected errors.
+    """
     errors_by_arm = []
     for errors in (*comparison.errors, comparison.alone):
         by_nature = {}
@@ -251,7 +303,14 @@ def _errors_by_nature(name: str, comparison: Comparison, unseen: bool, selection
 
 
 def _errors_by_row(name: str, comparison: Comparison, unseen: bool, selection: slice | np.ndarray) -> RowErrors:
-    """Return the errors of the selected rows with their joints, points, expected errors and numbers in their files."""
+    """Return the errors of the selected rows with joint values, target positions, expected errors and row numbers.
+
+    Args:
+        name: name of the set.
+        comparison: errors of the arms on the rows.
+        unseen: whether the rows were held out from the fit.
+        selection: indices of the selected rows.
+    """
     q = np.concatenate([block.q for block in comparison.blocks])
     numbers = np.concatenate([block.rows for block in comparison.blocks])
     points = _points(comparison)
@@ -268,7 +327,11 @@ def _errors_by_row(name: str, comparison: Comparison, unseen: bool, selection: s
 
 
 def _points(comparison: Comparison) -> np.ndarray:
-    """Return the target positions (rows, 3) [m] in the arm's base frame."""
+    """Return the positions (rows, 3) [m] of the targets in the arm's base frame, as predicted by the calibrated arm.
+
+    Args:
+        comparison: the rows, and the arms that predict them.
+    """
     cell = comparison.cells[1]
     points = []
     for block in prepare(cell, comparison.blocks):
@@ -280,7 +343,13 @@ def _points(comparison: Comparison) -> np.ndarray:
 
 
 def most_correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12) -> CorrelationMatrix:
-    """Return the most correlated parameters and their correlation matrix."""
+    """Return the correlation matrix of the `most` parameters with the strongest correlations.
+
+    Args:
+        names: names of p parameters.
+        covariance: (p, p) covariance.
+        most: largest number of parameters.
+    """
     sigma = np.sqrt(np.clip(np.diag(covariance), 1e-300, None))
     matrix = covariance / np.outer(sigma, sigma)
     strongest = np.abs(matrix - np.diag(np.diag(matrix))).max(axis=1, initial=0.0)
@@ -290,7 +359,10 @@ def most_correlated(names: Sequence[str], covariance: np.ndarray, most: int = 12
 
 
 def _noise(blocks: Sequence[PoseMeasurements]) -> dict[str, float | None]:
-    """Return the rms that the stated sigmas alone give, by nature [m, rad]; None where a block states none."""
+    """Return the rms errors that the stated σ alone cause: position [m] and orientation [rad].
+
+    None for a nature whose σ is not stated for every block of measurements.
+    """
     return {"position": _stated_rms(blocks, "sigma"), "orientation": _stated_rms(blocks, "sigma_rotation")}
 
 
@@ -308,7 +380,11 @@ def _stated_rms(blocks: Sequence[PoseMeasurements], field_name: str) -> float | 
 
 
 def _plain(values: np.ndarray) -> tuple[Any, ...]:
-    """Return numbers rounded to seven digits, as nested tuples."""
+    """Return an array of numbers, rounded to seven significant digits, as a tuple or nested tuples.
+
+    Args:
+        values: the array.
+    """
     rounded = [float(f"{value:.7g}") for value in np.ravel(values)]
     nested = np.array(rounded).reshape(np.shape(values)).tolist()
     if np.ndim(values) == 1:
@@ -317,12 +393,12 @@ def _plain(values: np.ndarray) -> tuple[Any, ...]:
 
 
 def write(report: Report, path: Path) -> None:
-    """Write a fit's report as JSON."""
+    """Write a fit's report as JSON to a path."""
     files.write_json(path, report)
 
 
 def read(path: Path) -> Report:
-    """Read a fit's report from JSON.
+    """Return a fit's report, read from the JSON file `path`.
 
     Raises:
         UsageError: if the file is missing or was written by another version.

@@ -1,6 +1,6 @@
-"""Figures of a geometric calibration, from a `Report` or from arrays [m, rad], as `Chart`s with captions.
+"""Figures on a geometric calibration, made from a `Report` or from arrays [m, rad], as `Chart`s with captions.
 
-Errors of the nominal arm are drawn light and those of the calibrated arm dark, distinguishable in greyscale.
+Errors of the nominal arm are light and those of the calibrated arm dark, so that they differ in greyscale.
 """
 
 from collections.abc import Sequence
@@ -28,13 +28,13 @@ BIN_EDGES = 31
 def error_histogram(
     before: np.ndarray, after: np.ndarray, nature: str = "position", noise: float | None = None, arm: str = ARM["urdf"]
 ) -> Chart:
-    """Return the histogram of nominal and calibrated errors, each with its rms; `noise` marks the instrument's error.
+    """Return a histogram of nominal and calibrated errors, with lines at the rms of each.
 
     Args:
         before, after: (m,) errors of the nominal and of the calibrated arm [m] or [rad].
         nature: ``position``, ``orientation`` or ``distance``.
-        noise: rms of the instrument's own error, in the unit of the errors; None: not drawn.
-        arm: name of the arm that `after` belongs to.
+        noise: rms of the instrument's own error, in the unit of the errors, drawn as a line; None: not drawn.
+        arm: printed name of the arm with the errors `after`.
     """
     factor, unit = ERRORS[nature]
     before, after = factor * np.asarray(before), factor * np.asarray(after)
@@ -80,14 +80,15 @@ def residuals_by_joint(
     nature: str = "position",
     arm: str = ARM["urdf"],
 ) -> Chart:
-    """Return the chart of errors over each joint value; a trend in the errors shows an unmodelled effect.
+    """Return a chart of errors over each joint value; a trend in the errors indicates an unmodelled effect.
 
     Args:
         q: (m, n) joint values [rad or m].
-        before, after: (m,) sizes of errors of the nominal and of the calibrated arm [m] or [rad].
+        before, after: (m,) error sizes of the nominal and of the calibrated arm [m] or [rad].
         joint_names: (n,) names of the joints.
         prismatic: (n,) whether each joint is prismatic.
-        nature, arm: as in `error_histogram`.
+        nature: ``position``, ``orientation`` or ``distance``.
+        arm: printed name of the arm with the errors `after`.
     """
     factor, unit = ERRORS[nature]
     sizes = factor * np.concatenate([before, after])
@@ -126,13 +127,13 @@ def error_map(
     expected: np.ndarray | None = None,
     least: float = 0.0,
 ) -> Chart:
-    """Return the maps of calibrated errors in the workspace (from above and from the side), and of expected errors.
+    """Return maps of calibrated and expected errors over the workspace, seen from above and from the side.
 
     Args:
-        points: (m, 3) target positions in the arm's base [m].
+        points: (m, 3) target positions in the arm's base frame [m].
         sizes: (m,) errors of the calibrated arm [m].
-        words: title, with {} for the largest error.
-        expected: (m,) predicted radius that contains 95 % of such errors [m]; None or empty if unknown.
+        words: title, in which {} is replaced by the largest error.
+        expected: (m,) predicted radius that contains 95 % of such errors [m]; None or empty: unknown, no map.
         least: error at which the colour scale begins [m].
     """
     largest_mm = 1e3 * float(np.max(sizes, initial=1e-9))
@@ -157,7 +158,15 @@ def error_map(
 def _map_panel(
     points: np.ndarray, sizes_mm: np.ndarray, limits_mm: tuple[float, float], axis: int, title: str
 ) -> Panel:
-    """Return the map of sizes at points (m, 3) over x and another axis; the second map has the colours' scale."""
+    """Return a map of sizes at points over x and another axis.
+
+    Args:
+        points: (m, 3) positions [m].
+        sizes_mm: (m,) sizes at the points, shown by colours [mm].
+        limits_mm: sizes at the ends of the colour scale [mm].
+        axis: vertical axis of the map: 1 for y, 2 for z; only the map over z has a colour bar.
+        title: title of the map.
+    """
     layers = [
         dots(points[:, 0], points[:, axis], sizes_mm, *limits_mm, "[mm]" if axis == 2 else ""),
         line([0.0], [0.0], "+", INK, size=9.0),
@@ -167,17 +176,22 @@ def _map_panel(
 
 
 def predicted_map(points: np.ndarray, sigma: np.ndarray) -> Chart:
-    """Return the map of the tool position's predicted σ (m,) [m] at points (m, 3) [m] of the workspace."""
+    """Return a map of the predicted σ (m,) [m] of the tool's position at workspace points (m, 3) [m].
+
+    Args:
+        points: positions of the tool.
+        sigma: predicted σ.
+    """
     return error_map(points, sigma, words="predicted σ up to {}", least=float(np.min(sigma)))
 
 
 def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) -> Chart:
-    """Return the maps of corner counts and reprojection errors in a camera's images; white: no corners.
+    """Return maps of corner counts and reprojection errors over a camera's image; cells without corners are white.
 
     Args:
         size: width and height of the images [px].
-        count: (rows, columns) corners per cell of the image.
-        rms: (rows, columns) reprojection error there [px].
+        count: (rows, columns) number of corners in each cell of the image.
+        rms: (rows, columns) rms reprojection error in each cell [px].
     """
     width, height = size
     extent = 0, width, height, 0
@@ -193,12 +207,12 @@ def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) ->
 
 
 def parameter_changes(rows: Sequence[FittedParameter], most: int = 48, of: str = "fitted - nominal") -> Chart:
-    """Return the chart of fitted minus nominal values with bars of two σ; lengths in mm, angles in mrad.
+    """Return a chart of fitted minus nominal values with error bars of two σ; lengths in mm, angles in mrad.
 
     Args:
-        rows: fitted parameters; those in other units are omitted.
-        most: largest number of parameters per panel, those furthest from nominal in σ.
-        of: text for the difference that is drawn.
+        rows: fitted parameters; parameters in other units are omitted.
+        most: largest number of parameters per panel; those with the largest change in σ are shown.
+        of: axis label for the difference.
     """
     panels = []
     longest = 5
@@ -222,11 +236,13 @@ def parameter_changes(rows: Sequence[FittedParameter], most: int = 48, of: str =
 
 
 def singular_values(values: np.ndarray, rank: int) -> Chart:
-    """Return the chart of singular values of the scaled observation matrix, and of the gap below the identifiable ones.
+    """Return a chart of the singular values of the scaled observation matrix.
+
+    It marks the gap below the singular values of the identifiable parameter combinations.
 
     Args:
         values: (p,) singular values in descending order.
-        rank: number of values that are kept.
+        rank: number of singular values that are kept.
     """
     values = np.asarray(values, dtype=float)
     # zeros have no place on a logarithmic axis
@@ -245,11 +261,12 @@ def singular_values(values: np.ndarray, rank: int) -> Chart:
 
 
 def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
-    """Return the chart of cross-validated errors of the models tried, up to the first without improvement.
+    """Return a chart of the cross-validated errors of the tried models.
 
     Args:
-        steps: models with such an error; the last one kept, without a note, is the model chosen.
-        noise: rms of the instrument's own error [m].
+        steps: tried models with a cross-validated error, in the order of the trials; the last model without a note is
+            the chosen one.
+        noise: rms of the instrument's own error [m]; None: not drawn.
     """
     errors = np.array([step.cross_validated_mm for step in steps], dtype=float)
     x = np.arange(len(steps))
@@ -286,7 +303,12 @@ def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
 
 
 def correlation_map(names: Sequence[str], correlation: np.ndarray) -> Chart:
-    """Return the map of the parameters' correlations (p, p), with their names (p,)."""
+    """Return a map of the correlation matrix (p, p) of parameters.
+
+    Args:
+        names: (p,) names of the parameters.
+        correlation: the matrix.
+    """
     off = np.abs(correlation - np.diag(np.diag(correlation)))
     matrix = heat(correlation, limits=(-1.0, 1.0), colours="PuOr", written=len(names) <= 10)
     # long names widen the figure, and never overlap
@@ -296,12 +318,12 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray) -> Chart:
 
 
 def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: str) -> Chart:
-    """Return the chart of predicted σ over measuring effort, both logarithmic; the present plan is marked.
+    """Return a chart of predicted σ over measuring effort, both logarithmic, on which the present plan is marked.
 
     Args:
-        others: pairs of effort and σ.
+        others: pairs of effort and σ of other plans.
         own: effort and σ of the present plan.
-        along, across: labels of effort and σ, with units.
+        along, across: axis labels of effort and σ, with units.
     """
     points = np.array(sorted(others)).reshape(-1, 2)
     with_plan = np.vstack([points, [own]])

@@ -1,4 +1,4 @@
-"""The geometry section of reports, for the console output of a fit and for its report."""
+"""The report section on the geometry, which is also the console output of a fit."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -47,7 +47,11 @@ ALONE_NOTE = (
 
 
 def read_lines(inputs: Inputs) -> list[str]:
-    """Return text lines on the robot and the measurements, as read."""
+    """Return lines of text that list the robot and the measurements that were read.
+
+    Args:
+        inputs: robot and measurements of the fit.
+    """
     chain = inputs.chain
     lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}"]
     for block in inputs.fit:
@@ -65,7 +69,11 @@ def read_lines(inputs: Inputs) -> list[str]:
 
 
 def outcome_section(metrics: FitMetrics) -> page.Section:
-    """Return the console's section on a fit: ladder, errors, repeated poses, findings, verdict."""
+    """Return the console output on a fit: tried models, errors, repeated poses, findings, and verdict.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     sets = _sets(metrics)
     blocks: list[page.Block] = [_ladder_table(metrics), error_table(sets, metrics.deliverable)]
     lines = [f"model {metrics.model}, {parameter_words(metrics)}"]
@@ -83,11 +91,11 @@ def outcome_section(metrics: FitMetrics) -> page.Section:
 
 
 def report_section(report: Report, figures: Mapping[str, page.Picture]) -> page.Section:
-    """Return the section of a report: errors, ladder, parameters, identifiability, figures, outliers.
+    """Return the report section on the geometry: errors, tried models, parameters, identifiability, figures, outliers.
 
     Args:
-        report: report of the fit.
-        figures: figures by name (`geometry_figures.captioned`); missing ones are omitted.
+        report: stored results of the fit.
+        figures: figures by name (`geometry_figures.captioned`); absent figures are left out of the section.
     """
     metrics = report.metrics
     blocks: list[page.Block] = [error_table(_sets(metrics), metrics.deliverable), *iso9283_tables(metrics)]
@@ -108,11 +116,13 @@ def report_section(report: Report, figures: Mapping[str, page.Picture]) -> page.
 
 
 def _key_figures(report: Report) -> list[page.KeyFigure]:
-    """Return the errors of nominal and calibrated robot that decide the verdict.
+    """Return the errors of the nominal and the calibrated robot on which the verdict is based.
 
-    They are those of the worst unseen rows; without unseen rows, those of cross-validation if the verdict is based on
-    it;
-    else those of the fitted rows.
+    They are those of the worst held-out rows. Without held-out rows, they are the cross-validated errors if the verdict
+    is based on these, otherwise the errors on the fitted rows.
+
+    Args:
+        report: stored results of the fit.
     """
     metrics = report.metrics
     if not metrics.proofs:
@@ -163,7 +173,13 @@ def _key_figures(report: Report) -> list[page.KeyFigure]:
 
 
 def _rms_spread(rows: RowErrors | None, arm: str, nature: str) -> str:
-    """Return the standard error of an arm's rms error as text; empty where it is not known."""
+    """Return the standard error of an arm's rms error as text; empty if it is unknown.
+
+    Args:
+        rows: errors on the rows; None: not stored, so that the result is empty.
+        arm: key of an arm: ``calibrated`` or ``urdf_alone``.
+        nature: ``position``, ``orientation`` or ``distance``.
+    """
     if rows is None:
         return ""
     errors = rows.urdf_alone if arm == "urdf_alone" else rows.calibrated
@@ -175,8 +191,12 @@ def _rms_spread(rows: RowErrors | None, arm: str, nature: str) -> str:
 
 
 def deciding(report: Report) -> tuple[ComparedRows, RowErrors | None]:
-    """Return the worst unseen rows with the error of each row (None if not stored); without unseen rows, the fitted
-    ones.
+    """Return the rows on which the verdict is based, and the error of each row (None: not stored).
+
+    They are the held-out rows with the largest error; without held-out rows, the fitted rows.
+
+    Args:
+        report: stored results of the fit.
     """
     metrics = report.metrics
     name = next(iter(metrics.proofs), "fit")
@@ -191,7 +211,13 @@ def deciding(report: Report) -> tuple[ComparedRows, RowErrors | None]:
 
 
 def _cross_validated_figure(metrics: FitMetrics) -> page.KeyFigure | None:
-    """Return the cross-validated errors of both arms; None if other errors decided the verdict (`validation.judge`)."""
+    """Return the cross-validated errors of the nominal and the calibrated arm.
+
+    None if the verdict is based on other errors (`validation.judge`).
+
+    Args:
+        metrics: metrics of the fit.
+    """
     findings, nominal = metrics.findings, metrics.fit.nominal.main
     if findings is None or findings.cross_validated is None or nominal is None or len(metrics.ladder) < 2:
         return None
@@ -216,13 +242,23 @@ def _size(value: float, unit: str) -> str:
 
 
 def _arm_errors(rows: ComparedRows, arm: str, key: str) -> ErrorStatistics | None:
-    """Return the errors of one nature (a key of `KINDS`) of an arm (a key of `ARMS`); None where there are none."""
+    """Return an arm's errors of one nature; None if there are none.
+
+    Args:
+        rows: errors on a set of rows.
+        arm: key of `ARMS`, such as ``nominal``.
+        key: key of `KINDS`, such as ``position_mm``.
+    """
     errors = getattr(rows, arm)
     return None if errors is None else getattr(errors, key)
 
 
 def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
-    """Return the sets of rows, each with its label."""
+    """Return the fitted and the validation rows, each with a label for tables.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     sets = [(f"fitted: {metrics.fit.poses} poses", metrics.fit)]
     for name, rows in metrics.validation.items():
         role = "unseen" if rows.unseen else "NOT unseen"
@@ -231,12 +267,21 @@ def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
 
 
 def meanings(rows: ComparedRows) -> list[str]:
-    """Return sentences on the meaning of the position errors of rows; [] if positions were measured."""
+    """Return sentences that explain how position errors are defined if positions were not measured directly.
+
+    Args:
+        rows: errors on a set of rows.
+    """
     return [sentence for name, sentence in MEANS.items() if name in rows.position_means]
 
 
 def error_table(sets: Sequence[tuple[str, ComparedRows]], deliverable: str) -> page.ReportTable:
-    """Return the table of errors of all arms on sets of rows, with the arm that the verdict is about in bold."""
+    """Return the table of the errors of all arms on sets of rows; the arm that is judged is in bold.
+
+    Args:
+        sets: label and errors of each set of rows.
+        deliverable: deliverable that is judged: ``urdf`` or ``corrections``.
+    """
     has_corrections = any(rows.urdf_alone for _, rows in sets)
     notes = {"Distances of pairs do not depend on the placement of instrument and tool.": None}
     if has_corrections:
@@ -256,7 +301,7 @@ def error_table(sets: Sequence[tuple[str, ComparedRows]], deliverable: str) -> p
 
 
 def _error_rows(rows: ComparedRows) -> Iterator[tuple[str, ...]]:
-    """Yield error, arm, and the arm's mean, rms, 95 % quantile and maximum, as text."""
+    """Yield table rows of text: kind of error, arm, and the arm's mean, rms, 95 % quantile and maximum."""
     kinds: dict[str, Mapping[str, ErrorStatistics | None]] = {}
     for key, (nature, unit) in KINDS.items():
         kinds[f"{rows.words(nature)} [{unit}]"] = {arm: _arm_errors(rows, arm, key) for arm in ARMS}
@@ -276,7 +321,11 @@ def _error_rows(rows: ComparedRows) -> Iterator[tuple[str, ...]]:
 
 
 def _ladder_table(metrics: FitMetrics) -> page.ReportTable:
-    """Return the table of the models tried, with their errors on held-out rows."""
+    """Return the table of the tried models with their errors on held-out rows.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     header = ("model", "parameters", "cross-validated rms [mm]", "remark")
     rows = []
     strong = set()
@@ -293,7 +342,11 @@ def _ladder_table(metrics: FitMetrics) -> page.ReportTable:
 
 
 def _outlier_table(metrics: FitMetrics) -> page.ReportTable:
-    """Return the table of outliers, the worst first."""
+    """Return the table of outliers, largest first.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     columns = (
         page.RecordColumn("file", _file_name, number=False),
         page.RecordColumn("row", "{0.row}"),
@@ -310,7 +363,7 @@ def _file_name(outlier: Outlier) -> str:
 
 
 def parameter_words(metrics: FitMetrics) -> str:
-    """Return the number of a fit's parameters by kind, as text; with a ridge, corrections may outnumber poses."""
+    """Return a text on the number of a fit's parameters: geometric parameters and joint corrections."""
     corrections = 0
     for step in metrics.ladder:
         if step.kept:
@@ -322,13 +375,23 @@ def parameter_words(metrics: FitMetrics) -> str:
 
 
 def error_words(metrics: FitMetrics) -> str:
-    """Return the rms errors on the fitted poses as text."""
+    """Return a text on the rms errors on the fitted poses.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     return f"{_rms_words(metrics.fit, metrics.deliverable)} on {metrics.fit.poses} fitted poses"
 
 
 def _rms_words(rows: ComparedRows, deliverable: str) -> str:
-    """Return the rms errors of the nominal robot and of the deliverable as text; those of the alternative in
+    """Return a text on the rms errors of the nominal robot and of the deliverable.
+
+    If a robot with and one without joint corrections is delivered, the errors of the one that is not judged are in
     brackets.
+
+    Args:
+        rows: errors on a set of rows.
+        deliverable: ``urdf`` or ``corrections``.
     """
     arms = {"nominal": rows.nominal, ARM["urdf"]: rows.calibrated}
     alternative = {}
@@ -345,7 +408,11 @@ def _rms_words(rows: ComparedRows, deliverable: str) -> str:
 
 
 def _parameter_table(report: Report) -> page.ReportTable:
-    """Return the table of fitted parameters, without joint corrections if these are many."""
+    """Return the table of fitted parameters; joint corrections are omitted if there are too many parameters.
+
+    Args:
+        report: stored results of the fit.
+    """
     parameters = report.parameters
     if len(report.parameters) > MAX_ROWS:
         parameters = tuple(row for row in report.parameters if row.group != "deflection")
@@ -370,7 +437,11 @@ def _parameter_table(report: Report) -> page.ReportTable:
 
 
 def outlier_sentences(metrics: FitMetrics) -> list[str]:
-    """Return a sentence on the number of outliers and the worst ones; empty without outliers."""
+    """Return a sentence on the number of outliers and on the largest ones; an empty list without outliers.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     if not metrics.outliers:
         return []
     rows = {(outlier.file, outlier.row) for outlier in metrics.outliers}
@@ -384,7 +455,11 @@ def outlier_sentences(metrics: FitMetrics) -> list[str]:
 
 
 def _identifiability(report: Report) -> list[str]:
-    """Return sentences on identifiable and correlated parameters."""
+    """Return sentences on parameters that are not identifiable or strongly correlated.
+
+    Args:
+        report: stored results of the fit.
+    """
     lines = []
     candidates = len(report.singular_values)
     undetermined, fitted = report.metrics.not_identifiable, report.metrics.fit.parameters
@@ -406,20 +481,33 @@ def _identifiability(report: Report) -> list[str]:
 
 
 def _repeated_sentences(metrics: FitMetrics) -> list[str]:
-    """Return a sentence on accuracy and repeatability for each set of rows with repeated poses."""
+    """Return a sentence on pose accuracy and repeatability for each set of rows with repeated poses.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     sets = {"fitted": metrics.fit, **metrics.validation}
     return [f"{name}: {iso9283_words(rows)}" for name, rows in sets.items() if rows.iso9283]
 
 
 def iso9283_words(rows: ComparedRows) -> str:
-    """Return the sentence on repeated poses, naming the arm; empty if no pose was repeated."""
+    """Return a sentence on the accuracy and repeatability of repeated poses; empty if no pose was repeated.
+
+    Args:
+        rows: errors on a set of rows.
+    """
     if rows.iso9283 is None:
         return ""
     return iso9283_sentence(rows.iso9283, ARM["corrections"] if rows.urdf_alone else ARM["urdf"])
 
 
 def iso9283_tables(metrics: FitMetrics, most: int = MAX_POSES) -> list[page.ReportTable]:
-    """Return the tables of accuracy and repeatability after ISO 9283, one per set of rows with repeated poses."""
+    """Return tables of accuracy and repeatability after ISO 9283, one for each set of rows with repeated poses.
+
+    Args:
+        metrics: metrics of the fit.
+        most: largest number of poses in a table.
+    """
     columns = (
         page.RecordColumn("pose", "{0[0]}", number=False),
         page.RecordColumn("cycles", _cycles),

@@ -1,4 +1,4 @@
-"""Figures of a designed or planned motion: q, v, a, τ with limits, tool path, search, and trade-offs of goals."""
+"""Figures of a designed or planned motion: joint motion with limits, tool path, search history, trade-offs of goals."""
 
 from __future__ import annotations
 
@@ -33,11 +33,12 @@ TITLES = ("position", "velocity", "acceleration", "torque")
 
 
 def motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[Joint]) -> Chart:
-    """Return the chart of series of every joint, a row per joint and a column per series, limits dashed.
+    """Return a chart of the joint motion over time, with a row per joint and a column per quantity.
 
     Args:
         times: (N,) times [s].
-        series: values (N, n), lower and upper limits (n,), infinite without one, of q, v, and of a and τ if known.
+        series: for each quantity, values (N, n), lower limits (n,) and upper limits (n,), infinite: no limit. The
+            quantities are position, velocity and, if known, acceleration and torque.
         joints: the robot's n joints.
     """
     units = motion_units(joint.kind for joint in joints)
@@ -62,7 +63,11 @@ def motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[
 
 
 def _motion_figure(designed: Designed) -> Chart:
-    """Return the chart of q, v, a and τ of every joint over one period, limits dashed."""
+    """Return a chart of each joint's position, velocity, acceleration and torque over one period; limits are dashed.
+
+    Args:
+        designed: the motion.
+    """
     motion, model, limits = _dense_motion(designed), designed.inputs.model, designed.inputs.limits
     infinite = np.full(designed.inputs.chain.n, np.inf)
     # the order of the derivative that is limited: 0 position, 1 velocity, 2 acceleration
@@ -78,7 +83,7 @@ def _motion_figure(designed: Designed) -> Chart:
 
 
 def _path_figure(designed: Designed) -> Chart:
-    """Return the chart of the tool's path from above and from the side."""
+    """Return a chart of the tool's path in a designed motion, seen from above and from the side."""
     position = sweep(designed.inputs.chain, _dense_motion(designed).q).position
     panels = []
     for axis, title in ((1, "the tool's path from above"), (2, "from the side")):
@@ -94,7 +99,13 @@ def _path_figure(designed: Designed) -> Chart:
 
 
 def _history_figure(designed: Designed) -> Chart:
-    """Return the chart of the objective over the search, for the best start."""
+    """Return a chart of the objective over the search for a motion.
+
+    It shows the search from the start point that led to the best motion.
+
+    Args:
+        designed: the motion.
+    """
     history = np.asarray(designed.found.history, dtype=float)
     title = f"{history[0]:.4g} at first, {history[-1]:.4g} at last" if len(history) else ""
     curve = line(np.arange(len(history)), history)
@@ -102,7 +113,11 @@ def _history_figure(designed: Designed) -> Chart:
 
 
 def front_figure(front: Front) -> Chart:
-    """Return the chart of a condition number over the mean torque that it was traded for; open: dominated points."""
+    """Return a chart of the trade-off between condition number and mean torque; open points are dominated by others.
+
+    Args:
+        front: the trade-offs, with the condition number as the first and the torque slack as the second objective.
+    """
     condition, torque = front.values[:, 0], 1.0 - front.values[:, 1]
     order = np.argsort(torque)
     efficient, dominated = order[front.best[order]], order[~front.best[order]]
@@ -125,7 +140,7 @@ def _dense_motion(designed: Designed) -> SampledMotion:
 
 
 def design_figures(designed: Designed) -> dict[str, Chart]:
-    """Return the figures of a designed motion by name: motion, an arm's tool path, search, front and outlook if any."""
+    """Return the figures of a designed motion by name: motion, history, and, if available, path, front and outlook."""
     figures = {"motion": _motion_figure(designed), "history": _history_figure(designed)}
     if isinstance(designed.inputs.chain, Chain):
         figures["path"] = _path_figure(designed)
@@ -140,22 +155,25 @@ def design_figures(designed: Designed) -> dict[str, Chart]:
 
 
 def plan_figures(planned: Planned) -> dict[str, Chart]:
-    """Return the figures of a planned motion by name: motion and speed profile."""
+    """Return the figures of a planned motion by name: joint motion and speed profile."""
     return {"motion": _plan_figure(planned), "profile": _profile_figure(planned)}
 
 
 def write_design(designed: Designed, folder: Path) -> None:
-    """Write the figures of a designed motion into its folder."""
+    """Write the figures of a designed motion as PNG into a folder."""
     save_all(design_figures(designed), folder)
 
 
 def write_plan(planned: Planned, folder: Path) -> None:
-    """Write the figures of a planned motion into its folder."""
+    """Write the figures of a planned motion as PNG into a folder."""
     save_all(plan_figures(planned), folder)
 
 
 def _plan_figure(planned: Planned) -> Chart:
-    """Return the chart of q, v, a and τ of every joint, limits dashed."""
+    """Return a chart of each joint's position, velocity, acceleration and torque in a planned motion.
+
+    Limits are dashed.
+    """
     track, limits = planned.track, planned.limits
     series: list[Limited] = [
         (track.q, planned.lower, planned.upper),
@@ -168,7 +186,7 @@ def _plan_figure(planned: Planned) -> Chart:
 
 
 def _profile_figure(planned: Planned) -> Chart:
-    """Return the chart of the speed along the path, and of the share reached of each limit."""
+    """Return a chart of the speed along the path of a planned motion, and of the used share of each limit."""
     speeds, shares = [], []
     start = 0.0
     for timing in planned.timings:

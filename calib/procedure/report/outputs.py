@@ -1,4 +1,4 @@
-"""Additional files of a result's folder: data of its report, figures, and its certificate."""
+"""Additional files in a result's folder: the report's data, figures, and the certificate."""
 
 from __future__ import annotations
 
@@ -15,7 +15,14 @@ if TYPE_CHECKING:
 
 
 def write_fit(outcome: Outcome, folder: Path, plots: bool = True, pages: bool = True) -> None:
-    """Write ``report.json``, figures (if `plots`) and, outside sessions, the certificate of a fit into its folder."""
+    """Write ``report.json``, figures and certificate of a fit into the folder of the fit.
+
+    Args:
+        outcome: the fit.
+        folder: folder of the fit.
+        plots: whether to draw figures.
+        pages: whether to write certificate and report; sessions write these pages later.
+    """
     from calib.procedure.kinematic_stage.folder import FitFolder
     from calib.procedure.report import fit_report
 
@@ -34,9 +41,14 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True, pages: bool = 
 
 
 def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True, pages: bool = True) -> None:
-    """Write the figure of friction (if `plots`) and, outside sessions, ``report.json``, figures and certificate.
+    """Write figures, ``report.json`` and certificate of an identification into the folder of the identification.
 
-    In a session, the certificate draws the other figures, with the unseen recordings.
+    Args:
+        outcome: the identification.
+        folder: folder of the identification.
+        plots: whether to draw figures.
+        pages: whether to write everything but the friction figure; a session's certificate step does this later, with
+            the held-out recordings.
     """
     from calib.procedure.dynamic_stage.folder import UnseenFolder
     from calib.procedure.report import dynamics_section

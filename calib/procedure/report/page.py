@@ -1,4 +1,4 @@
-"""Elements of a report as values (tables, texts, pictures, sections), and their printing by rich.
+"""Elements of a report as values (tables, texts, pictures, sections), and their output on the console by rich.
 
 Report and certificate show the same values as HTML and PDF; this module does not depend on robots.
 """
@@ -28,10 +28,11 @@ class ReportTable:
     Attributes:
         title: title of the table.
         header: names of the columns.
-        rows: cells of each row; a row of one cell is a heading over the rows that follow.
+        rows: cells of each row; a row with one cell is a heading above the next rows.
         note: explanation for the reader.
         strong: indices of the rows in bold.
         numbers: indices of the right-aligned columns.
+        kind: name of the kind of block, for the templates.
     """
 
     title: str
@@ -47,14 +48,20 @@ class ReportTable:
 
 
 class RecordColumn(NamedTuple):
-    """A column of a table of records: name, format of a cell (``{0.sigma:.2g}``), and alignment."""
+    """A column of a table of records.
+
+    Attributes:
+        name: name of the column.
+        cell: format of a cell (``{0.sigma:.2g}``), or function that returns the text for a record.
+        number: whether the column is right-aligned.
+    """
 
     name: str
     cell: str | Callable[..., str]
     number: bool = True
 
     def of(self, record: object) -> str:
-        """Return the text of a record's cell."""
+        """Return the text in this column for a record."""
         if isinstance(self.cell, str):
             return self.cell.format(record)
         return self.cell(record)
@@ -72,7 +79,16 @@ def table(
     strong: Callable[..., bool] = _never,
     most: int | None = None,
 ) -> ReportTable:
-    """Return a table of records, one row per record up to `most`, with the `strong` ones in bold."""
+    """Return a table with one row per record.
+
+    Args:
+        title: title of the table.
+        columns: the columns.
+        records: the records.
+        note: explanation for the reader.
+        strong: function of a record that returns whether its row is bold.
+        most: largest number of rows; None: all records.
+    """
     if most is not None and len(records) > most:
         note = f"{note} {len(records) - most} more in metrics.json."
         records = records[:most]
@@ -95,7 +111,16 @@ def grouped(
     strong: Callable[[Sequence[str]], bool] = _never,
     texts: int = 1,
 ) -> ReportTable:
-    """Return a table of rows under headings, with the `strong` rows in bold; the first `texts` columns are text."""
+    """Return a table with groups of rows under headings.
+
+    Args:
+        title: title of the table.
+        header: names of the columns.
+        groups: heading -> rows.
+        note: explanation for the reader.
+        strong: function of a row that returns whether the row is bold.
+        texts: number of left-aligned text columns at the left; the other columns are right-aligned.
+    """
     rows: list[Sequence[str]] = []
     for heading, group in groups.items():
         rows.append((heading,))
@@ -105,7 +130,7 @@ def grouped(
 
 
 def shortened(text: str, max_letters: int) -> str:
-    """Return a text, cut at a word with an ellipsis if it is longer than `max_letters`."""
+    """Return a text, cut between words and ended by an ellipsis if it is longer than `max_letters`."""
     if len(text) <= max_letters:
         return text
     words, *_ = text[: max_letters - 1].rsplit(" ", 1)
@@ -114,7 +139,14 @@ def shortened(text: str, max_letters: int) -> str:
 
 @dataclass(frozen=True)
 class Text:
-    """A list of sentences; on the console each is printed with `label` in front, or marked as a warning."""
+    """A list of sentences.
+
+    Attributes:
+        title: title above the sentences; empty: none.
+        lines: the sentences; a `Note` may be a warning.
+        label: word before each sentence on the console; a warning has ``warning`` instead.
+        kind: name of the kind of block, for the templates.
+    """
 
     title: str
     lines: Sequence[str | Note]
@@ -127,8 +159,13 @@ class Text:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure as PNG or SVG; a wide one uses the full width of the page; `chart` is the chart it shows; None:
-    unknown.
+    """A figure as PNG or SVG.
+
+    Attributes:
+        image: content of the PNG or SVG file.
+        caption: caption of the figure.
+        wide: whether the figure uses the full width of the page.
+        chart: the chart from which the figure was drawn; None: unknown.
     """
 
     image: bytes
@@ -139,7 +176,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Pictures:
-    """Figures side by side."""
+    """Figures that are shown side by side."""
 
     title: str
     pictures: Sequence[Picture]
@@ -150,7 +187,13 @@ class Pictures:
 
 
 def pictures(title: str, figures: Mapping[str, Picture], names: Iterable[str]) -> Pictures:
-    """Return those of the figures that have these names, side by side."""
+    """Return the figures with the given names, to be shown side by side; absent figures are left out.
+
+    Args:
+        title: title above the figures.
+        figures: name -> figure.
+        names: names of the figures to show.
+    """
     return Pictures(title, [figures[name] for name in names if name in figures])
 
 
@@ -159,15 +202,15 @@ Block = ReportTable | Text | Pictures
 
 @dataclass(frozen=True)
 class KeyFigure:
-    """A number on which a verdict is based.
+    """A number on which a verdict is based, as text.
 
     Attributes:
         quantity: name of the quantity.
-        before, after: its value for the nominal and for the calibrated robot, with unit.
-        spread: its standard error.
-        basis: number of poses or motions it was computed from, and whether they are unseen.
-        allowed: the tolerance; empty without one.
-        met: whether the tolerance is met, as text.
+        before, after: value for the nominal and for the calibrated robot, with unit.
+        spread: standard error of the value.
+        basis: number of poses or motions from which the value was computed, and whether they were held out.
+        allowed: the tolerance; empty: no tolerance is shown.
+        met: whether the tolerance is met.
     """
 
     quantity: str
@@ -180,7 +223,7 @@ class KeyFigure:
 
 
 def met(value: float, tolerance: float) -> str:
-    """Return whether a value is within a tolerance, in a word; empty without a tolerance (0)."""
+    """Return ``yes`` or ``NO``: whether a value is within a tolerance; empty without a tolerance (0)."""
     if not tolerance:
         return ""
     return "yes" if value <= tolerance else "NO"
@@ -188,7 +231,15 @@ def met(value: float, tolerance: float) -> str:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report; a judged section has a verdict (pass, marginal, fail), a reason and key figures."""
+    """A part of a report.
+
+    Attributes:
+        title: title of the section.
+        blocks: tables, texts and pictures.
+        verdict, reason: level of the verdict (pass, marginal, fail) and its reason; empty for sections that are not on
+            a judged result.
+        figures: numbers on which the verdict is based.
+    """
 
     title: str
     blocks: Sequence[Block]
@@ -198,7 +249,7 @@ class Section:
 
 
 def relative_sigma(percent: float | None) -> str:
-    """Return an RSD [%] with two digits as text; empty if None or too large."""
+    """Return a relative standard deviation `percent` [%] as text; empty if it is None or above `MAX_PRINTED_RSD`."""
     if percent is None or percent > MAX_PRINTED_RSD:
         return ""
     if percent >= 10:
@@ -207,7 +258,7 @@ def relative_sigma(percent: float | None) -> str:
 
 
 def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
-    """Yield each block as a rich renderable, without pictures and empty blocks."""
+    """Yield each table and text as a rich renderable; pictures and empty blocks are left out."""
     for block in blocks:
         if not len(block):
             continue
@@ -226,7 +277,10 @@ def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
 
 
 def single_colons(line: str) -> str:
-    """Return a line without doubled colons: a recording cut as ``log.npz@10:`` ends with a colon of its own."""
+    """Return a line in which a single colon replaces a doubled one.
+
+    The name of a recording cut as ``log.npz@10:`` ends with a colon.
+    """
     return line.replace(":: ", ": ")
 
 
@@ -252,7 +306,7 @@ def _rich_table(table: ReportTable) -> RichTable:
 
 
 def section(section: Section) -> Iterator[RenderableType]:
-    """Yield the verdict of a section with its reason, then its blocks, as rich renderables."""
+    """Yield, as rich renderables, the verdict of a section with its reason, and then the section's content."""
     if section.verdict:
         style = f"bold {COLOURS[section.verdict]}"
         yield RichText.assemble("verdict: ", (section.verdict, style), f": {section.reason}")

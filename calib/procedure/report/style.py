@@ -1,6 +1,7 @@
-"""Common style of all figures: one palette that is legible in greyscale, light axes, PNG with a palette.
+"""Common style of all figures: colours that are distinguishable in greyscale, light axes, PNG with a colour palette.
 
-Margins are matplotlib's constrained layout; text is never read as mathematics, so that a ``$`` in a name is a ``$``.
+Margins are those of matplotlib's constrained layout. Text is never interpreted as mathematics, so that a ``$`` in a
+name is printed as a ``$``.
 """
 
 import io
@@ -68,7 +69,11 @@ STYLE: "dict[RcKeyType, str | float | bool]" = {
 
 @contextmanager
 def styled(quiet_titles: bool = False) -> Iterator[None]:
-    """Apply the common style within a context, then restore matplotlib's settings; `quiet_titles` makes them small."""
+    """Apply the common figure style within a context, and restore matplotlib's settings afterwards.
+
+    Args:
+        quiet_titles: whether the titles of panels are small.
+    """
     settings = dict(STYLE)
     if quiet_titles:
         settings |= {"axes.titleweight": "normal", "axes.titlesize": 7.5}
@@ -77,7 +82,7 @@ def styled(quiet_titles: bool = False) -> Iterator[None]:
 
 
 class ShownFigure(Figure):
-    """A figure that a notebook shows without pyplot."""
+    """A matplotlib figure that a notebook shows as PNG without pyplot."""
 
     def _repr_png_(self) -> bytes:
         return png(self)
@@ -100,7 +105,7 @@ def sheet(
 
 
 def log_axis(axis: XAxis | YAxis, low: float, high: float, most: int = 7) -> None:
-    """Make an axis logarithmic from `low` to `high`, with at most about `most` ticks: 1, 2, 5 or powers of ten."""
+    """Make an axis logarithmic from `low` to `high`, with about `most` ticks at most: 1, 2, 5 or powers of ten."""
     axis.axes.set(**{f"{axis.axis_name}scale": "log", f"{axis.axis_name}lim": (low, high)})
     steps = (1.0, 2.0, 5.0) if high < 100.0 * low else (1.0,)
     locator = LogLocator(subs=steps, numticks=most)
@@ -108,7 +113,7 @@ def log_axis(axis: XAxis | YAxis, low: float, high: float, most: int = 7) -> Non
 
 
 def tick_text(value: float, _: object) -> str:
-    """Return the text of a tick, as a formatter of matplotlib."""
+    """Return the label of a tick at `value`; matplotlib calls this function as a formatter."""
     return number(value)
 
 
@@ -116,7 +121,7 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float) -> str:
-    """Return the text of a tick: a plain number from 0.001 to 10 000, else a power of ten."""
+    """Return `value` as the label of a tick: plain from about 0.001 to 100 000, otherwise with a power of ten."""
     if value == 0.0 or 0.99e-3 < abs(value) < 0.99e5:
         return f"{value:g}"
     digits, power = f"{value:.0e}".split("e")
@@ -129,7 +134,13 @@ def number(value: float) -> str:
 
 
 def legend(figure: Figure, axes: Axes | None, title: str) -> None:
-    """Draw the figure's title in its upper left corner, and the legend of `axes` in the upper right one."""
+    """Draw a title in the figure's upper left corner, and the legend of `axes` in the upper right corner.
+
+    Args:
+        figure: the figure.
+        axes: axes with the labelled curves; None: no legend.
+        title: the title.
+    """
     width, height = figure.get_size_inches()
     figure.text(0.1 / width, 1.0 - 0.06 / height, title, va="top", fontsize=9.0, fontweight="bold")
     if axes is not None:
@@ -147,8 +158,9 @@ def legend(figure: Figure, axes: Axes | None, title: str) -> None:
 
 
 def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a long curve reduced to the minimum and maximum of each of `STRETCHES` intervals, so that all peaks are
-    kept.
+    """Return a curve with fewer points, of which all peaks remain.
+
+    The points are the minimum and maximum of each of `STRETCHES` intervals.
 
     Args:
         t: (N,) times [s].
@@ -166,7 +178,12 @@ def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def png(figure: Figure, dpi: float = DPI) -> bytes:
-    """Return a figure as PNG."""
+    """Return a figure as the content of a PNG file.
+
+    Args:
+        figure: the figure.
+        dpi: resolution [dots per inch].
+    """
     with styled():
         figure.set_dpi(dpi)
         canvas = FigureCanvasAgg(figure)
@@ -184,7 +201,7 @@ def png(figure: Figure, dpi: float = DPI) -> bytes:
 
 
 def svg(figure: Figure) -> bytes:
-    """Return a figure as SVG, letters as outlines: it looks the same wherever it is shown."""
+    """Return a figure as the content of an SVG file, with letters as outlines, so that it does not depend on fonts."""
     # with a fixed salt the same figure is the same file
     with styled(), matplotlib.rc_context({"svg.hashsalt": "calib"}):
         buffer = io.BytesIO()
@@ -193,5 +210,11 @@ def svg(figure: Figure) -> bytes:
 
 
 def save(figure: Figure, path: str | Path, dpi: float = DPI) -> Path:
-    """Write a figure as PNG, completely or not at all."""
+    """Write a figure as PNG; the file is written completely or not at all.
+
+    Args:
+        figure: the figure.
+        path: the PNG file.
+        dpi: resolution [dots per inch].
+    """
     return files.write(path, png(figure, dpi))

@@ -1,4 +1,4 @@
-"""Pages from templates in a common style, with the date and the versions that all of them state."""
+"""HTML pages from templates in a common style, with date and versions, which all pages state."""
 
 from __future__ import annotations
 
@@ -17,31 +17,43 @@ HERE = "calib.procedure.report"  # where the templates of blocks and the style a
 
 @cache
 def versions() -> str:
-    """Return the versions of the toolkit and of the libraries that its results depend on."""
+    """Return a text with the versions of the toolkit, of the libraries on which the results depend, and of Python."""
     names = ("armature-calib", "numpy", "scipy")
     known = ", ".join(f"{name} {metadata.version(name)}" for name in names)
     return f"{known}, Python {platform.python_version()}"
 
 
 def issued(now: datetime | None = None) -> str:
-    """Return date and toolkit version of a page as text."""
+    """Return a text with date and toolkit version, for a page.
+
+    Args:
+        now: the date; None: the current date.
+    """
     when = (now or datetime.now().astimezone()).strftime("%Y-%m-%d %H:%M %Z").strip()
     return f"{when}, armature-calib {metadata.version('armature-calib')}"
 
 
 def read(package: str, file: str) -> str:
-    """Return the text of a file that is shipped in a package."""
+    """Return the text of a file in an installed package."""
     return resources.files(package).joinpath(file).read_text(encoding="utf-8")
 
 
 def filled(package: str, file: str, **values: object) -> str:
-    """Return a package's template, filled with values; it may import ``blocks.html`` and print the common `style`."""
+    """Return a template filled with values.
+
+    Templates may import ``blocks.html`` and print the variable ``style``, which contains the common style sheet.
+
+    Args:
+        package: package that contains the template.
+        file: name of the template.
+        values: values of the template's variables.
+    """
     return _template(package, file).render(**values, style=read(HERE, "style.css"))
 
 
 @cache
 def _template(package: str, file: str) -> jinja2.Template:
-    """Return the compiled template of a file, cached within a process."""
+    """Return the compiled template in a file of a package; templates are cached within a process."""
     import jinja2  # slow to load, and not needed to write the rest
 
     loader = jinja2.FunctionLoader(lambda name: read(HERE, name))

@@ -1,4 +1,4 @@
-"""The certificate of a session: the results of geometry and dynamics, read from the session's folders."""
+"""The certificate of a session, on the results of geometry and dynamics that are read from the session's folders."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -8,7 +8,7 @@ from calib import files
 from calib.data.poses import CORNERS, JOINTS
 from calib.errors import command_line
 from calib.extensions import Point
-from calib.folders import CERTIFICATE, ESTIMATE, METRICS, PAGES, REPORT
+from calib.folders import CERTIFICATE, ESTIMATE, METRICS, PAGES, REPORT, read_estimate
 from calib.procedure.excitation import coefficients
 from calib.procedure.export.delivery import prediction
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
@@ -57,7 +57,7 @@ TORQUES = {
 
 
 def certify(session: Session, say: Say) -> list[str]:
-    """Write certificate and report of a session, and return its notes."""
+    """Write certificate and report of a session, and return notes for the user."""
     say("drawing" if session.plots else "writing")
     certificate, report = pages(session)
     judged = [section for section in report.sections if section.verdict]
@@ -68,7 +68,7 @@ def certify(session: Session, say: Say) -> list[str]:
 
 
 def pages(session: Session) -> tuple[Certificate, Page]:
-    """Return certificate and report of a session."""
+    """Return certificate and report of a session as records, which are rendered as HTML and PDF."""
     stages = []
     metrics = None
     if session.geometric:
@@ -92,7 +92,7 @@ def pages(session: Session) -> tuple[Certificate, Page]:
 
 
 def _geometry(session: Session, report: fit_report.Report) -> StageRecord:
-    """Return the stage of the geometry, with figures if the session draws any."""
+    """Return the content of report and certificate on the geometry; with figures if the session draws figures."""
     figures = {}
     if session.plots:
         from calib.procedure.report.charts import pictures
@@ -103,7 +103,10 @@ def _geometry(session: Session, report: fit_report.Report) -> StageRecord:
 
 
 def _dynamics(session: Session) -> StageRecord:
-    """Return the stage of the dynamics, with figures if the session draws any, judged on the exported robot."""
+    """Return the content of report and certificate on the dynamics of a session.
+
+    The verdict is that on the exported robot.
+    """
     from calib.procedure.report import dynamics_section
 
     report = dynamics_section.read(session.identification.path)
@@ -120,7 +123,9 @@ def _dynamics(session: Session) -> StageRecord:
     predicted = prediction(session.path(session.export))
     delivered = None if predicted is None else predicted.exported
     exported = read_state(session).notes("export")
-    section = dynamics_section.report_section(report, figures, exported, allowed, delivered)
+    tolerances = session.settings.dynamics.tolerance_torque
+    joint_count = len(chain_of(session).joints)
+    section = dynamics_section.report_section(report, figures, exported, allowed, delivered, tolerances, joint_count)
     verdict = session.verdicts().stages["dynamics"]
     section = replace(section, verdict=verdict.level, reason=verdict.reason)
     stage = dynamics_pages.stage(report, section, session.plots, allowed)
@@ -128,7 +133,7 @@ def _dynamics(session: Session) -> StageRecord:
 
 
 def _validated_report(session: Session) -> fit_report.Report:
-    """Return the report of the fit, including the results of the step validate."""
+    """Return the report on a session's fit, including the results of the step ``validate``."""
     validation = session.validation
     metrics = validation.metrics()
     if metrics.schema >= SCHEMA:
@@ -142,7 +147,7 @@ def _validated_report(session: Session) -> fit_report.Report:
 
 
 def _unchecked(session: Session) -> Iterator[str]:
-    """Yield texts on what the whole session cannot prove."""
+    """Yield texts on the properties that the session as a whole cannot prove."""
     unchecked = _session_plan(session).unchecked if session.geometric else ()
     if unchecked:
         yield f"when poses were chosen: {', '.join(unchecked)}"
@@ -157,7 +162,13 @@ def _unchecked(session: Session) -> Iterator[str]:
 
 
 def _arrival_notes(session: Session, folder: str, step: str) -> list[str]:
-    """Return the notes made when the files were read: training files, and the unseen files of a step."""
+    """Return the notes on measured files that were made when the files were read.
+
+    Args:
+        session: the session.
+        folder: folder of the training files: ``3-measured`` or ``7-recorded``.
+        step: name of the step that read the held-out files.
+    """
     lines = read_lines(session.path(f"{folder}/{CHECKED}"))
     unseen = session.brought("validation" if folder == "3-measured" else "unseen")
     prefixes = tuple(f"{path.name}: " for path in unseen)
@@ -167,7 +178,12 @@ def _arrival_notes(session: Session, folder: str, step: str) -> list[str]:
 
 
 def _with_arrival(stage: StageRecord, lines: list[str]) -> StageRecord:
-    """Return a stage whose section of the report has the missing notes on its input files, too."""
+    """Return the content on a stage, with notes on input files added to the report section.
+
+    Args:
+        stage: content of report and certificate on the stage.
+        lines: the notes; those that the section already contains are omitted.
+    """
     blocks = stage.section.blocks
     present: set[str] = set()
     for block in blocks:
@@ -179,7 +195,12 @@ def _with_arrival(stage: StageRecord, lines: list[str]) -> StageRecord:
 
 
 def _setup(session: Session, metrics: FitMetrics | None) -> list[Entry]:
-    """Return the entries on robot, instrument and method, for the stages that the session has."""
+    """Return certificate entries on robot, instrument and method, for the stages of the session.
+
+    Args:
+        session: the session.
+        metrics: metrics of the fit; None: no fit.
+    """
     settings, chain = session.settings, chain_of(session)
     description = settings.robot.given
     if metrics is None:
@@ -206,11 +227,13 @@ def _setup(session: Session, metrics: FitMetrics | None) -> list[Entry]:
         allowed = "none given: pass below 10 %"
         if section.tolerance_percent:
             allowed = f"{section.tolerance_percent:g} % on unseen motion"
-        payloads = ", ".join(f"{label} {payload}" for label, payload in section.payloads.items())
+        joint_tolerances = ", ".join(f"{tolerance:g}" for tolerance in section.tolerance_torque)
+        payloads = ", ".join(_payloads(session))
         rows += [
             ("recordings", _names(session.brought("training", "unseen"))),
             ("torques", TORQUES[section.torques]),
             ("tolerance of torque", allowed),
+            ("tolerance of joints' torques, rms", joint_tolerances and f"{joint_tolerances} N m or N"),
             ("payloads", payloads),
         ]
     rows += [
@@ -222,7 +245,12 @@ def _setup(session: Session, metrics: FitMetrics | None) -> list[Entry]:
 
 
 def _instrument(session: Session, metrics: FitMetrics) -> str:
-    """Return a text on the instrument: kind of measurement (as given, and as used) and sigmas."""
+    """Return a text on a session's instrument: name, measured quantity (as stated, and as used), and σ.
+
+    Args:
+        session: the session.
+        metrics: metrics of the fit, which state the measured quantities that were used.
+    """
     instrument = session.settings.instrument
     with_orientation = metrics.fit.calibrated.orientation_deg is not None
     measures = f"measures {instrument.measures}"
@@ -235,17 +263,36 @@ def _instrument(session: Session, metrics: FitMetrics) -> str:
         sigma = f"σ {1e6 * instrument.sigma_position:g} µm"
     if instrument.sigma_orientation:
         sigma += f", {1e3 * instrument.sigma_orientation:g} mrad"
+    if instrument.reference:
+        sigma += ", seen from a frame on the base that was measured with every row"
     return f"{instrument.name}, {measures}, {sigma}"
 
 
+def _payloads(session: Session) -> Iterator[str]:
+    """Yield for each payload of a session its label, what was stated of it, and its identified mass."""
+    identified = {}
+    if session.settings.dynamics.payloads and (session.identification.path / ESTIMATE).exists():
+        identified = {row.name: row for row in read_estimate(session.identification.path)}
+    for label, payload in session.settings.dynamics.payloads.items():
+        text = f"{label} {payload}"
+        mass = identified.get(f"M{label}")
+        if mass is not None:
+            sigma = f" ± {mass.sigma:.2g}" if mass.sigma else ""
+            text += f" (identified: {mass.value:.4g}{sigma} kg)"
+        yield text
+
+
 def _names(paths: list[Path]) -> str:
-    """Return the file names as one text, without dates, since copying changes a file's date."""
+    """Return the names of the files `paths` as one text.
+
+    Dates are omitted, since copying changes the date of a file.
+    """
     return ", ".join(path.name for path in paths)
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """The content of ``selection.json``: how the poses were chosen, the checked limits, and the limits not checked."""
+    """The content of ``selection.json``: how the poses were selected, as text, and the checked and unchecked limits."""
 
     words: str = "chosen by hand"
     checked: tuple[str, ...] = ()
@@ -260,7 +307,11 @@ def _session_plan(session: Session) -> _Plan:
 
 
 def _filed(paths: list[Path]) -> list[Path]:
-    """Return the measured files to archive; an image folder is represented by its file of detected corners."""
+    """Return the measured files for the certificate's list; the file of detected corners represents an image folder.
+
+    Args:
+        paths: the measured files.
+    """
     archived = []
     joints = []
     for path in paths:
@@ -275,7 +326,10 @@ def _filed(paths: list[Path]) -> list[Path]:
 
 
 def listed(session: Session) -> list[FileRow]:
-    """Return name, content, size [bytes] and SHA-256 of the certificate's files, the most important ones first."""
+    """Return name, role, size [bytes] and SHA-256 of the files in a session's certificate.
+
+    The most important files are first.
+    """
     judged_files = {}
     if session.path(VERDICT).exists():
         judged_files = read_json(session.path(VERDICT)).get("files", {})
@@ -309,7 +363,7 @@ def listed(session: Session) -> list[FileRow]:
 
 
 def _archive(session: Session) -> list[Path]:
-    """Return the files that the certificate lists, the most important ones first."""
+    """Return the paths of the files that a session's certificate lists, the most important ones first."""
     exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
     exported.sort(key=lambda path: path.name != URDF)
     paths = [*exported[:1], session.robot_file]
@@ -350,7 +404,7 @@ STEP = SessionStep(
         StepSetting("instrument"),
         StepSetting("poses"),
         StepSetting("fit"),
-        StepSetting("dynamics", ("torques", "payloads", "tolerance_percent")),
+        StepSetting("dynamics", ("torques", "payloads", "tolerance_percent", "tolerance_torque")),
         StepSetting("certificate"),
     ),
 )

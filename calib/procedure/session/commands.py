@@ -1,10 +1,11 @@
-"""The guided procedure of the commands `calib new`, `calib next`, `calib status` and `calib redo`.
+"""The guided procedure behind the commands `calib new`, `calib next`, `calib status` and `calib redo`.
 
-A waiting session prints two lines: what to do at the robot, and which file to provide in which format.
+A waiting session prints two texts: the task at the robot, and the file to provide with its format.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 from rich.console import RenderableType
@@ -20,6 +21,7 @@ from calib.data.poses import IMAGES
 from calib.errors import UsageError, command_line, require
 from calib.folders import CERTIFICATE, PAGES, SESSION
 from calib.geometry.observability import targets_of
+from calib.procedure.dynamic_stage.computed_torque import check_tolerances
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import CORRECTED_URDF, TERMS, URDF
@@ -28,7 +30,7 @@ from calib.procedure.measuring.pose_limits import read_limits, tables_of
 from calib.procedure.report import page
 from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import steps
-from calib.procedure.session.dynamics_steps import unrecorded_payloads
+from calib.procedure.session.dynamics_steps import pick_motion, picked_front, unrecorded_payloads
 from calib.procedure.session.folder import POSES, UNSEEN, WAYS, Say, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
@@ -51,7 +53,12 @@ MEASURED_FILES = {POSES: "measured.csv", UNSEEN: "validation_measured.csv"}
 
 
 def asks(session: Session, state: State) -> tuple[str, str]:
-    """Return the task at the robot, a line for each part of it, and the file to provide, with the file's format."""
+    """Return two texts for a session that waits: the task at the robot, and the file to provide with its format.
+
+    Args:
+        session: the session.
+        state: status of the step that waits.
+    """
     step, next_command = state.step.name, command_line("next", session.folder)
     if state.kind == WAITING and step in ("record", "predict"):
         task, file = _to_record(session, step)
@@ -59,11 +66,16 @@ def asks(session: Session, state: State) -> tuple[str, str]:
         task, file = _to_measure(session, step)
     else:
         return f"step {step} needs {state.words}", f"put it into {session.folder} and run {next_command} again"
-    return task, f"Bring {file}; then: {next_command}"
+    return task, f"Provide {file}; then: {next_command}"
 
 
 def _to_measure(session: Session, step: str) -> tuple[str, str]:
-    """Return what to measure at the robot, and the files of measurements or images to provide."""
+    """Return two texts: the poses to measure at the robot, and the files of measurements or images to provide.
+
+    Args:
+        session: the session.
+        step: the step that waits: ``measure``, or the step for validation poses.
+    """
     settings, joints = session.settings, chain_of(session).joint_names
     instrument, images = settings.instrument, settings.instrument.measures == IMAGES
     lists = [POSES] if step == "measure" else [UNSEEN]
@@ -92,15 +104,21 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
             f"[deg] … {joints[-1]} [deg]; one row per image), board.toml (calib board makes boards), and camera.yaml "
             "if the lens is known (calib formats images)"
         )
+    base_frame = ""
+    if instrument.reference:
+        base_frame = " and, at the same time, the frame on the base"
     task = _numbered(
         f"Drive {poses}; at each let the arm settle.",
-        f"Measure the target's {instrument.measures} with the {instrument.name} and log the joint angles read back.",
+        f"Measure the target's {instrument.measures}{base_frame} with the {instrument.name} "
+        "and log the joint angles read back.",
         "At the end, measure the first three again to check for drift (optional, into drift.csv).",
     )
     columns = [f"{joint} [deg]" for joint in joints]
     columns += ["x [mm]", "y [mm]", "z [mm]"]
     if instrument.measures == "pose":
         columns += ["qx", "qy", "qz", "qw"]
+    if instrument.reference:
+        columns += ["base_x [mm]", "base_y [mm]", "base_z [mm]", "base_qx", "base_qy", "base_qz", "base_qw"]
     return task, (
         f"{' and '.join(files)}, one row per pose: {', '.join(columns)} (calib formats measurements), "
         "or joints and points apart, by calib join"
@@ -108,7 +126,12 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
 
 
 def _planned_poses(session: Session, lists: Sequence[str]) -> list[str]:
-    """Return for each list of planned poses that exists its number of poses, its file, and programs of it."""
+    """Return a text on each existing list of planned poses: number of poses, file, and robot programs.
+
+    Args:
+        session: the session.
+        lists: file names of the lists in ``2-poses``.
+    """
     if not session.settings.poses.plan:
         return []
     planned = []
@@ -132,7 +155,12 @@ def _numbered(*parts: str) -> str:
 
 
 def _to_record(session: Session, step: str) -> tuple[str, str]:
-    """Return which motions to play, and the logs to provide."""
+    """Return two texts: the motions to play, and the logs to provide.
+
+    Args:
+        session: the session.
+        step: the step that waits: ``record``, or the step for the validation motion.
+    """
     section, joints = session.settings.dynamics, chain_of(session).joints
     names = []
     missing = unrecorded_payloads(session) if step == "record" else []
@@ -165,7 +193,13 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
 
 
 def _to_play(session: Session, names: Sequence[str], payloads: Sequence[str]) -> str:
-    """Return how to play the designed motions of these names, and again with each payload of these labels."""
+    """Return a text that explains how to play designed motions.
+
+    Args:
+        session: the session.
+        names: names of the motions, which are folders in ``6-excitation``.
+        payloads: labels of payloads with which the motions are played again.
+    """
     section = session.settings.dynamics
     file = RUN if section.repeats > 1 else SAMPLES
     motions = " and, into a separate file, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
@@ -198,7 +232,14 @@ COLOURS = {
 
 @dataclass(frozen=True)
 class _Stop:
-    """Result of `go_on`: the waiting step, instructions as lines, and the verdict if the session is complete."""
+    """Result of `go_on`.
+
+    Attributes:
+        session: the session.
+        waiting: status of the step that waits for the user; None: the session is complete.
+        lines: instructions for the user.
+        verdict: level of the session's verdict; empty while the session is not complete.
+    """
 
     session: Session
     waiting: State | None
@@ -222,29 +263,31 @@ def new_session(
     seed: int = 0,
     program: str = "",
     tolerance_mm: float = 0.0,
+    reference: bool = False,
     certificate: Mapping[str, object] | None = None,
     **motion: object,
 ) -> Path:
-    """Create the folder of a guided session for a robot, like `calib new`.
+    """Create the folder of a guided session for a robot, like the command `calib new`.
 
     Args:
         folder: new folder.
-        robot, base, tip: as of `calib.load`.
+        robot, base, tip: arguments of `calib.load`.
         instrument: ``cmm``, ``tracker``, ``tracker6d``, ``mocap``, ``camera``, ``other-pose``, ``other-position``, or
-            ``none``: identify the dynamics only, on the geometry of the robot's description.
-        poses, validation: number of poses to choose for the fit, and of poses to measure for validation only.
-        tool: (3,) approximate position of the target in the tip's frame [m]; None: the tip.
-        limits: TOML file of limits for both poses and motions (``calib formats limits``), or its tables; None:
-            defaults.
+            ``none``: only the dynamics are identified, on the geometry of the robot's description.
+        poses, validation: number of poses to select for the fit, and number of held-out poses for the validation.
+        tool: (3,) approximate position of the target in the tip's frame [m]; None: default of ``session.toml``.
+        limits: TOML file of limits for both poses and motions (``calib formats limits``), or its content as tables;
+            None: defaults.
         dynamics: whether to identify the dynamics, too.
         seed: seed of all random numbers.
-        program: controller in whose language the poses are written, too (`calib program --list`); empty: none.
-        tolerance_mm: largest accepted rms on unseen poses [mm]; 0: none.
-        certificate: keys of ``[certificate]``: entries of the certificate besides results.
+        program: robot controller in whose language the poses are written, too (`calib program --list`); empty: none.
+        tolerance_mm: largest accepted rms on held-out poses [mm]; 0: none.
+        reference: whether a frame on the robot's base is measured beside the target.
+        certificate: keys of ``[certificate]``: entries of the certificate besides results; None: all are empty.
         motion: other keys of ``[dynamics]`` (``calib formats session``): torques, payloads, period …
 
     Returns:
-        The folder; its ``session.toml`` states the settings of the session.
+        The folder, whose ``session.toml`` contains the settings of the session.
 
     Raises:
         UsageError: if the folder is in use, or a value is not valid.
@@ -256,6 +299,12 @@ def new_session(
     chain = load(robot, base or None, tip or None)
     if program:
         check_controller(program, chain.n)
+    of_instrument: dict[str, object] = asdict(device) | {"reference": reference}
+    if tool is not None:
+        of_instrument["tool"] = [*map(float, tool)]
+    tolerances = motion.get("tolerance_torque", ())
+    if isinstance(tolerances, Sequence):
+        check_tolerances(tolerances, chain.n)
     copied, named = _limits(limits, chain, source, dynamics)
     table = {
         "name": chain.name,
@@ -263,7 +312,7 @@ def new_session(
         "seed": seed,
         "fit": {"tolerance_mm": tolerance_mm},
         "robot": {"file": source.name, "given": str(robot), "base": base, "tip": tip, "controller": program},
-        "instrument": asdict(device) | ({} if tool is None else {"tool": [*map(float, tool)]}),
+        "instrument": of_instrument,
         "poses": {"fit": poses, "validation": validation, "constraints": named},
         "dynamics": {"wanted": dynamics, "limits": named, **motion},
         "certificate": dict(certificate or {}),
@@ -275,7 +324,16 @@ def new_session(
 def _limits(
     limits: str | Path | Mapping[str, object] | None, chain: Chain, source: Path, motions: bool
 ) -> tuple[dict[str, Path | str], str]:
-    """Return the files of the given limits (name -> path or text) after checking them, and the limits file's name."""
+    """Return the files with limits that the session needs (name -> path or text), and the name of the limits file.
+
+    The limits are checked by reading them.
+
+    Args:
+        limits: file, folder or tables with limits; None: defaults, which yields no file and an empty name.
+        chain: the arm.
+        source: file of the robot.
+        motions: whether the limits are also used for motions.
+    """
     if limits is None:
         return {}, ""
     if isinstance(limits, str):
@@ -297,18 +355,25 @@ def _limits(
     return {LIMITS: f"{LIMITS_HEAD}{dumps(tables)}", **files}, LIMITS
 
 
-def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> _Stop:
+def go_on(
+    folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True, pick: int = 0
+) -> _Stop:
     """Run all steps whose inputs exist, and return the step that waits for input, with instructions.
 
     Args:
         folder: folder of the session.
-        say, progress: functions that print permanent lines, and progress messages.
-        command: name of the command for the record.
-        again: name of a step to repeat, with all steps that depend on it; empty: none.
+        say, progress: functions that print permanent lines and progress messages.
+        command: the running command, to be recorded in the session.
+        again: name of a step to repeat, together with all steps that depend on it; empty: no step.
         plots: whether to draw figures.
+        pick: number of the front's motion that becomes the training motion; 0: none.
     """
     session = open_session(folder, plots)
     with locked(session, say):
+        if pick:
+            step = steps.find(session, "excite")
+            make = partial(pick_motion, picked_front(session, pick))
+            steps.run_instead(session, step, make, say, progress, command)
         if again:
             steps.forget(session, steps.find(session, again))
         state = steps.run_next(session, say, progress, command)
@@ -318,7 +383,7 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
 
 
 def _ending(session: Session) -> tuple[str, ...]:
-    """Return the closing lines of a complete session: the verdict, where certificate and robot are."""
+    """Return the closing lines for a complete session: the verdict, and the paths of certificate and robot."""
     first, *further_pages = PAGES
     page = f"{session.path(first)} ({', '.join(further_pages)})"
     verdicts, further = session.verdicts(), promised(session)
@@ -334,7 +399,11 @@ def _ending(session: Session) -> tuple[str, ...]:
 
 
 def status_lines(folder: Path) -> Iterator[RenderableType]:
-    """Yield the status of every step of a session, and the next command."""
+    """Yield lines on the status of every step of a session, and on the next task or command.
+
+    Args:
+        folder: folder of the session.
+    """
     session = open_session(folder)
     settings, states = session.settings, steps.states(session)
     pending = [state for state in states if state.kind not in (DONE, KEPT)]
@@ -354,7 +423,7 @@ def status_lines(folder: Path) -> Iterator[RenderableType]:
 
 
 def noted(folder: Path) -> list[str]:
-    """Return the notes of each completed step of a session."""
+    """Return the notes of all completed steps of the session in a folder, each beginning with the step's name."""
     lines = []
     for name, record in read_state(open_session(folder)).steps.items():
         lines += [f"  {name}: {note}" for note in record.notes]

@@ -1,13 +1,15 @@
-"""Drift of instrument, base or tool during a measurement, from poses measured more than once.
+"""Drift of instrument, base or tool during a measurement, computed from poses that were measured more than once.
 
-Two figures, of which a session says the first at once: how far repeated poses are apart (by the nominal arm, what
-differing joints explain subtracted by magnitude), and, where the file has a column of time or temperature, the trend:
-with p the measured points less what the placed nominal arm predicts, each pose's mean taken out of p and of x,
+Two figures are computed. The first is the rms distance between repeated measurements of a pose; the part that differing
+joint values explain by the nominal arm is subtracted by magnitude. The second, if the file has a column of time or
+temperature x, is the trend of the target's position with x. Let p be the measured points minus the points predicted by
+the placed nominal arm; p̃ and x̃ are p and x minus their means over the visits of each pose. Then
 
     p̃ = s x̃ + noise,   s = Σ x̃ p̃ / Σ x̃²,   σ² = Σ |p̃ - s x̃|² / dof,   dof = 3 (visits - poses - 1)
 
-per axis alike; whether s differs from 0, Σ x̃² |s|² / 3 σ² says by its F distribution. A translation of the target is
-what a base or a tracker that moves does; arms that warm up also grow by pose, which this averages.
+with equal noise σ per axis. The F distribution of Σ x̃² |s|² / 3 σ² determines whether s differs from 0. A moving base
+or tracker translates the target equally at all poses. A warming arm also grows, which affects each pose differently;
+the trend is the average over the poses.
 """
 
 from __future__ import annotations
@@ -43,15 +45,19 @@ class Drift:
     """Differences between two measurements of the same poses.
 
     Attributes:
-        poses: pairs of measurements.
-        rms: rms distance of the measured points, minus the displacement by differing joint values [m].
+        poses: number of pairs of measurements.
+        rms: rms distance of the two measured points, minus the displacement by differing joint values [m].
     """
 
     poses: int
     rms: float
 
     def exceeds(self, sigma: float) -> bool:
-        """Return whether the differences exceed `MIN_DRIFT_SIGMAS` standard errors at noise `sigma` per axis [m]."""
+        """Return whether the differences are larger than measurement noise explains.
+
+        Args:
+            sigma: σ of a measured position, per axis [m].
+        """
         return self.rms > (MIN_DRIFT_SIGMAS / np.sqrt(self.poses) + 1.0) * noise_of_difference(sigma)
 
 
@@ -61,13 +67,14 @@ class Trend:
 
     Attributes:
         what: name of the column.
-        unit: its unit as shown: h or °C.
-        x: (m,) time from the start, or temperature, of the measurements of repeated poses [unit].
-        moved: (m, 3) measured points minus the arm's prediction and minus each pose's mean [m], in the instrument's
-            frame.
+        unit: unit of the column's values: h or °C.
+        x: (m,) time from the start, or temperature, at the measurements of repeated poses [unit].
+        moved: (m, 3) measured points minus the arm's prediction and minus the mean of each pose [m], in the
+            instrument's frame.
         poses: number of repeated poses.
         span: range of the column over all rows [unit].
-        slope, sigma: (3,) rate of the target's motion, and its standard deviation per axis [m per unit].
+        slope: (3,) rate of the target's motion [m per unit].
+        sigma: standard deviation of the rate, per axis [m per unit].
         sigmas: significance of the slope, as the deviation of a normal variable with the same probability.
     """
 
@@ -83,71 +90,103 @@ class Trend:
 
     @property
     def size(self) -> float:
-        """Size of the slope [m per unit]."""
+        """Length of the slope vector [m per unit]."""
         return float(np.linalg.norm(self.slope))
 
     @property
     def total(self) -> float:
-        """Distance that the target moves over all rows [m]."""
+        """Distance that the target moves over the column's range [m]."""
         return self.size * self.span
 
     def finding(self, need: float) -> Finding:
-        """Return the finding on this trend; `need`: smallest relevant distance [m], 0: unknown."""
+        """Return a finding on this trend.
+
+        Args:
+            need: smallest distance that matters [m]; 0: unknown.
+        """
         rate = f"{1e3 * self.size:.2g} ± {1e3 * self.sigma:.1g} mm/{self.unit}"
         times = self.total / need if need else 0.0
         return finding("target-drifts", sigmas=self.sigmas, times=times, rate=rate, total=self.total, column=self.what)
 
 
 def noise_of_difference(sigma: float) -> float:
-    """Return the rms distance [m] of two points, each measured with `sigma` per axis [m]."""
+    """Return the expected rms distance [m] of two measurements of one point, each with `sigma` per axis [m]."""
     return float(np.sqrt(6.0) * sigma)
 
 
 def of_session(
     session: Session, chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements]
 ) -> list[Finding]:
-    """Return the findings on drift from a session's measurements, when they arrive."""
-    sigma, tolerance = session.settings.instrument.sigma_position, 1e-3 * session.settings.fit.tolerance_mm
+    """Return findings on drift in the measurements of a session.
+
+    Args:
+        session: the session.
+        chain: the nominal arm.
+        blocks: measurements for the fit.
+        again: measurements repeated at the end.
+    """
+    instrument, tolerance = session.settings.instrument, 1e-3 * session.settings.fit.tolerance_mm
+    sigma = instrument.sigma_position
+    if instrument.reference and sigma:
+        sigma = _stated_sigma(blocks) or sigma
     trended = [one.finding(tolerance or noise_of_difference(sigma)) for one in trends(chain, blocks, again, sigma)]
     return [*repeats(chain, blocks, again, sigma), *trended]
+
+
+def _stated_sigma(blocks: Sequence[PoseMeasurements]) -> float:
+    """Return the rms of the positions' stated σ per axis [m], which seen from a base frame grow with the distance.
+
+    0 without stated σ.
+    """
+    squares = [block.sigma.ravel() ** 2 for block in blocks if isinstance(block, Positions) and block.sigma is not None]
+    if not squares:
+        return 0.0
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
 def repeats(
     chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements], sigma: float
 ) -> list[Finding]:
-    """Return findings on drift, from poses measured again at the end, and from poses repeated within a block.
+    """Return findings on drift, from poses measured again at the end, and from poses repeated within a file.
 
     Args:
         chain: the nominal arm.
         blocks: measurements for the fit.
-        again: measurements of files whose name starts with drift.
-        sigma: σ of one position, per axis [m]; 0: unknown, then the drift is stated without a judgement.
+        again: measurements from files whose names start with drift.
+        sigma: σ of one position, per axis [m]; 0: unknown, so that the drift is stated but not judged.
     """
-    pairs = [(later.file, "again at the end", drift_of(chain, later, blocks)) for later in again]
-    pairs += [(block.file, "more than once", drift_of(chain, block)) for block in blocks]
-    return [
-        finding(
-            "poses-moved" if sigma and found.exceeds(sigma) else "poses-repeat",
+    drifts = [(later.file, "again at the end", drift_of(chain, later, blocks)) for later in again]
+    drifts += [(block.file, "more than once", drift_of(chain, block)) for block in blocks]
+    noise = None
+    if sigma:
+        noise = noise_of_difference(sigma)
+    findings = []
+    for file, when, drift in drifts:
+        if drift is None:
+            continue
+        beyond_noise = bool(sigma) and drift.exceeds(sigma)
+        drift_finding = finding(
+            "poses-moved" if beyond_noise else "poses-repeat",
             file=Path(file).name,
             when=when,
-            poses=found.poses,
-            rms=found.rms,
-            noise=noise_of_difference(sigma) if sigma else None,
+            poses=drift.poses,
+            rms=drift.rms,
+            noise=noise,
         )
-        for file, when, found in pairs
-        if found is not None
-    ]
+        findings.append(drift_finding)
+    return findings
 
 
 def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurements] | None = None) -> Drift | None:
-    """Return the drift between measurements and earlier ones of the same poses; None without common poses.
+    """Return the drift between measurements and earlier measurements of the same poses; None without common poses.
 
-    Displacements by differing joint values (nominal arm) are subtracted by magnitude: the instrument frame is unknown.
+    Displacements by differing joint values (nominal arm) are subtracted by magnitude, since the instrument's frame is
+    unknown.
 
     Args:
         chain: the nominal arm.
-        later: measured poses or positions; other kinds are ignored.
-        first: the earlier measurements; None: the earlier rows of `later`.
+        later: measured poses or positions; for other kinds of measurement, the result is None.
+        first: the earlier measurements; None: each row of `later` is compared with the earlier rows of `later`.
     """
     before = [later] if first is None else first
     earlier = [(block, k) for block in before if isinstance(block, Positions) for k in range(len(block))]
@@ -169,14 +208,14 @@ def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurem
 def trends(
     chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements] = (), sigma: float = 0.0
 ) -> list[Trend]:
-    """Return the target's motion with time and with each temperature that the files state; [] without repeated poses.
+    """Return the target's motion with time and with each temperature in the files; empty without repeated poses.
 
     Args:
         chain: the nominal arm.
-        blocks: measured poses or positions; other kinds are ignored. Times are used if all files have a common clock,
-            that is, do not overlap.
+        blocks: measured poses or positions; other kinds are ignored. Times are used only if all files have a common
+            clock, that is, if their time ranges do not overlap.
         again: measurements at the end, from the station of the first block.
-        sigma: σ of one position, per axis [m], a lower limit for the noise; 0: unknown.
+        sigma: σ of one position, per axis [m], a lower bound for the noise; 0: unknown.
     """
     seen = [block for block in blocks if isinstance(block, Positions)]
     seen += [replace(block, station=seen[0].station) for block in again if seen and isinstance(block, Positions)]
@@ -205,12 +244,22 @@ def trends(
 
 
 def _poses(key: np.ndarray) -> np.ndarray:
-    """Return the number of each row's pose (m,): that of the first row near it."""
+    """Return for each row the index (m,) of the first row with the same pose, up to a difference of `SAME`.
+
+    Args:
+        key: (m, k) joint values, and scaled indices of target and station.
+    """
     return np.array([min(near) for near in KDTree(key).query_ball_point(key, SAME, p=np.inf)])
 
 
 def _one_clock(times: Sequence[np.ndarray]) -> bool:
-    """Return whether files follow each other in time; where each counts from its own start they overlap."""
+    """Return whether the time ranges of files do not overlap, so that the files can have one clock.
+
+    They overlap if each file counts from its own start.
+
+    Args:
+        times: times of the rows of each file [s].
+    """
     spans = sorted((each.min(), each.max()) for each in times)
     return all(one[1] <= two[0] for one, two in pairwise(spans))
 
@@ -233,7 +282,12 @@ def _trend(what: str, unit: str, x: np.ndarray, off: np.ndarray, pose: np.ndarra
 
 
 def _columns(path: Path, rows: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
-    """Return time [h] and temperatures [°C] of a file's rows, numbered from 1: name -> unit and values (m,)."""
+    """Return time [h] and temperatures [°C] of a file's rows: column name -> unit and values (m,).
+
+    Args:
+        path: the file.
+        rows: (m,) row numbers, counted from 1.
+    """
     if not path.is_file():
         return {}
     table = read_table(path)
@@ -249,7 +303,12 @@ def _covariates(table: Table) -> Iterator[tuple[str, str, np.ndarray]]:
 
 
 def _seconds(cells: np.ndarray, unit: str) -> np.ndarray | None:
-    """Return times [s] of a column: numbers in a unit of `TIMES`, or dates as ISO 8601 writes them; else None."""
+    """Return the times [s] in a column: numbers in a unit of `TIMES`, or dates in ISO 8601; None for other columns.
+
+    Args:
+        cells: (m,) cells of the column.
+        unit: unit in the column's header.
+    """
     if cells.dtype == float:
         return TIMES[unit] * cells if unit in TIMES and np.isfinite(cells).all() else None
     try:

@@ -1,6 +1,6 @@
-"""Steps of a session for the dynamics: design motions, check recordings, identify, validate on unseen motion.
+"""Steps of a session for the dynamics: design motions, check recordings, identify, validate on held-out motion.
 
-The same functions as `calib excite` and `calib identify`; only the files are the session's.
+The steps call the functions behind `calib excite` and `calib identify` with files in the session's folder.
 """
 
 import re
@@ -17,7 +17,7 @@ from calib.column_changes import Change
 from calib.data.recordings.recording import Recording, parse_cut
 from calib.data.recordings.recording_files import read_recording
 from calib.dynamics.torque_rows import torque_rows
-from calib.errors import CalibError, Finding, finding, refuse_data
+from calib.errors import CalibError, Finding, UsageError, command_line, finding, refuse_data, require
 from calib.identification.checks.recorded_motion import (
     EDGE_TIME,
     DesignedMotion,
@@ -29,10 +29,12 @@ from calib.identification.checks.recorded_motion import (
 from calib.identification.identify_options import FileSettings, IdentifyOptions, read_options
 from calib.procedure.dynamic_stage import identify as identifying
 from calib.procedure.dynamic_stage import inputs
+from calib.procedure.dynamic_stage.computed_torque import torque_tests
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, assess
-from calib.procedure.excitation import coefficients, prediction
+from calib.procedure.excitation import coefficients, prediction, stored_front
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.settings import ExcitationSettings
+from calib.procedure.excitation.stored_front import StoredFront
 from calib.procedure.findings import UNJUDGED, Note, Verdict, as_notes, lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, ROUND, Say, Session
@@ -57,7 +59,10 @@ VALIDATION_FRACTION = 3
 
 
 def options_of(session: Session) -> IdentifyOptions:
-    """Return the identification options from the options file or ``session.toml``, with each recording's payloads."""
+    """Return the identification options from the options file or ``session.toml``, with the payload of each recording.
+
+    A recording carries the payloads whose labels are part of its file name.
+    """
     section = session.settings.dynamics
     options = read_options(session.named(section.options))
     settings = options.settings
@@ -78,33 +83,79 @@ def options_of(session: Session) -> IdentifyOptions:
 def _labels_in(name: str, labels: Iterable[str]) -> tuple[str, ...]:
     """Return the labels that are words of a recording's name, such as ``load`` of ``training_load_log``.
 
-    Digits may follow a label, as in ``training_load2_log``, unless the longer word is a label, too.
+    A number may follow a label, as in ``training_load2_log``; where a longer label matches, only this one counts.
+    Without such words the labels count with which a word begins, as in ``training_loaded_log``.
+
+    Args:
+        name: file name of the recording.
+        labels: labels of all payloads.
     """
-    words = []
+    whole = _spans(name, labels, r"(?![^\W_])")
+    return whole or _spans(name, labels, "")
+
+
+def _spans(name: str, labels: Iterable[str], end: str) -> tuple[str, ...]:
+    """Return the labels at the beginnings of words in a name, without those inside a longer match.
+
+    Args:
+        name: the name.
+        labels: the labels.
+        end: pattern behind a label and its number.
+    """
+    matches = {}
     for label in labels:
-        word = re.compile(rf"(?<![^\W_]){re.escape(label)}(?![^\W\d_])", re.IGNORECASE)
-        if word.search(name):
-            words.append(label)
-    return tuple(label for label in words if not any(label != word and word.startswith(label) for word in words))
+        number = r"" if label[-1].isdigit() else r"\d*"
+        match = re.search(rf"(?<![^\W_]){re.escape(label)}{number}{end}", name, re.IGNORECASE)
+        if match is not None:
+            matches[label] = match.span()
+    kept = []
+    for label, (start, stop) in matches.items():
+        longer = False
+        for other, (other_start, other_stop) in matches.items():
+            inside = other_start <= start and stop <= other_stop
+            longer = longer or (inside and len(other) > len(label))
+        if not longer:
+            kept.append(label)
+    return tuple(kept)
 
 
 def unrecorded_payloads(session: Session) -> list[str]:
     """Return the labels of the session's payloads that no training recording carries."""
     if not session.settings.dynamics.payloads:
         return []
-    options = options_of(session)
+    try:
+        options = options_of(session)
+    except CalibError:
+        # the step that reads the options says what is wrong with them
+        return []
     carried = set()
     for path in session.brought("training"):
         carried.update(options.file_settings(str(path)).payload)
     return [label for label in session.settings.dynamics.payloads if label not in carried]
 
 
-def excite(session: Session, say: Say) -> list[str]:
-    """Design the training motion and the validation motion, and return notes."""
-    section = session.settings.dynamics
-    if not section.plan:
+def excite(session: Session, say: Say) -> list[str | Note]:
+    """Design the training motion and the validation motion of a session, and return notes.
+
+    Args:
+        session: the session.
+        say: called with progress texts.
+    """
+    if not session.settings.dynamics.plan:
         return ["no motion was designed, since plan = false: the recordings may contain any motions"]
-    notes = _design(session, "training", _training_settings(session), say)
+    return _designs(session, say)
+
+
+def _designs(session: Session, say: Say, picked: StoredFront | None = None) -> list[str | Note]:
+    """Design both motions of a session, and return notes.
+
+    Args:
+        session: the session.
+        say: called with progress texts.
+        picked: front whose designed motion is the training motion; None: search.
+    """
+    section = session.settings.dynamics
+    notes = _design(session, "training", _training_settings(session), say, picked)
     if section.validation:
         notes += _design(session, "validation", _validation_settings(session), say)
     if session.named(section.limits) is None:
@@ -113,7 +164,7 @@ def excite(session: Session, say: Say) -> list[str]:
 
 
 def _training_settings(session: Session) -> ExcitationSettings:
-    """Return the settings of the training motion."""
+    """Return the settings for the design of the training motion, from ``session.toml``."""
     section = session.settings.dynamics
     return ExcitationSettings(
         period=section.period,
@@ -132,7 +183,11 @@ def _training_settings(session: Session) -> ExcitationSettings:
 
 
 def _validation_settings(session: Session) -> ExcitationSettings:
-    """Return the settings of the validation motion: another period and seed, within the training motion's states."""
+    """Return the settings for the design of a session's validation motion.
+
+    The motion has another period and seed than the training motion, and stays within its range of positions, velocities
+    and accelerations.
+    """
     section = session.settings.dynamics
     return replace(
         _training_settings(session),
@@ -148,8 +203,41 @@ def _validation_settings(session: Session) -> ExcitationSettings:
     )
 
 
-def _design(session: Session, name: str, settings: ExcitationSettings, say: Say) -> list[str]:
-    """Design a motion, write its folder, and return notes; figures and details of the training motion alone."""
+def pick_motion(picked: StoredFront, session: Session, say: Say) -> list[str | Note]:
+    """Make the designed motion of a front the training motion, design the validation motion, and return notes.
+
+    Args:
+        picked: the front of the session's training motion, with the motion to take as the designed one.
+        session: the session.
+        say: called with progress texts.
+    """
+    return _designs(session, say, picked)
+
+
+def picked_front(session: Session, number: int) -> StoredFront:
+    """Return the front of the session's training motion with motion `number`, from 1, as the designed one.
+
+    Raises:
+        UsageError: if the training motion has no front, or no such motion.
+    """
+    folder = session.path("6-excitation/training")
+    message = f"{folder} has no front: write front = 5 and a torque goal under [dynamics] of session.toml"
+    require((folder / stored_front.TABLE).is_file(), message, UsageError)
+    return stored_front.read(folder).with_designed(number)
+
+
+def _design(
+    session: Session, name: str, settings: ExcitationSettings, say: Say, picked: StoredFront | None = None
+) -> list[str | Note]:
+    """Design a motion, write its folder, and return notes; only the training motion gets figures and details.
+
+    Args:
+        session: the session.
+        name: name of the motion and of its folder in ``6-excitation``.
+        settings: settings of the design.
+        say: called with progress texts.
+        picked: front with a stored motion that is taken instead of a search; None: search.
+    """
     from calib.procedure.excitation import design
     from calib.procedure.excitation import folder as motion_folder
 
@@ -161,6 +249,7 @@ def _design(session: Session, name: str, settings: ExcitationSettings, say: Say)
         settings,
         limits=session.named(session.settings.dynamics.limits),
         options=options_of(session).settings,
+        picked=picked,
         progress=report_progress,
     )
     # a session is resumed, not gone on with half a search
@@ -172,18 +261,25 @@ def _design(session: Session, name: str, settings: ExcitationSettings, say: Say)
     motion_folder.write_design(designed, session.path("6-excitation") / name, draw)
 
     condition, columns = designed.condition, len(designed.inputs.model.exact.names)
-    notes = [
+    notes: list[str | Note] = [
         f"{name}: {designed.period:g} s, condition number {condition.raw:.3g} raw, {condition.normalised:.3g} "
         f"normalised, {columns} columns; all limits are respected"
     ]
     if name == "training":
-        remarks = (*designed.inputs.limits.bounds.lines(), *designed.notes)
+        notes += [Note(f"{name}: {doubt}", is_warning=True) for doubt in designed.doubts]
+        if designed.front is not None:
+            count = len(designed.front.values)
+            choose = command_line("next", session.folder, "--pick", "N")
+            table = session.path("6-excitation/training") / stored_front.TABLE
+            notes.append(Note(f"{name}: {count} motions to choose from ({table}): {choose}", is_warning=True))
+        remarks = [*designed.inputs.limits.bounds.lines()]
+        remarks += [note for note in designed.notes if note not in designed.doubts]
         notes += [f"{name}: {remark}" for remark in remarks]
     return notes
 
 
 def record(session: Session, say: Say) -> list[str]:
-    """Check the training recordings, and return notes."""
+    """Check the training recordings of a session, and return notes for the user."""
     cuts = {}
     notes = []
     for path in session.brought("training"):
@@ -201,7 +297,14 @@ def record(session: Session, say: Say) -> list[str]:
 
 
 def check_recording(session: Session, path: Path, name: str) -> tuple[list[float] | None, list[str]]:
-    """Return start and end of the designed motion in a recording [s] (None: use the whole recording), and notes.
+    """Return start and end of the designed motion in a recording [s], and notes for the user.
+
+    The start and end are None if no designed motion is expected, so that the whole recording is used.
+
+    Args:
+        session: the session.
+        path: path of the recording.
+        name: name of the designed motion: ``training``, ``validation`` or ``round2`` …
 
     Raises:
         MeasurementError: for wrong units or joint order, another motion, or reversed torques.
@@ -236,16 +339,16 @@ def check_recording(session: Session, path: Path, name: str) -> tuple[list[float
 def check_motion(
     recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion], repeats: int
 ) -> tuple[LocatedMotion, list[Finding]]:
-    """Find the designed motion in a recording, and return its location and findings.
+    """Find the designed motion in a recording, and return its location with findings on how it was played.
 
     Args:
-        recording: of n joints.
-        motion: the one that was to be played.
-        others: the session's other motions by name, to say if one of them was played instead.
-        repeats: how many repetitions were asked for.
+        recording: the recording.
+        motion: the motion that should have been played.
+        others: the session's other motions by name; if one of them was played instead, the error message names it.
+        repeats: requested number of repetitions.
 
     Raises:
-        MeasurementError: if the motion is not found, with the likely reason.
+        MeasurementError: if the motion is not found; the message states the likely reason.
     """
     located = locate(recording, motion)
     if located is None:
@@ -260,7 +363,14 @@ def check_motion(
 
 
 def _other_motion(recording: Recording, motion: DesignedMotion, change: Change | None) -> Finding:
-    """Return the finding on what a recording contains instead of the designed motion."""
+    """Return a finding on why a recording does not contain the designed motion.
+
+    Args:
+        recording: the recording.
+        motion: the designed motion.
+        change: the change of units, joint order or signs, or the other motion, that explains the recording; None:
+            unknown.
+    """
     if change is None:
         if recording.duration < motion.period:
             return finding("motion-short", duration=recording.duration, period=motion.period)
@@ -282,10 +392,14 @@ def _other_motion(recording: Recording, motion: DesignedMotion, change: Change |
 
 
 def check_torques(recording: Recording, chain: Chain) -> None:
-    """Raise an error if recorded torques have the wrong sign or unit, compared with torques of the nominal masses.
+    """Compare recorded torques with the gravity and inertia torques of the nominal masses.
+
+    Args:
+        recording: the recording.
+        chain: the arm with its nominal masses.
 
     Raises:
-        MeasurementError: if torques of heavily loaded joints are reversed, or of another magnitude.
+        MeasurementError: if torques of heavily loaded joints have the opposite sign, or another magnitude.
     """
     if chain.inertias is None or recording.kind != "torque":
         return
@@ -310,7 +424,7 @@ def _refuse(recording: Recording, reason: Finding) -> NoReturn:
 
 
 def designed_motions(session: Session) -> dict[str, Periodic]:
-    """Return the session's designed motions by name; empty if no motion was designed."""
+    """Return the designed motions in the session's folder: name -> motion; empty if no motion was designed."""
     if not session.settings.dynamics.plan:
         return {}
     folders = [session.path(f"6-excitation/{name}") for name in ("training", "validation")]
@@ -319,7 +433,7 @@ def designed_motions(session: Session) -> dict[str, Periodic]:
 
 
 def next_round(session: Session) -> str:
-    """Return the name of the round after those whose logs are there: round2, round3 …"""
+    """Return the name of a session's next further motion: round2, or round3 if a log of round2 exists, and so on."""
     number = 2
     while _logs_of(session, f"{ROUND}{number}"):
         number += 1
@@ -327,12 +441,17 @@ def next_round(session: Session) -> str:
 
 
 def _logs_of(session: Session, name: str) -> list[Path]:
-    """Return the training recordings whose names begin with that of a further motion."""
+    """Return the training recordings of a session whose file names begin with `name`, that of a further motion."""
     return [path for path in session.brought("training") if path.stem.lower().startswith(name)]
 
 
 def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
-    """Return each recording's path with the time range of the motion appended, as ``log.csv@0:9``."""
+    """Return the recordings' paths with the time range of the motion appended, such as ``log.csv@0:9``.
+
+    Args:
+        paths: the recordings.
+        cuts: file name -> start and end of the motion [s]; None: the whole recording.
+    """
     ranges = []
     for path in paths:
         cut = cuts.get(path.name)
@@ -345,7 +464,10 @@ def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
 
 
 def _divided(session: Session) -> tuple[list[str], list[str]]:
-    """Return training recordings and held-out recordings, as paths with time ranges (``log.csv@0:9``)."""
+    """Return a session's training recordings and the held-out parts of recordings.
+
+    Both are paths with time ranges (``log.csv@0:9``).
+    """
     cuts = read_json(session.path(CUTS), "calib redo recreates it", Cuts)
     share = session.settings.dynamics.holdout
     training = session.brought("training")
@@ -363,13 +485,20 @@ def _divided(session: Session) -> tuple[list[str], list[str]]:
 def _gathered(
     session: Session, training: Sequence[str], unseen: Sequence[str], say: Say
 ) -> inputs.IdentificationInputs:
-    """Return the inputs of the identification: calibrated robot, training recordings, validation recordings."""
+    """Return the inputs of the identification: calibrated robot, training recordings, and held-out recordings.
+
+    Args:
+        session: the session.
+        training, unseen: recordings as paths with time ranges.
+        say: called with progress texts.
+    """
     motions = designed_motions(session)
     options = options_of(session)
-    # the options of a recording of the session that is not read here do not apply
-    brought = {path.name for path in session.brought("training", "unseen")}
-    read = {Path(parse_cut(recording)[0]).name for recording in (*training, *unseen)}
-    by_file = {name: entry for name, entry in options.files.items() if name in read or name not in brought}
+    # settings of recordings that are not read are refused
+    session_files = {path.name for path in session.brought("training", "unseen")}
+    used_files = {Path(parse_cut(recording)[0]).name for recording in (*training, *unseen)}
+    unused = session_files - used_files
+    by_file = {name: entry for name, entry in options.files.items() if Path(name).name not in unused}
     return inputs.gather(
         session.fit.path,
         training,
@@ -382,7 +511,11 @@ def _gathered(
 
 
 def identify(session: Session, say: Say) -> list[str | Note]:
-    """Identify base parameters and friction on the calibrated geometry; validation files are not used."""
+    """Identify a session's base parameters and friction on the calibrated geometry; held-out recordings are not used.
+
+    Returns:
+        Notes for the user.
+    """
     from calib.procedure.dynamic_stage import folder as identification_outputs
     from calib.procedure.report.outputs import write_model
 
@@ -418,7 +551,7 @@ def identify(session: Session, say: Say) -> list[str | Note]:
 
 
 def predict(session: Session, say: Say) -> list[str | Note]:
-    """Validate the identified model on unseen motion, and write the verdict."""
+    """Validate a session's identified model on held-out motion, write the verdict, and return notes for the user."""
     training, held_out = _divided(session)
     unseen = session.brought("unseen")
     notes = []
@@ -432,20 +565,27 @@ def predict(session: Session, say: Say) -> list[str | Note]:
     assessment = assess(gathered, folder.dynamics(), folder.findings(), folder.errors(), progress=say)
     # the export is judged by the torques written here
     folder.unseen.write(gathered, assessment)
-    assessment = replace(assessment, verdict=_as_delivered(session, assessment))
+    assessment = replace(assessment, verdict=_as_delivered(session, gathered, assessment))
     folder.unseen.write(gathered, assessment)
     earlier = folder.metrics().warnings
     new_warnings = [warning for warning in assessment.warnings if warning not in earlier]
     return [*notes, str(assessment.verdict), *as_notes(new_warnings, assessment.noticed)]
 
 
-def _as_delivered(session: Session, assessment: DynamicsAssessment) -> Verdict:
-    """Return the verdict on the exported robot; a model that cannot be exported gets the verdict prediction only."""
+def _as_delivered(session: Session, gathered: inputs.IdentificationInputs, assessment: DynamicsAssessment) -> Verdict:
+    """Return the verdict on the exported robot; for a model that cannot be exported, pass becomes prediction only.
+
+    The verdict is fail if the torque error exceeds the tolerance in ``session.toml``.
+
+    Args:
+        session: the session, with the tolerance.
+        assessment: errors of the exported robot's model on the recordings, and the verdict.
+    """
     from calib.procedure.export.delivery import Export
 
     verdict = assessment.verdict
     exported = Export(session.robot_file, identified=session.identification.path)
-    errors = [score.judged.total for score in assessment.proofs.values()]
+    errors = [score.counted(score.floor_dominates).total for score in assessment.proofs.values()]
     error, model = max(errors, default=0.0), "identified model"
     predicted = None
     try:
@@ -453,12 +593,22 @@ def _as_delivered(session: Session, assessment: DynamicsAssessment) -> Verdict:
         predicted = exported.with_masses and exported.prediction
     except CalibError as reason:
         verdict = verdict.for_prediction(f"the dynamics cannot be exported: {reason}")
-    if predicted is not None:
-        error, model = predicted.exported, "exported robot"
-        figure = f"{error:.2f} % of the torque unexplained by the exported robot"
+    if predicted:
+        error, model = predicted.exported if predicted.tested is None else predicted.tested, "exported robot"
+        figure = f"{predicted.exported:.2f} % of the torque unexplained by the exported robot"
         verdict = replace(verdict, reason=f"{figure} (identified model: {verdict.reason})")
-    tolerance = session.settings.dynamics.tolerance_percent
-    if not tolerance or error <= tolerance:
+    section = session.settings.dynamics
+    excesses = []
+    if section.tolerance_percent and error > section.tolerance_percent:
+        excesses.append(
+            f"the {model} has an error of {error:.2f} %, above the tolerance of {section.tolerance_percent:g} %"
+        )
+    rows = gathered.options.settings.torque_rows.titles(gathered.chain.joint_names)
+    tests = torque_tests(section.tolerance_torque, assessment.proofs, rows, len(gathered.chain.joints))
+    failed = [test for test in tests if test.passed is False]
+    if failed:
+        errors_above = ", ".join(f"{test.row} {test.rms:.3g} (tolerance {test.tolerance:g})" for test in failed)
+        excesses.append(f"rms torque errors [N m or N] of the identified model above tolerance: {errors_above}")
+    if not excesses:
         return verdict
-    excess = f"the {model} has an error of {error:.2f} %, above the tolerance of {tolerance:g} %"
-    return Verdict("fail", f"{verdict.reason}; {excess}")
+    return Verdict("fail", "; ".join([verdict.reason, *excesses]))

@@ -89,7 +89,17 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class StepRecord:
-    """Record of a completed step in ``state.json``: time, version, fingerprints (SHA-256) of inputs and outputs."""
+    """Record of a completed step in ``state.json``.
+
+    Attributes:
+        finished: date and time at which the step was completed, ISO 8601.
+        inputs, outputs: name of a file or setting -> fingerprint: SHA-256 of the file, or value of the setting as JSON.
+        seconds: duration of the step [s].
+        command: command that ran the step.
+        seed: seed of all random numbers.
+        toolkit: versions of the toolkit and its libraries.
+        notes: notes for the user.
+    """
 
     finished: Text
     inputs: Mapping[str, Text]
@@ -103,17 +113,17 @@ class StepRecord:
 
 @dataclass(frozen=True)
 class StateFile:
-    """The content of ``state.json``: completed steps, and the running one."""
+    """The content of ``state.json``: the completed steps, and the name of the running step (empty: none)."""
 
     steps: Mapping[str, StepRecord] = field(default_factory=dict)
     running: Text = ""
 
     def without(self, *names: str) -> StateFile:
-        """Return the state with the named steps and the running step removed."""
+        """Return the state without the records of the named steps, and without a running step."""
         return StateFile({name: record for name, record in self.steps.items() if name not in names})
 
     def notes(self, step: str) -> tuple[str, ...]:
-        """Return the notes of a completed step; empty if it was not run."""
+        """Return the notes of a completed step; empty if the step has not been completed."""
         return self.steps[step].notes if step in self.steps else ()
 
 
@@ -126,17 +136,25 @@ class Session:
     plots: bool = True
 
     def path(self, name: str) -> Path:
-        """Return the path of a file, given by its name relative to the session's folder (`OLDER` in older ones)."""
+        """Return the path of a file by its name relative to the session's folder.
+
+        Sessions of earlier versions have other names for some files (`OLDER`); an existing file with such a name is
+        returned.
+        """
         older = self.folder / OLDER.get(name, name)
         return older if older.exists() else self.folder / name
 
     def named(self, name: str) -> Path | None:
-        """Return the path of the file that a key of ``session.toml`` names; None if the key is empty."""
+        """Return the path of a file that a key in ``session.toml`` names.
+
+        Args:
+            name: value of the key; empty: there is no file, and None is returned.
+        """
         return self.path(name) if name else None
 
     @property
     def links(self) -> FieldValues:
-        """The arm's first and last link: as given to `calib new`, else as its fit has them; None: to be chosen."""
+        """Names of the arm's base and tip link, as in `calib new` or in the fit; None: chosen by default."""
         links: FieldValues = {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
         fitted = self.fit.path / ROBOT
         if links["tip"] is None and is_urdf(self.robot_file) and fitted.is_file():
@@ -149,7 +167,11 @@ class Session:
         return self.path(self.settings.robot.file)
 
     def brought(self, *kinds: str) -> list[Path]:
-        """Return the user's files of the kinds in `BROUGHT`, followed by the folders with images or bags."""
+        """Return the paths that the user provided, by kind: for each kind first files, then folders of images or bags.
+
+        Args:
+            kinds: keys of `BROUGHT`, such as ``measured``.
+        """
         result = []
         for kind in kinds:
             folder, prefix = BROUGHT[kind]
@@ -165,7 +187,10 @@ class Session:
         return result
 
     def files_brought(self, kind: str) -> list[Path]:
-        """Return the user's files of a kind, including those in folders, but not the toolkit's corner files."""
+        """Return the files of one kind that the user provided, including files in folders.
+
+        Files of detected corners, which this toolkit writes into image folders, are excluded.
+        """
         files_of_kind = []
         for path in self.brought(kind):
             inside = sorted(file for file in path.rglob("*") if file.is_file())
@@ -179,46 +204,49 @@ class Session:
 
     @property
     def needs(self) -> bool:
-        """Whether the session requests an accuracy of torques or parameters."""
+        """Whether the settings request an accuracy of torques or parameters, so that motions may be added."""
         section = self.settings.dynamics
         return self.dynamic and section.plan and bool(section.tolerance_percent or section.sigma_percent)
 
     @property
     def geometric(self) -> bool:
-        """Whether the session fits the geometry; otherwise it uses the geometry of the robot's file."""
+        """Whether the session fits the geometry; otherwise the geometry of the robot's file is used."""
         return self.settings.instrument.measures != NOTHING
 
     @property
     def fit(self) -> FitFolder:
-        """Folder of the fitted geometry or, without a fit, of the nominal robot."""
+        """Folder of the fitted geometry; without a fit, folder of the nominal robot."""
         return FitFolder(self.folder / (IN_SESSION if self.geometric else AS_GIVEN))
 
     @property
     def validation(self) -> ValidationFolder:
-        """Folder of the validation on unseen poses."""
+        """Folder of the fit's validation on held-out poses."""
         return ValidationFolder(self.folder / VALIDATED)
 
     @property
     def identification(self) -> IdentificationFolder:
-        """Folder of the identification."""
+        """Folder with the results of the identification."""
         return IdentificationFolder(self.folder / "8-dynamics")
 
     @property
     def export(self) -> str:
-        """The folder of the export, relative to the session's folder."""
+        """Name of the folder of the export, relative to the session's folder."""
         return EXPORT[self.dynamic]
 
     @property
     def concluded(self) -> bool:
-        """Whether the session has a verdict."""
+        """Whether the session has a verdict, because the step export has been completed."""
         return self.path(VERDICT).exists()
 
     def write_state(self, state: StateFile) -> None:
-        """Write `state` to ``state.json``, completely or not at all."""
+        """Write a state to ``state.json``; the file is written completely or not at all."""
         files.write_json(self.path(STATE), {"schema": SCHEMA, **plain(state)})
 
     def verdicts(self) -> Verdicts:
-        """Return the verdict of each stage; without an export, the dynamics are for prediction only."""
+        """Return the verdicts on the stages and deliverables.
+
+        If the dynamics could not be exported, their verdict is at best pass for prediction only.
+        """
         stages = {}
         deliverables: Mapping[str, Verdict] = {}
         if self.geometric:
@@ -253,13 +281,13 @@ def _files_before_folders(path: Path) -> tuple[bool, Path]:
 
 
 def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Mapping[str, Path | str]) -> None:
-    """Make a session folder, completely or not at all.
+    """Create the folder of a session, completely or not at all.
 
     Args:
-        folder: new, or empty.
-        robot_file: the description, copied into ``1-robot``, there a URDF where it is xacro or MJCF.
-        settings: what ``session.toml`` is to say; the robot's file and the date are filled in here.
-        copied: other files to copy, or texts to write, by their names in the folder.
+        folder: path of a new or empty folder.
+        robot_file: the robot's description, copied into ``1-robot``; xacro and MJCF are converted to URDF.
+        settings: content of ``session.toml``; the robot's file and the date are filled in by this function.
+        copied: other contents: name in the folder -> path of a file to copy, or text to write.
 
     Raises:
         SessionError: if the folder is not empty, or cannot be written.
@@ -297,10 +325,14 @@ def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Ma
 
 
 def open_session(folder: Path, plots: bool = True) -> Session:
-    """Read the session in `folder`.
+    """Read the settings of the session in a folder.
+
+    Args:
+        folder: the folder.
+        plots: whether the session's steps draw figures.
 
     Raises:
-        SessionError: if it is not a session, was made by a newer version, or its file is damaged.
+        SessionError: if the folder is not a session, was made by a newer version, or has a damaged ``session.toml``.
     """
     path = folder / SETTINGS
     if not path.exists():
@@ -312,7 +344,7 @@ def read_state(session: Session) -> StateFile:
     """Return the content of ``state.json``; an empty state if the file is missing.
 
     Raises:
-        SessionError: for a damaged file or one by a newer version, with what to do.
+        SessionError: for a file that is damaged or from a newer version; the message states what to do.
     """
     path = session.path(STATE)
     if not path.exists():
@@ -327,10 +359,10 @@ def read_state(session: Session) -> StateFile:
 
 @contextmanager
 def locked(session: Session, say: Say = print) -> Iterator[None]:
-    """Lock the session for one command; the lock of a killed command is replaced.
+    """Lock the session during one command; a lock left by a killed command is replaced.
 
     Raises:
-        Busy: while another command works on it.
+        Busy: while another command uses the session.
     """
     busy = f"{session.folder} is busy: {{}} works on it; wait for it to end"
     with files.locked(session.path("session.lock"), busy, Busy) as holder:

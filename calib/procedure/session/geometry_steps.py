@@ -1,12 +1,12 @@
 """Steps of a session for geometry and export, which call the functions of `calib fit` and `calib export`.
 
-A session asks for two sets of poses: optimised ones for the fit, and random ones for validation.
+A session selects two sets of poses: optimised poses for the fit, and random poses for the validation.
 """
 
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from calib import files
 from calib.data.images.coverage import image_words
 from calib.data.images.pixels import Pixels
-from calib.data.poses import IMAGES
+from calib.data.poses import IMAGES, MEASURED
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.pose_lists import (
@@ -31,6 +31,7 @@ from calib.data.schema import Joints
 from calib.errors import CalibError, Finding, UsageError, finding
 from calib.extensions import Point
 from calib.folders import write_staged
+from calib.geometry.checks.base_motion import base_motion
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.identification.model_file import MODEL
 from calib.poses.candidates import draw_candidates
@@ -40,7 +41,7 @@ from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs, selection
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
-from calib.procedure.kinematic_stage.validation import assess
+from calib.procedure.kinematic_stage.validation import Assessment, assess
 from calib.procedure.measuring.constraints_file import VIEW_UNCHECKED
 from calib.procedure.measuring.measuring_run import same_turn, write_run
 from calib.procedure.measuring.pose_limits import read_limits
@@ -52,6 +53,7 @@ from calib.procedure.report.geometry_section import error_words, outlier_sentenc
 from calib.procedure.report.outputs import write_fit
 from calib.procedure.session import drift, folder
 from calib.procedure.session.folder import Say, Session
+from calib.records import read_json
 from calib.robot import calibrated
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.formats.urdf_tree import is_urdf
@@ -69,7 +71,16 @@ WRITE_PROGRAM: Point[Callable[[Path, Path, str], object]] = Point(
 
 
 def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
-    """Choose poses as set in ``session.toml``; write the poses, the driving order, and the predicted sigmas."""
+    """Select poses by the settings in ``session.toml``, and write poses, visiting order, and predicted σ.
+
+    Args:
+        session: the session.
+        chain: the nominal arm.
+        say: called with progress texts.
+
+    Returns:
+        Notes for the user.
+    """
     settings, robot_file = session.settings, session.robot_file
     section, instrument = settings.poses, settings.instrument
     sigmas = None
@@ -88,6 +99,7 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
             index=section.index,
             method=section.method,
             sigmas=sigmas,
+            reference=instrument.reference,
             seed=settings.seed,
         ),
         constraints=session.named(section.constraints),
@@ -135,10 +147,17 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
 
 
 def _write_pose_lists(session: Session, chain: Chain, q: np.ndarray) -> int:
-    """Write the poses (m, n) for the fit and those for validation, and programs of them for the robot's controller.
+    """Write the lists of poses to measure, and programs for the robot's controller.
+
+    The lists are the selected poses for the fit, and random poses for the validation.
+
+    Args:
+        session: the session.
+        chain: the nominal arm.
+        q: (m, n) poses for the fit [rad or m].
 
     Returns:
-        The number of poses for validation.
+        The number of poses for the validation.
     """
     lists = {folder.POSES: q}
     if session.settings.poses.validation:
@@ -152,12 +171,22 @@ def _write_pose_lists(session: Session, chain: Chain, q: np.ndarray) -> int:
 
 
 def _selection_kind(measures: str) -> str:
-    """Return the kind of measurement for pose selection; an image counts as a pose."""
+    """Return the kind of measurement for pose selection.
+
+    Args:
+        measures: quantity that the instrument measures; images (``pixels``) count as poses.
+    """
     return "pose" if measures == IMAGES else measures
 
 
 def _random_poses(session: Session, chain: Chain, count: int) -> np.ndarray:
-    """Return random poses (count, n) within all limits, independent of the poses chosen for the fit."""
+    """Return random poses (count, n) [rad or m] within all limits, independent of the poses for the fit.
+
+    Args:
+        session: the session with its limits and seed.
+        chain: the nominal arm.
+        count: number of poses.
+    """
     cell = targets_of(chain, [session.settings.instrument.tool])
     limits = read_limits(session.named(session.settings.poses.constraints), cell, session.robot_file)
     jacobian = observation(cell, _selection_kind(session.settings.instrument.measures))
@@ -170,12 +199,16 @@ def _random_poses(session: Session, chain: Chain, count: int) -> np.ndarray:
 
 
 def chain_of(session: Session) -> Chain:
-    """Return the nominal arm of the session's robot."""
+    """Return the nominal arm in the session's robot file."""
     return inputs.load_robot(session.robot_file, None, _options_of(session), **session.links)[0]
 
 
 def _options_of(session: Session, paths: Sequence[Path] = ()) -> FitOptions:
-    """Return the fit options; files without a sigma get the instrument's, those (`paths`) without joints the plan's."""
+    """Return the fit options, completed by the session's instrument and pose lists.
+
+    Files without a stated σ get the instrument's σ. Files in `paths` that contain no joint values are assigned the
+    session's list of planned poses.
+    """
     options = read_options(session.named(session.settings.fit.options))
     by_file = dict(options.files)
     if session.settings.poses.plan:
@@ -184,22 +217,26 @@ def _options_of(session: Session, paths: Sequence[Path] = ()) -> FitOptions:
             plan = session.path(f"2-poses/{folder.UNSEEN if path in validation else folder.POSES}")
             if plan.exists():
                 by_file[path.name] = replace(options.for_file(path), planned=str(plan))
-    by_file = {name: _with_sigma(session, file_options) for name, file_options in by_file.items()}
-    return replace(options, sigma=_with_sigma(session, options).sigma, files=by_file)
+    by_file = {name: _with_instrument(session, file_options) for name, file_options in by_file.items()}
+    common = _with_instrument(session, options)
+    return replace(options, sigma=common.sigma, base_frame=common.base_frame, files=by_file)
 
 
-def _with_sigma(session: Session, options: FileOptions) -> FileOptions:
-    """Return a file's options with the instrument's sigmas where they state none."""
+def _with_instrument(session: Session, options: FileOptions) -> FileOptions:
+    """Return a file's options completed by a session's instrument: its σ, and whether it measures a base frame."""
     instrument, sigma = session.settings.instrument, options.sigma
     if instrument.sigma_position and sigma.position is None:
         sigma = replace(sigma, position=(instrument.sigma_position,) * 3)
     if instrument.sigma_orientation and sigma.orientation is None:
         sigma = replace(sigma, orientation=(instrument.sigma_orientation,) * 3)
-    return replace(options, sigma=sigma)
+    base_frame = options.base_frame
+    if instrument.reference and base_frame == FileOptions.base_frame:
+        base_frame = MEASURED
+    return replace(options, sigma=sigma, base_frame=base_frame)
 
 
 def describe(session: Session, say: Say) -> list[str]:
-    """Read the robot, write a summary of it, and return notes."""
+    """Read the robot, write a summary of it into the session's folder, and return notes for the user."""
     chain = chain_of(session)
     lines = [f"{chain.name}: {chain.base} to {chain.tip}, {chain.n} joints, {len(chain.elements)} elements", ""]
     for joint in chain.joints:
@@ -217,7 +254,11 @@ def describe(session: Session, say: Say) -> list[str]:
 
 
 def select(session: Session, say: Say) -> list[str]:
-    """Choose poses for the fit, and random ones for validation, and return notes."""
+    """Select poses for the fit of a session and random poses for its validation, and return notes for the user.
+
+    Raises:
+        UsageError: if a pose list contains measurements, which would be overwritten.
+    """
     chain = chain_of(session)
     for name in (folder.POSES, folder.UNSEEN):
         path = session.path(f"2-poses/{name}")
@@ -231,7 +272,7 @@ def select(session: Session, say: Say) -> list[str]:
 
 
 def arrive(session: Session, say: Say) -> list[Note]:
-    """Check the measured files for the fit, and return notes."""
+    """Check a session's measured files for the fit, and return notes for the user."""
     chain = chain_of(session)
     blocks = read_measured(session, chain, session.brought("measured"))
     repeated = read_measured(session, chain, session.brought("drift"))
@@ -247,10 +288,16 @@ def arrive(session: Session, say: Say) -> list[Note]:
 def read_measured(
     session: Session, chain: Chain, paths: Sequence[Path], like: Sequence[PoseMeasurements] = ()
 ) -> list[tuple[str, PoseMeasurements]]:
-    """Return the blocks of measured files with their files' names.
+    """Return the measurements in files, each with the name of its file.
+
+    Args:
+        session: the session.
+        chain: the nominal arm.
+        paths: the files.
+        like: measurements of the fit, whose lens and board apply to images in `paths`.
 
     Raises:
-        MeasurementError: for implausible values, with row and column.
+        MeasurementError: for implausible values; the message states row and column.
     """
     options = _options_of(session, paths)
     blocks = []
@@ -260,7 +307,14 @@ def read_measured(
 
 
 def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMeasurements]], plan: str) -> list[Note]:
-    """Return the notes on measured blocks: rows, kind, ignored columns, poses missing from a list in ``2-poses``."""
+    """Return notes for the user on measurements: rows, kind, ignored columns, and planned poses that are missing.
+
+    Args:
+        session: the session.
+        chain: the nominal arm.
+        blocks: measurements with the names of their files.
+        plan: name of the list of planned poses in ``2-poses``.
+    """
     measures = session.settings.instrument.measures
     path = session.path(f"2-poses/{plan}")
     planned = None
@@ -280,6 +334,7 @@ def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMea
         if planned is not None:
             remarks += check_against(planned, block)
         notes += [Note(f"{name}: {remark}") for remark in remarks]
+        notes += notes_of(base_motion([block]))
         if planned is not None:
             for note in notes_of(readback(planned, block)):
                 notes.append(Note(f"{name}: {note.text}", note.is_warning))
@@ -289,7 +344,15 @@ def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMea
 
 
 def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
-    """Return findings on measured minus planned joint values (m, n) [rad or m]; empty if no pose was planned."""
+    """Return findings on the difference between measured and planned joint values.
+
+    Args:
+        plan: (m, n) planned joint values [rad or m].
+        measured: measurements; rows that are not near a planned pose are ignored.
+
+    Returns:
+        One finding; an empty list if no row is near a planned pose.
+    """
     distance, index = KDTree(plan).query(measured.q, p=np.inf)
     distance, index = np.atleast_1d(distance), np.atleast_1d(index)
     close = distance <= MAX_JOINT_DIFFERENCE
@@ -304,7 +367,7 @@ def readback(plan: np.ndarray, measured: PoseMeasurements) -> list[Finding]:
 
 
 def _fit_settings(session: Session) -> FitSettings:
-    """Return the fit settings of ``session.toml``; a value ``auto`` leaves the choice to the options file."""
+    """Return the fit settings of ``session.toml``; for a value ``auto``, the options file decides."""
     section = session.settings.fit
     masses = ""
     if (session.path(folder.MASSES) / MODEL).is_file():
@@ -326,7 +389,12 @@ def _fit_settings(session: Session) -> FitSettings:
 
 
 def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
-    """Return the inputs of the fit: robot, measurements, and the given validation files."""
+    """Return the inputs of a session's fit: robot, measurements, and validation files.
+
+    Args:
+        session: the session.
+        validate: the validation files; empty: none.
+    """
     measured = session.brought("measured")
     links = session.links
     # the same links whatever joints the files' columns name
@@ -344,7 +412,7 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
 
 
 def fit(session: Session, say: Say) -> list[Note]:
-    """Fit the geometry to the measured files; validation files are not used."""
+    """Fit the geometry to a session's measured files, and return notes for the user; validation files are not used."""
     poses = session.path(f"2-poses/{folder.POSES}")
     predicted = None
     if session.settings.poses.plan and beside(poses).exists():
@@ -366,7 +434,10 @@ def fit(session: Session, say: Say) -> list[Note]:
 
 
 def validate(session: Session, say: Say) -> list[Note]:
-    """Validate the fitted robot on unseen poses, as `calib fit` does with validation files."""
+    """Validate a session's fitted robot on held-out poses, and return notes for the user.
+
+    The errors are computed as by `calib fit` with validation files.
+    """
     chain, unseen = chain_of(session), session.brought("validation")
     metrics, report = session.fit.metrics(), fit_report.read(session.fit.report)
     # images are read with the lens and board of those of the fit
@@ -387,11 +458,48 @@ def validate(session: Session, say: Say) -> list[Note]:
     validation_metrics = session.validation.write(assessment, gathered, rows)
     fit_report.write(report.with_unseen(validation_metrics, rows), session.validation.report)
     new_warnings = [warning for warning in assessment.warnings if warning not in metrics.warnings]
+    notes += notes_of(_predicted_and_reached(session, assessment))
     return [*notes, Note(str(assessment.verdict)), *as_notes(new_warnings, assessment.noticed)]
 
 
+def _predicted_and_reached(session: Session, assessment: Assessment) -> list[Finding]:
+    """Return the findings that state the reached accuracy of the tool next to the predicted one.
+
+    Args:
+        session: the session, whose selection of poses contains the predicted σ of the tool's position.
+        assessment: errors on held-out poses, whose rms is the reached accuracy.
+
+    Returns:
+        One finding for each set of held-out poses; an empty list without a prediction.
+    """
+    path = session.path(folder.SELECTION)
+    if not session.settings.poses.plan or not path.exists():
+        return []
+    predicted = read_json(path, "repeat the step with `calib redo`", _PredictedTool).tool_sigma
+    if predicted is None:
+        return []
+    findings = []
+    for name, rows in assessment.validation.items():
+        delivered = rows.of_urdf if assessment.deliverable == "urdf" else rows
+        if rows.proves:
+            reached = delivered.errors[1].rms
+            findings.append(finding("tool-accuracy-reached", file=name, reached=reached, predicted=predicted))
+    return findings
+
+
+@dataclass(frozen=True)
+class _PredictedTool:
+    """The key of ``selection.json`` with the predicted σ of the tool's position [m]; None if it is not known."""
+
+    tool_sigma: float | None = None
+
+
 def export(session: Session, say: Say) -> list[str]:
-    """Export the calibrated robot to all formats, and write a verdict on each file and on the session."""
+    """Export the calibrated robot to all file formats, and write the verdicts on each file and on the session.
+
+    Returns:
+        Remarks for the user.
+    """
     from calib.procedure.export.delivery import by_file, mark, prediction
 
     out = session.path(session.export)
@@ -414,7 +522,15 @@ def export(session: Session, say: Say) -> list[str]:
 
 
 def _deliver(session: Session, out: Path, say: Say) -> list[str]:
-    """Write the exported files of the session's stages; without the dynamics if they cannot be exported."""
+    """Write the exported files of the session's stages, and return remarks for the user.
+
+    If the dynamics cannot be exported, only the geometry is written.
+
+    Args:
+        session: the session.
+        out: folder to write into.
+        say: called with progress texts.
+    """
     from calib.procedure.export.delivery import FILES, Export, deliver
 
     if not session.geometric:
@@ -441,7 +557,7 @@ def _deliver(session: Session, out: Path, say: Say) -> list[str]:
 
 
 def clear_staging(session: Session) -> None:
-    """Remove the temporary folders of a killed command; an upload that arrives meanwhile stays."""
+    """Remove temporary files of a killed command from a session's folder, but not those of a running upload."""
     for path in session.folder.rglob(".*.part"):
         if files.in_use(path):
             continue

@@ -1,13 +1,16 @@
-"""Identified masses in the geometric fit: its compliance is fitted to their gravity torques, not to the description's.
+"""Identified masses in the geometric fit: its compliance is fitted to gravity torques of the identified masses.
+
+Without this iteration, the gravity torques are those of the masses in the robot's description. The iteration is
 
     fit → identify → fit with the identified masses → identify → …
 
-until neither geometry nor dynamics moves by more than `MAX_MOVE` of its σ. A session does so by itself, for fits with
-compliance or sag, up to ``rounds`` of ``[fit]``: ``8-masses`` holds the identification whose masses the fit uses, and
-its change makes the fit, and what follows it, stale; so an interrupted session goes on where it was. By command:
-``calib fit ROBOT MEASURED --masses FOLDER``, ``calib identify``, and again.
+until no parameter of geometry or dynamics changes by more than `MAX_MOVE` of its σ. Sessions do this automatically for
+fits with compliance or sag, up to ``rounds`` times (section ``[fit]``). The folder ``8-masses`` contains the
+identification whose masses the fit uses. If this folder changes, the fit and all later steps are repeated, so that an
+interrupted session can be continued. The commands are ``calib fit ROBOT MEASURED --masses FOLDER`` and ``calib
+identify``, in turn.
 
-The fit takes the masses as exact: the share of the compliance's σ that comes from theirs is left out.
+The fit regards the masses as exact: the σ of the compliance does not include the uncertainty of the masses.
 """
 
 import shutil
@@ -27,7 +30,13 @@ ROUNDS = "rounds.json"
 
 
 def largest_move(before: Path, after: Path) -> float:
-    """Return the largest |Δ| / σ of the parameters of two folders with an estimate; infinite for other parameters."""
+    """Return the largest change of a parameter between two result folders, in units of the parameter's σ.
+
+    Infinite if the folders have other parameters, or if the first folder has no estimate.
+
+    Args:
+        before, after: folders with ``estimate.csv``.
+    """
     if not (before / ESTIMATE).is_file():
         return float("inf")
     old = {row.name: row for row in read_estimate(before)}
@@ -42,9 +51,12 @@ def largest_move(before: Path, after: Path) -> float:
 
 
 def return_masses(session: Session) -> list[str]:
-    """Hand the masses that a session has just identified to its fit, if that would still change; return notes.
+    """Copy the identified masses into the folder from which the fit reads them, if they would still change the fit.
 
-    The fit takes them where it has compliance or sag; its step is then stale.
+    Nothing is done unless the fit has compliance or sag. After copying, the session's fit is repeated.
+
+    Returns:
+        Notes for the user.
     """
     limit = session.settings.fit.rounds
     record_path = session.path(MASSES)
@@ -59,13 +71,13 @@ def return_masses(session: Session) -> list[str]:
         rounds = read_json(record, "calib redo fit", dict[str, int])["rounds"]
     geometry = largest_move(record_path / "geometry", session.fit.path)
     dynamics = largest_move(record_path, identification)
-    message = f"the geometry has moved by {geometry:.2g} σ, the dynamics by {dynamics:.2g} σ"
+    message = f"the geometry has changed by {geometry:.2g} σ, the dynamics by {dynamics:.2g} σ"
     if not (record_path / MODEL).is_file():
         message = "the compliance was fitted to the description's masses"
     settled = max(geometry, dynamics) <= MAX_MOVE
     if settled or rounds >= limit:
         write_json(record, {"rounds": 0})
-        end = "settled" if settled else f"not settled, stopped by rounds = {limit}"
+        end = "converged" if settled else f"not converged, stopped by rounds = {limit}"
         return [f"identified masses in the fit's gravity torques: after {rounds} rounds {message}: {end}"]
     (record_path / "geometry").mkdir(parents=True, exist_ok=True)
     shutil.copy(session.fit.path / ESTIMATE, record_path / "geometry")
@@ -73,4 +85,4 @@ def return_masses(session: Session) -> list[str]:
     # the last is what the fit depends on
     for name in (calibrated.ROBOT, ESTIMATE, MODEL):
         shutil.copy(identification / name, record_path)
-    return [f"identified masses return into the fit, round {rounds + 1} of at most {limit}: {message}"]
+    return [f"the identified masses are used in the fit again, round {rounds + 1} of at most {limit}: {message}"]

@@ -10,13 +10,16 @@ from scipy.spatial.transform import Rotation
 
 from calib.config import described, parse
 from calib.config_types import OneOf, ParsedTable, Real
+from calib.controllers.table import controller_named
 from calib.data.images.board import read_board
 from calib.data.images.lens import read_lens
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
+from calib.data.poses.measurements import Poses, Positions
 from calib.errors import CalibError, UsageError, one_of, refused_as, require
 from calib.procedure.answers import CAMERA, CELL, Answers, CertificateSection
+from calib.procedure.excitation.settings import DEFAULT_DESIGN, checked_goal
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
-from calib.procedure.session.settings import NOTHING, InstrumentSection
+from calib.procedure.session.settings import NOTHING, InstrumentSection, check_labels
 from calib.records import FieldValues
 from calib.robot.library import resolve
 from calib.transforms import pose, to_xyz_rpy
@@ -48,13 +51,13 @@ def instrument_named(name: str) -> InstrumentSection:
     """Return the settings of an instrument by its name.
 
     Raises:
-        UsageError: for an unknown name, with the known ones.
+        UsageError: for an unknown name; the message lists the known names.
     """
     return INSTRUMENTS[one_of(name, INSTRUMENTS, "instrument", UsageError)]
 
 
 def _measures(answers: Answers) -> str:
-    """Return what the instrument in the answers measures; "" if the instrument is unknown."""
+    """Return which quantity the instrument in the answers measures; empty if the instrument is unknown."""
     if answers.instrument not in INSTRUMENTS:
         return ""
     return INSTRUMENTS[answers.instrument].measures
@@ -62,7 +65,13 @@ def _measures(answers: Answers) -> str:
 
 @dataclass(frozen=True)
 class Question:
-    """A question at the terminal: option name and default of the answer."""
+    """A question at the terminal.
+
+    Attributes:
+        name: name of the option that the question is about.
+        default: default answer.
+        of: dataclass with this option: `Answers` or `CertificateSection`.
+    """
 
     name: str
     default: str
@@ -70,12 +79,12 @@ class Question:
 
     @property
     def words(self) -> str:
-        """Text of the question, from the help of the option."""
+        """Text of the question, made from the option's help text."""
         about = described(self.of)[self.name]
         return f"{self.name.replace('_', ' ')} ({about})" if self.of is Answers else f"{about} (Enter: by hand, later)"
 
     def open(self, answers: Answers) -> bool:
-        """Return whether the question still needs an answer, given the earlier answers."""
+        """Return whether the question still has to be asked, given the earlier answers."""
         if self.of is CertificateSection:
             return bool(answers.details) and not getattr(answers.certificate, self.name)
         if getattr(answers, self.name) not in (None, ()):
@@ -92,21 +101,25 @@ class Question:
                 return not answers.cell
             case "cone" | "facing":
                 return "instrument" in cell_tables(instrument_at=answers.instrument_at)
+            case "reference":
+                return measures == Poses.kind
             case "mounting":
                 return camera
             case "lens" | "board" | "carried" | "stands":
                 return camera and (answers.mounting or "").lower() not in UNSAID
             case "dynamics":
                 return not nothing
-            case "torques" | "payloads" | "tolerance_percent":
+            case "torques" | "payloads" | "goals" | "period" | "tolerance_percent" | "tolerance_torque":
                 return answers.dynamics is not False
+            case "front":
+                return answers.dynamics is not False and any("=" in goal for goal in answers.goals)
             case "tolerance_mm" | "program":
                 return not nothing
         return True
 
 
 def _questions() -> tuple[Question, ...]:
-    """Return all questions in their order: those on the session, then those on its certificate."""
+    """Return all questions in the order in which they are asked: session first, then certificate."""
     names = [answer.name for answer in fields(Answers) if answer.name != "certificate"]
     questions = [Question(name, DEFAULTS.get(name, "unknown")) for name in names]
     questions += [Question(entry.name, "", CertificateSection) for entry in fields(CertificateSection)]
@@ -116,6 +129,7 @@ def _questions() -> tuple[Question, ...]:
 DEFAULTS = {
     "robot": "",
     "instrument": "tracker",
+    "reference": "no",
     "tool": "0.05,0,0.05",
     "program": "none",
     "limits": "none",
@@ -123,18 +137,27 @@ DEFAULTS = {
     "dynamics": "yes",
     "torques": "motor",
     "payloads": "none",
+    "goals": "none",
+    "period": f"{DEFAULT_DESIGN.period:g}",
+    "front": "0",
     "tolerance_mm": "0",
     "tolerance_percent": "0",
+    "tolerance_torque": "none",
     "details": "yes",
 }
 QUESTIONS = _questions()
 
 
 def with_answer(answers: Answers, question: Question, text: str) -> Answers:
-    """Return the answers with the text of one more answer added, after checking it.
+    """Return the answers with the answer to one more question added, after a check.
+
+    Args:
+        answers: the earlier answers.
+        question: the question.
+        text: the answer as typed.
 
     Raises:
-        UsageError: for an invalid answer, with the valid form.
+        UsageError: for an invalid answer; the message states the valid form.
     """
     name = question.name
     if question.of is CertificateSection:
@@ -150,13 +173,22 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
             value = None if is_empty else text
         case "payloads":
             value = [] if is_empty else [part.strip() for part in text.split(";")]
+        case "goals":
+            value = [] if is_empty else text.split()
+        case "period":
+            with refused_as(UsageError, ValueError, f"--period {text}: expected a number of seconds"):
+                value = Real(quantity="1").read(text)
+        case "front":
+            value = int(text) if text.isdecimal() else text
         case "obstacles":
             value = [text]
-        case "dynamics" | "details":
+        case "dynamics" | "details" | "reference":
             value = {"y": True, "n": False}.get(text[:1].lower(), text)
     result = replace(answers, **{name: getattr(parse(Answers, {name: value}, ""), name)})
+    if name == "program" and not is_empty:
+        controller_named(text)
     if name == "robot":
-        require(text, "a robot is needed", UsageError)
+        require(text, "a robot is needed: a file, or a robot of the library", UsageError)
         resolve(text)
     # what is not answered yet is no error
     checked(replace(result, robot=result.robot or "", instrument=result.instrument or "tracker"))
@@ -164,20 +196,44 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
 
 
 def checked(answers: Answers) -> FieldValues:
-    """Return the arguments of `calib.procedure.session.commands.new_session` from checked answers.
+    """Return the arguments of `calib.procedure.session.commands.new_session` that follow from the answers.
 
     Raises:
         UsageError: for an invalid answer.
     """
     robot, instrument = answers.robot, answers.instrument
-    require(robot is not None and instrument is not None, "a robot and an instrument are needed", UsageError)
+    require(
+        robot is not None and instrument is not None,
+        "a robot and an instrument are needed: give --robot and --instrument",
+        UsageError,
+    )
     instrument_named(instrument or "")
     of_camera = [name for name in CAMERA if getattr(answers, name) is not None]
     if of_camera and _measures(answers) != IMAGES:
-        raise CalibError(f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}")
+        raise CalibError(
+            f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}: leave it out"
+        )
+    require(
+        not answers.reference or _measures(answers) in (Poses.kind, Positions.kind),
+        f"--reference applies to a target's pose or position; the instrument is {instrument}: leave it out",
+        UsageError,
+    )
     dynamics = answers.dynamics is not False
-    if not dynamics and (answers.payloads or answers.torques):
-        raise UsageError("--payload and --torques apply to the dynamics, which --geometry-only excludes")
+    for goal in answers.goals:
+        checked_goal(goal)
+    of_dynamics = {
+        "payload": answers.payloads,
+        "torques": answers.torques,
+        "goal": answers.goals,
+        "period": answers.period,
+        "front": answers.front,
+        "tolerance-percent": answers.tolerance_percent,
+        "tolerance-torque": answers.tolerance_torque,
+    }
+    for option, answer in of_dynamics.items():
+        require(
+            dynamics or not answer, f"--{option} applies to the dynamics, which --geometry-only excludes", UsageError
+        )
 
     limits: Path | dict[str, object] | None = answers.limits
     if answers.limits is None:
@@ -187,16 +243,21 @@ def checked(answers: Answers) -> FieldValues:
         if answers.cell:
             first = next(iter(answers.cell))
             option = first.replace("_", "-").replace("obstacles", "obstacle")
-            raise UsageError(f"--{option} and --limits both describe the cell; put it into {answers.limits}")
+            raise UsageError(f"--{option} and --limits both describe the cell; state it in {answers.limits} only")
 
     optional = {
         "payloads": stated_payloads(answers.payloads),
         "certificate": asdict(answers.certificate),
+        "reference": answers.reference,
         "tool": answers.tool,
         "program": answers.program,
         "torques": answers.torques,
+        "goals": list(answers.goals),
+        "period": answers.period,
+        "front": answers.front,
         "tolerance_mm": answers.tolerance_mm,
         "tolerance_percent": answers.tolerance_percent,
+        "tolerance_torque": _joint_tolerances(answers.tolerance_torque or NONE),
     }
     result = {"robot": robot, "instrument": instrument, "dynamics": dynamics, "limits": limits}
     return result | {name: value for name, value in optional.items() if value and value != NONE}
@@ -204,6 +265,9 @@ def checked(answers: Answers) -> FieldValues:
 
 def stated_payloads(texts: Sequence[str]) -> dict[str, dict[str, object]]:
     """Return the payloads of a session by label, from answers such as ``loaded=3.28 at 0,0,0.05``.
+
+    Args:
+        texts: the answers, each ``label``, ``label=kg`` or ``label=kg at x,y,z``.
 
     Raises:
         UsageError: for an invalid answer, or a label that is stated twice.
@@ -215,11 +279,26 @@ def stated_payloads(texts: Sequence[str]) -> dict[str, dict[str, object]]:
             label not in payloads, f"--payload {text}: '{label}' is stated twice; give each payload a label", UsageError
         )
         payloads[label] = payload
+    with refused_as(UsageError, ValueError, "--payload: {}"):
+        check_labels(payloads)
     return payloads
 
 
+def _joint_tolerances(text: str) -> list[float]:
+    """Return the tolerances of the joints' torques [N m or N] from numbers with commas; an empty list for "none"."""
+    if _plain(text) in (*UNSAID, NONE):
+        return []
+    message = f"--tolerance-torque {text}: expected a number, or one per joint with commas, e.g. 2,2,1,0.5"
+    with refused_as(UsageError, ValueError, message):
+        return [Real(least=0, quantity="1").read(part) for part in text.split(",")]
+
+
 def _payload(text: str) -> tuple[str, dict[str, object]]:
-    """Return label and keys of a payload, given as ``label``, ``label=kg`` or ``label=kg at x,y,z``."""
+    """Return label and keys of a payload.
+
+    Args:
+        text: ``label``, ``label=kg`` or ``label=kg at x,y,z`` with the centre of mass in the tip's frame [m].
+    """
     labelled_mass, _, position = text.partition(" at ")
     label, equals, mass = (part.strip() for part in labelled_mass.partition("="))
     payload: dict[str, object] = {}
@@ -245,16 +324,16 @@ ABSENT = {"instrument_at": "instrument", "box": "box", "obstacles": "obstacles"}
 
 
 def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, object]:
-    """Return the content of a limits file, from the answers on the cell; empty without such answers.
+    """Return the content of a limits file that follows from the answers about the cell; empty without such answers.
 
-    Every question may be answered by "unknown": the subject is then not checked, and the certificate says so. "none"
-    means that it does not exist, so that nothing has to be checked.
+    The answer "unknown" to a question means that the subject is not checked, which the certificate states. The answer
+    "none" means that the object does not exist, so that nothing has to be checked.
 
     Args:
-        answers: by the names of `calib.procedure.answers.Answers`.
+        answers: answers by the field names of `calib.procedure.answers.Answers`.
 
     Raises:
-        UsageError: for an invalid answer, with the valid form.
+        UsageError: for an invalid answer; the message states the valid form.
     """
     texts = {}
     absent = []
@@ -277,7 +356,7 @@ def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, object]:
             value = read(text, texts) if name in ("carried", "stands") else read(text)
         except ValueError as error:
             option = "obstacle" if name == "obstacles" else name.replace("_", "-")
-            raise UsageError(f"--{option} {text}: {error}, or unknown") from None
+            raise UsageError(f"--{option} {text}: {error}, or the word unknown") from None
         if key:
             tables[table] = tables.get(table, {}) | {key: value}
         else:
@@ -299,7 +378,11 @@ def _lengths(text: str, count: int, most: float, expected: str = "x,y,z in metre
 
 
 def _direction(text: str) -> str | list[float]:
-    """Return the name of an axis, or a direction of three numbers."""
+    """Return a direction given as the name of an axis (lower case), or as three numbers.
+
+    Raises:
+        ValueError: for another text.
+    """
     if text.lower() in AXES:
         return text.lower()
     with refused_as(ValueError, ValueError, f"expected {', '.join(AXES)}, or three numbers"):
@@ -307,7 +390,14 @@ def _direction(text: str) -> str | list[float]:
 
 
 def _box(text: str) -> list[list[float]]:
-    """Return the ranges along x, y and z of a box around the robot [m]."""
+    """Return the ranges along x, y and z of a box around the robot [m].
+
+    Args:
+        text: the answer, ``x,x,y,y,z,z``.
+
+    Raises:
+        ValueError: for another form, or if the base is outside the box.
+    """
     sides = _lengths(text, 6, MAX_WIDE, "x,x,y,y,z,z in metres, the smaller one first")
     ranges = [sides[k : k + 2] for k in (0, 2, 4)]
     if any(low >= high for low, high in ranges):
@@ -319,7 +409,11 @@ def _box(text: str) -> list[list[float]]:
 
 
 def _obstacles(text: str) -> list[dict[str, object]]:
-    """Return the tables of obstacles, given as texts between semicolons."""
+    """Return the tables of obstacles, given as texts separated by semicolons.
+
+    Raises:
+        ValueError: for an obstacle of another form.
+    """
     form = "NAME box|sphere|cylinder SIZES at X,Y,Z in metres, e.g. table box 1.2,0.8,0.05 at 0.7,0,-0.03"
     length = Real(above=0, most=MAX_WIDE, unit="m", quantity="length")
     tables = []
@@ -339,7 +433,12 @@ def _mounting(text: str) -> str:
 
 
 def _file(read: Callable[[Path], object], text: str) -> str:
-    """Return the path of a lens or board file, after checking that it can be read."""
+    """Return the path of a lens or board file, after checking that it can be read.
+
+    Args:
+        read: function that reads the file.
+        text: the path, or a folder with a board file.
+    """
     path = Path(text).expanduser()
     path = path / BOARD if read is read_board and path.is_dir() else path
     require(path.is_file(), "no such file; give an existing one", ValueError)
@@ -348,7 +447,20 @@ def _file(read: Callable[[Path], object], text: str) -> str:
 
 
 def _turned(name: str, most: float, text: str, answers: dict[str, str]) -> dict[str, list[float]]:
-    """Return a placement with z along the viewing direction: the camera's, or opposite to the board's normal."""
+    """Return the placement (xyz, rpy) of a camera or board, given as a position and the direction that it faces.
+
+    The z axis of a camera is along its viewing direction, and the z axis of a board is opposite to the direction that
+    it faces.
+
+    Args:
+        name: ``carried`` (on the arm) or ``stands`` (fixed).
+        most: largest allowed coordinate [m].
+        text: the answer, such as ``0.5,0,0 facing z``.
+        answers: all answers; ``mounting`` states whether the arm carries the camera or the board.
+
+    Raises:
+        ValueError: for an invalid answer.
+    """
     require(
         "mounting" in answers,
         "it is not known whether the arm carries the camera or the board; give --mounting, too",
@@ -371,7 +483,7 @@ def _turned(name: str, most: float, text: str, answers: dict[str, str]) -> dict[
 
 
 def _cone(text: str) -> str:
-    """Return the half angle of a cone with its unit; without one it is in degrees."""
+    """Return the half angle `text` of a cone with its unit; an angle without a unit is in degrees."""
     return text if any(map(str.isalpha, text)) else f"{text} deg"
 
 

@@ -1,13 +1,14 @@
-"""A further motion, for joints or parameters that do not meet the accuracy requested in ``session.toml``.
+"""A further motion for joints or parameters that do not meet the accuracy requested in ``session.toml``.
 
-Requests are ``tolerance_percent``, of the torques on unseen motion, and ``sigma_percent``, of essential parameters. The
-motion is designed after the identification, into ``6-excitation/round2`` (``round3`` once round2 was recorded …); a log
-whose name begins with the folder's name is identified together with all others. If the session requests nothing, its
-last messages name the joints' torques and the essential parameters' σ above `NEED`, and how to have a motion designed.
+Requests are ``tolerance_percent``, for the torques on held-out motion, and ``sigma_percent``, for the σ of essential
+parameters. The further motion is designed after the identification, into ``6-excitation/round2`` (``round3`` after
+round2 was recorded …). A log whose name begins with the folder's name is used in the identification together with all
+other logs. If the session requests no accuracy, its last messages name the joints whose torque error, and the essential
+parameters whose σ, is above `NEED`, and how to request a further motion.
 
-More motion reduces the error of a joint's torque only by the part that comes from the parameters' σ: of an error e with
-the parts s before and s' after the motion, √(e² - s² + s'²) remains. If even s' = 0 would gain less than `MIN_GAIN`,
-more motion does not help: the remaining error is not modelled.
+More motion reduces only the part of a joint's torque error that is due to the parameters' σ. From an error e with the
+parts s before and s' after the motion, √(e² - s² + s'²) remains. If even s' = 0 would gain less than `MIN_GAIN`, more
+motion does not help, since the remaining error is an effect that is not modelled.
 """
 
 from dataclasses import replace
@@ -48,15 +49,24 @@ class _Parameter(NamedTuple):
 
 
 class _ShortParameter(NamedTuple):
-    """A joint whose torque error is larger than requested: index, error on unseen motion [%], torque rms [N m or N]."""
+    """A joint whose torque error is larger than requested.
+
+    Attributes:
+        joint: index of the joint.
+        error: torque error on held-out motion [%].
+        size: rms of the torque [N m or N].
+    """
 
     joint: int
     error: float
     size: float
 
     def left(self, before: np.ndarray, after: np.ndarray) -> float:
-        """Return the error [%] that remains after the torques' σ (n,) from the parameters falls from `before` to
-        `after`.
+        """Return the torque error [%] that remains after a further motion.
+
+        Args:
+            before, after: (n,) σ of the torques due to the parameters' σ, before and after the further motion [N m or
+                N].
         """
         then = 100.0 * before[self.joint] / self.size
         after_percent = 100.0 * after[self.joint] / self.size
@@ -64,8 +74,14 @@ class _ShortParameter(NamedTuple):
 
 
 def extend(session: Session, say: Say) -> list[str]:
-    """Design a further motion if joints or parameters do not meet the request; return its predicted benefit as
-    notes.
+    """Design a further motion if joints or parameters of a session do not meet the requested accuracy.
+
+    Args:
+        session: the session.
+        say: called with progress texts.
+
+    Returns:
+        Notes on the predicted benefit.
     """
     section = session.settings.dynamics
     identification = session.identification
@@ -119,11 +135,19 @@ def extend(session: Session, say: Say) -> list[str]:
 
 
 def _short_joints(session: Session, tolerance: float) -> list[_ShortParameter]:
-    """Return the joints whose motor torque error exceeds the tolerance [%], if that of all torques together does."""
+    """Return the joints whose motor torque error exceeds the tolerance [%] on the worst recording.
+
+    Empty if the error of all torques together is within the tolerance.
+
+    Args:
+        session: the session with its identification.
+        tolerance: largest accepted torque error of a joint [%].
+    """
     report = session.identification.unseen.read()
     recordings = (report.proofs or report.fit).values()
-    worst = max(recordings, key=lambda recording: recording.raw.relative_error_percent.total).raw
-    if not tolerance or worst.relative_error_percent.total <= tolerance:
+    errors_in_motion = [recording.counted(recording.floor_dominates) for recording in recordings]
+    worst = max(errors_in_motion, key=lambda errors: errors.total)
+    if not tolerance or worst.total <= tolerance:
         return []
     n = session.identification.dynamics().model.n
     # the motors' rows come last
@@ -138,7 +162,14 @@ def _short_joints(session: Session, tolerance: float) -> list[_ShortParameter]:
 
 
 def _weak_parameters(session: Session, tolerance: float) -> tuple[str, ...]:
-    """Return the essential parameters whose relative σ [%] exceeds the tolerance, and that a design can aim at."""
+    """Return the names of essential parameters whose relative σ [%] exceeds the tolerance.
+
+    Parameters that the design of a motion cannot take into account are excluded.
+
+    Args:
+        session: the session with its identification.
+        tolerance: largest accepted standard deviation [%] of the parameter's value.
+    """
     identification = session.identification
     without = {column.name for column in identification.dynamics().model.columns if not column.form.slopes}
     weak = []
@@ -150,15 +181,26 @@ def _weak_parameters(session: Session, tolerance: float) -> tuple[str, ...]:
 
 
 def _unmodelled(inputs: ExcitationInputs, joints: list[_ShortParameter]) -> list[str]:
-    """Return a note on the joints whose torque error more motion does not reduce; [] if there are none."""
+    """Return a note on the joints whose torque error more motion does not reduce; an empty list without such joints.
+
+    Args:
+        inputs: robot and model.
+        joints: joints with too large torque errors.
+    """
     if not joints:
         return []
     names = listing(f"{inputs.chain.joint_names[joint.joint]} {joint.error:.2g} %" for joint in joints)
-    return [f"more motion does not help {names}: what is left is not modelled (friction, elasticity)"]
+    return [f"more motion does not reduce the torque errors of {names}: they are unmodelled effects"]
 
 
 def _gains(designed: design.Designed, joints: list[_ShortParameter], parameters: tuple[str, ...]) -> list[str]:
-    """Return a note on the predicted improvement of joints and parameters by a motion, the worst first."""
+    """Return a note on the improvement of joints and parameters that is predicted for a designed motion.
+
+    Args:
+        designed: the designed motion.
+        joints: joints with too large torque errors.
+        parameters: names of parameters with too large σ.
+    """
     outlook = designed.outlook
     names = designed.inputs.chain.joint_names
     rows = sorted(designed.predicted, key=lambda prediction: -(prediction.rsd or 0.0))
@@ -174,13 +216,13 @@ def _gains(designed: design.Designed, joints: list[_ShortParameter], parameters:
         if row.name in parameters and row.value and row.sigma_before and row.rsd is not None:
             before = 100.0 * row.sigma_before / abs(row.value)
             parts.append(f"σ of {row.name} from {before:.2g} to {row.rsd:.2g} %")
-    return [f"{seconds:.0f} s more, of a motion designed for it, bring the {listing(parts, 6)}"]
+    return [f"a further motion of {seconds:.0f} s, designed for this, is expected to change {listing(parts, 6)}"]
 
 
 def promised(session: Session) -> tuple[str, ...]:
-    """Return lines on a further motion of a complete session: its benefit, and how to record it; () without one.
+    """Return lines on a further motion of a complete session: predicted benefit, and how to record it; may be empty.
 
-    If the session requests no accuracy, the lines name joints and parameters that do not meet the default.
+    If the session requests no accuracy, the lines name joints and parameters that do not meet the default accuracy.
     """
     if session.dynamic and session.settings.dynamics.plan and not session.needs:
         return _short_of_default(session)
@@ -192,12 +234,19 @@ def promised(session: Session) -> tuple[str, ...]:
     played = folder / SAMPLES
     if session.settings.dynamics.repeats > 1:
         played = folder / RUN
-    task = f"play {played}, bring its log as {session.path(f'7-recorded/{name}_log.csv')}; then: "
+    logs = [f"{name}_log.csv", *(f"{name}_{label}_log.csv" for label in session.settings.dynamics.payloads)]
+    paths = " and ".join(str(session.path(f"7-recorded/{log}")) for log in logs)
+    loads = " without and with each payload" if session.settings.dynamics.payloads else ""
+    task = f"play {played}{loads}, put the log into {paths}; then: "
     return (notes[0], f"if wanted, {task}{command_line('next', session.folder)}")
 
 
 def _short_of_default(session: Session) -> tuple[str, ...]:
-    """Return a line on joints and parameters that fall short of the default needs, and what designs a motion."""
+    """Return a line on joints and parameters below the default accuracy, and on how to request a further motion.
+
+    Args:
+        session: a session with an identification.
+    """
     joints = _short_joints(session, NEED)
     weak = _weak_parameters(session, NEED)
     names = load_calibrated(session.fit.path).chain.joint_names

@@ -1,4 +1,4 @@
-"""Folders of sessions, and errors of complete sessions, each as one number for nominal and calibrated robot."""
+"""Folders of sessions, and the position and torque errors of complete sessions as single numbers."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -8,18 +8,18 @@ from calib.procedure.session.folder import SETTINGS, Session
 
 
 def _on_this_machine(address: str) -> list[str]:
-    """Return no addresses, since a path on this machine names a single folder."""
+    """Return an empty list: `address` is a path on this machine and thus a single folder."""
     return []
 
 
 def folders_of(
     given: str | Path | Sequence[str | Path], elsewhere: Callable[[str], list[str]] = _on_this_machine
 ) -> list[Path | str]:
-    """Return the folders of sessions or fits, given as one or several folders, ``session.toml`` files or addresses.
+    """Return the folders of sessions or fits.
 
     Args:
-        given: what a person names.
-        elsewhere: the addresses of the sessions at an address; empty for a path on this machine.
+        given: one or several folders, ``session.toml`` files or addresses, as stated by the user.
+        elsewhere: function that returns the addresses of all sessions at an address; empty for a path on this machine.
 
     Raises:
         UsageError: for a duplicate, or an empty list.
@@ -40,7 +40,10 @@ def folders_of(
 
 
 def position_errors(session: Session) -> tuple[float, float] | None:
-    """Return the rms errors of nominal and calibrated robot on the worst unseen poses [mm]; None without such."""
+    """Return the rms position errors [mm] of nominal and calibrated robot on a session's held-out poses.
+
+    Of several sets of poses, the one with the largest error is used. None without a fit or held-out poses.
+    """
     if not session.geometric:
         return None
     metrics = session.validation.metrics()
@@ -55,7 +58,10 @@ def position_errors(session: Session) -> tuple[float, float] | None:
 
 
 def torque_error(session: Session) -> float | None:
-    """Return the share of the torque that is unexplained on the worst unseen motion [%]; None without dynamics."""
+    """Return the unexplained share of the torque [%] on a session's held-out motion with the largest error.
+
+    Without held-out motion, the error on the training motion; None without dynamics.
+    """
     if not session.dynamic:
         return None
     unseen = session.identification.unseen.read()

@@ -1,6 +1,7 @@
 """Settings of a session, ``session.toml``: robot, instrument, poses, fit and dynamics.
 
-Lengths in m, angles in rad. Every key, what it may be, its default and its comment stand here and nowhere else.
+Lengths are in m, angles in rad. The dataclasses of this module define every key with its allowed values, default and
+comment.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -16,6 +17,7 @@ from calib.config import described, parse, read_toml, strict
 from calib.config_types import Checked, Expect, Flag, Holdout, Name, NotNegative, OneOf, Seed, Text, Whole, shown
 from calib.data.poses import Loss, Model
 from calib.data.poses.fit_options import FitOptions, MetresOrZero, RadiansOrZero
+from calib.data.poses.measurements import Poses, Positions
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.registry import METHODS
@@ -25,6 +27,7 @@ from calib.procedure.excitation.settings import (
     DEFAULT_DESIGN,
     HARMONICS,
     Evaluations,
+    Front,
     Goal,
     HardGoal,
     Harmonics,
@@ -67,7 +70,11 @@ _HEAD = (
 
 
 def _beside(value: object) -> object:
-    """Check that a name is a valid relative path, and return it."""
+    """Return a value unchanged after a check that a text is a relative path, which is next to ``session.toml``.
+
+    Raises:
+        ValueError: for an absolute or too long path.
+    """
     if not isinstance(value, str):
         return value
     if PurePath(value).is_absolute() or len(value) > MAX_NAME or "\0" in value:
@@ -101,13 +108,15 @@ class RobotSection:
 @strict
 @dataclass(frozen=True)
 class InstrumentSection:
-    """Section ``[instrument]``: the instrument, and its sigmas.
+    """Section ``[instrument]``: the measuring instrument, and its σ.
 
     Attributes:
         name: what it is called
         measures: pose (position and orientation), position or pixels; nothing: the geometry is not fitted
         sigma_position: standard deviation of one measurement, per axis [m]; 0: estimated from the residuals
         sigma_orientation: standard deviation of one measurement, per axis [rad]; 0: estimated from the residuals
+        reference: true: a frame on the robot's base is measured with every row (columns base_x …), and the target is
+            seen from there
         tool: approximate position of the target in the tip's frame; for pose selection only
     """
 
@@ -116,6 +125,13 @@ class InstrumentSection:
     sigma_position: MetresOrZero = 0.0
     sigma_orientation: RadiansOrZero = 0.0
     tool: Annotated[tuple[float, float, float], Expect("three numbers [m]")] = (0.05, 0.0, 0.05)
+    reference: Flag = False
+
+    def __post_init__(self) -> None:
+        if self.reference and self.measures not in (Poses.kind, Positions.kind):
+            raise ValueError(
+                f"reference = true applies to poses and positions; the instrument measures {self.measures}"
+            )
 
 
 @strict
@@ -170,6 +186,13 @@ class FitSection:
     rounds: Annotated[int, Whole(0, 20)] = 3
 
 
+def _as_list(value: object) -> object:
+    """Return a number as a list with it; other values unchanged."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return [value]
+    return value
+
+
 @strict
 @dataclass(frozen=True)
 class DynamicsSection:
@@ -195,6 +218,8 @@ class DynamicsSection:
         holdout: share at the end of each recording that is held out if there is no validation recording; 0:
             none
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none
+        tolerance_torque: largest accepted rms error of each joint's torque on unseen motion [N m or N]: one number per
+            joint (0: none), or one for all joints; []: none
         sigma_percent: largest standard deviation of essential parameters that is wanted [%]; 0: none. Where joints are
             above tolerance_percent, or parameters above this, a further motion is designed (6-excitation/round2);
             with neither stated, the session's end names what is above 10 %
@@ -210,7 +235,7 @@ class DynamicsSection:
     rate: Rate = DEFAULT_DESIGN.rate
     goals: tuple[Goal, ...] = ()
     hard: tuple[HardGoal, ...] = ()
-    front: Annotated[int, Whole(0, 1000)] = 0
+    front: Front = 0
     repeats: Annotated[int, Whole(1)] = 3
     starts: Starts = DEFAULT_DESIGN.starts
     evaluations: Evaluations = DEFAULT_DESIGN.evaluations
@@ -221,19 +246,20 @@ class DynamicsSection:
     options: Beside = ""
     holdout: Holdout = 0.0
     tolerance_percent: NotNegative = 0.0
+    tolerance_torque: Annotated[tuple[NotNegative, ...], Checked(_as_list)] = ()
     sigma_percent: NotNegative = 0.0
     payloads: Mapping[str, Annotated[Payload, Checked(mass_as_payload)]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_labels(self.payloads)
+        check_labels(self.payloads)
         if self.repeats > MAX_SAMPLES / max(self.period * self.rate, 1e-300):  # a quotient: repeats may be huge
             raise ValueError(
-                f"period {self.period:g} s at rate {self.rate:g} Hz, repeated {self.repeats} times: more than "
-                f"{MAX_SAMPLES:.0e} samples"
+                f"period {self.period:g} s at rate {self.rate:g} Hz, repeated {self.repeats} times, is more than "
+                f"{MAX_SAMPLES:.0e} samples: lower one of them"
             )
 
 
-def _check_labels(labels: Iterable[str]) -> None:
+def check_labels(labels: Iterable[str]) -> None:
     """Raise a ValueError if a label occurs in the names of all recordings, which labels assign to payloads."""
     for label in labels:
         if label.lower() in RECORDING_WORDS:
@@ -266,10 +292,10 @@ class SessionSettings:
 
 
 def read_settings(path: Path) -> SessionSettings:
-    """Read ``session.toml``; missing keys get their defaults, and schema 1 gets no dynamics.
+    """Read ``session.toml`` at `path`; missing keys get their defaults, and files of schema 1 get no dynamics.
 
     Raises:
-        SessionError: if it was made by a newer version, is damaged, or has an invalid value.
+        SessionError: if the file was made by a newer version, is damaged, or has an invalid value.
     """
     table = read_toml(path, SessionError)
     check_schema(path, table.get("schema"))
@@ -284,10 +310,11 @@ def read_settings(path: Path) -> SessionSettings:
 
 
 def check_schema(path: Path, schema: object) -> None:
-    """Raise an error for a schema number that this version cannot read.
+    """Raise a SessionError, with advice, if this version cannot read the schema of a session's file.
 
-    Raises:
-        SessionError: with advice.
+    Args:
+        path: the file, for the message.
+        schema: the schema number in the file; None: the file has no such number.
     """
     if schema in READABLE_SCHEMAS and type(schema) is int:
         return
@@ -302,14 +329,14 @@ def check_schema(path: Path, schema: object) -> None:
 
 
 def default_keys(section: str) -> dict[str, object]:
-    """Return the defaults of a section by key; empty for a key outside sections."""
+    """Return the default values of a section of ``session.toml`` by key; empty if there is no such section."""
     kind = get_type_hints(SessionSettings).get(section)
     keys = fields(kind) if is_dataclass(kind) else ()
     return {key.name: key.default for key in keys if key.default is not MISSING}
 
 
 def written(settings: SessionSettings) -> str:
-    """Return the text of ``session.toml`` with these settings, including a comment for every key."""
+    """Return the text of ``session.toml`` for the given settings, with a comment for every key."""
     lines = [f"# {line}" for line in _HEAD]
     lines.append(f"schema = {settings.schema}")
     lines += _lines(settings)
@@ -317,7 +344,12 @@ def written(settings: SessionSettings) -> str:
 
 
 def _lines(section: "DataclassInstance | type[DataclassInstance]", prefix: str = "") -> Iterator[str]:
-    """Yield the lines of a section, with the comments of keys aligned in one column, and tables last."""
+    """Yield the lines of a section: first keys with comments aligned in one column, then tables.
+
+    Args:
+        section: the section, or its class for the default values.
+        prefix: names of the sections that contain it, each followed by a dot; empty: none.
+    """
     comments = described(type(section))
     tables = []
     for key in fields(section):

@@ -1,9 +1,9 @@
-"""Status of a session's steps (done, stale, waiting …), and the run of the next steps.
+"""Status of a session's steps (done, stale, waiting …), and functions that run the next steps.
 
-A step is done while its inputs have the fingerprints that were recorded with it. Outputs that a person has replaced
-are kept and reported. A running step is marked; if its command was killed, the step is repeated.
-
-`STEPS` lists the steps: the files that each reads and writes, its settings, and the files that people provide.
+A step is done as long as its inputs have the fingerprints that were recorded when the step ran. Outputs that the user
+has replaced are kept and reported. A running step is marked in ``state.json``; if its command was killed, the step is
+repeated. `STEPS` lists the steps with the files that each reads and writes, its settings, and the files that the user
+has to provide.
 """
 
 import json
@@ -15,11 +15,13 @@ from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
-from calib.errors import SessionError
+from calib.config import parse
+from calib.errors import SessionError, command_line, require
 from calib.extensions import Point
 from calib.files import fingerprint
 from calib.folders import COVARIANCE, ESTIMATE, METRICS, REPORT
 from calib.identification.model_file import MODEL
+from calib.identification.settings import Payload, mass_as_payload
 from calib.procedure.excitation.coefficients import NAME as MOTION
 from calib.procedure.findings import Note
 from calib.procedure.kinematic_stage.folder import URDF
@@ -41,12 +43,12 @@ DONE, READY, WAITING, STALE, KEPT, AFTER = "done", "ready", "waiting", "stale", 
 
 @dataclass(frozen=True)
 class SessionFile:
-    """A file that a step reads, by its name in the session's folder; absent if the session lacks the file's stage.
+    """A file in the session's folder that a step reads; it is ignored if the session lacks the stage that writes it.
 
     Attributes:
-        name: name of the file.
-        optional: whether it may be missing.
-        without_geometry: whether it is read only if no geometry is fitted.
+        name: name of the file, relative to the session's folder.
+        optional: whether the file may be missing.
+        without_geometry: whether the file is read only if no geometry is fitted.
     """
 
     name: str
@@ -54,7 +56,7 @@ class SessionFile:
     without_geometry: bool = False
 
     def paths(self, session: Session) -> list[Path]:
-        """Return the file's path."""
+        """Return the path of the file as a list; empty if the file does not apply to the session."""
         if self.name.startswith(GEOMETRIC_FILES) and not session.geometric:
             return []
         if self.name.startswith(DYNAMIC_FILES) and not session.dynamic:
@@ -66,51 +68,51 @@ class SessionFile:
 
 @dataclass(frozen=True)
 class FitFile:
-    """A file that a step reads from the folder of the fit or, without a fit, of the nominal robot."""
+    """A file that a step reads from the folder of the fit or, without a fit, from the folder of the nominal robot."""
 
     name: str
     optional: bool = False
 
     def paths(self, session: Session) -> list[Path]:
-        """Return the file's path."""
+        """Return the path of the file in a session's folder of the fit, as a list."""
         return [session.fit.path / self.name]
 
 
 @dataclass(frozen=True)
 class ExportedFile:
-    """A file that a step reads from the folder of the export; none where no geometry is fitted."""
+    """A file that a step reads from the folder of the export; it does not apply if no geometry is fitted."""
 
     name: str
     optional: bool = False
 
     def paths(self, session: Session) -> list[Path]:
-        """Return the file's path."""
+        """Return the path of the file in a session's export, as a list; empty if the session fits no geometry."""
         return [session.path(f"{session.export}/{self.name}")] if session.geometric else []
 
 
 @dataclass(frozen=True)
 class NamedFile:
-    """A file that a step reads, named by a key of ``session.toml``; none where the key is empty."""
+    """A file that a step reads and that a key of ``session.toml`` names; it does not apply if the key is empty."""
 
     section: str
     key: str
     optional: bool = False
 
     def paths(self, session: Session) -> list[Path]:
-        """Return the file's path."""
+        """Return the path of the file that a session's settings name, as a list; empty if the key is empty."""
         name = getattr(getattr(session.settings, self.section), self.key)
         return [session.path(name)] if name else []
 
 
 @dataclass(frozen=True)
 class UserFiles:
-    """Files that a step reads and people provide, of a kind of `folder.BROUGHT`."""
+    """Files that the user provides and a step reads; `kind` is a key of `folder.BROUGHT`."""
 
     kind: str
     optional: bool = False
 
     def paths(self, session: Session) -> list[Path]:
-        """Return the paths of the files, including those in folders."""
+        """Return the paths of the files in a session's folder, including files in folders that the user provided."""
         return session.files_brought(self.kind)
 
 
@@ -119,10 +121,19 @@ Input = SessionFile | FitFile | ExportedFile | NamedFile | UserFiles
 
 @dataclass(frozen=True)
 class StepSetting:
-    """A section or value of ``session.toml`` on which a step depends: all of it, or these keys of it."""
+    """A section or value of ``session.toml`` on which a step depends.
+
+    Attributes:
+        section: name of the section, or key outside sections.
+        keys: keys of the section on which the step depends; empty: all keys.
+    """
 
     section: str
     keys: tuple[str, ...] = ()
+
+
+# makes the outputs of a step and returns notes
+Make = Callable[[Session, Say], Sequence[str | Note]]
 
 
 @dataclass(frozen=True)
@@ -131,19 +142,20 @@ class SessionStep:
 
     Attributes:
         name, purpose: name, and purpose as text for the user.
-        make: function that runs the step and returns its notes.
-        reads: files that it reads.
-        makes: names or patterns of the files that it writes.
-        settings: sections and keys of ``session.toml`` that it depends on.
-        stage: ``geometry`` or ``dynamics`` if only sessions with this stage have the step; ``need`` if only sessions
-            that request an accuracy have it; empty: all sessions.
+        make: function that runs the step and returns notes for the user.
+        reads: files that the step reads.
+        makes: names or patterns of the files that the step writes.
+        settings: sections and keys of ``session.toml`` on which the step depends.
+        stage: ``geometry`` or ``dynamics``: only sessions with this stage have the step; ``need``: only sessions that
+            request an accuracy have the step; empty: all sessions have the step.
         brings: kind of files that the user provides before the step, and their description.
-        kept: kind of files after whose arrival the step is not repeated, and their description; empty: always repeated.
+        kept: kinds of files whose existence keeps the step from being repeated, and the reason as text; empty: the step
+            is always repeated if its inputs change.
     """
 
     name: str
     purpose: str
-    make: Callable[[Session, Say], Sequence[str | Note]]
+    make: Make
     reads: tuple[Input, ...]
     makes: tuple[str, ...]
     settings: tuple[StepSetting, ...]
@@ -152,14 +164,17 @@ class SessionStep:
     kept: tuple[tuple[str, ...], str] = ((), "")
 
     def inputs(self, session: Session) -> dict[Path, bool]:
-        """Return the files that the step reads, and for each whether it may be missing."""
+        """Return the files of a session that the step reads: path -> whether the file may be missing."""
         paths = {}
         for source in self.reads:
             paths |= dict.fromkeys(source.paths(session), source.optional)
         return paths
 
     def waits(self, session: Session) -> str:
-        """Return a text on the user's files that the step waits for; empty if none are missing."""
+        """Return a description of the user's files for which the step of a session waits.
+
+        Empty if no files are missing.
+        """
         kind, words = self.brings
         # a part of the measured poses or recordings may be held out instead
         poses, fit, dynamics = session.settings.poses, session.settings.fit, session.settings.dynamics
@@ -169,13 +184,15 @@ class SessionStep:
             return ""
         if not kind:
             return ""
-        if not session.brought(kind):
-            return words
-        if kind == "training":
-            missing = dynamics_steps.unrecorded_payloads(session)
-            if missing:
-                return f"{words} with '{missing[0]}'; if there is none, remove [dynamics.payloads] from session.toml"
-        return ""
+        return "" if session.brought(kind) else words
+
+    def lacks(self, session: Session) -> str:
+        """Return a description of further recordings that a step waits for, unless it was completed without them."""
+        kind, words = self.brings
+        missing = dynamics_steps.unrecorded_payloads(session) if kind == "training" else []
+        if not missing:
+            return ""
+        return f"{words} with '{missing[0]}'; if there is none, remove [dynamics.payloads] from session.toml"
 
 
 ROBOT = NamedFile("robot", "file")
@@ -184,8 +201,24 @@ FIT_OPTIONS = NamedFile("fit", "options")
 IDENTIFY_OPTIONS = NamedFile("dynamics", "options")
 # keys of [dynamics] on which the identified model depends
 MODEL_KEYS = ("torques", "friction", "method", "options", "payloads", "holdout")
-# and those of a designed motion
-DESIGN_KEYS = ("plan", "validation", "period", "harmonics", "rate", "starts", "evaluations", "limits")
+# keys of [dynamics] on which its verdict depends
+TOLERANCES = ("tolerance_percent", "tolerance_torque")
+# keys of [dynamics] on which a designed motion depends
+DESIGN_KEYS = (
+    "plan",
+    "torques",
+    "payloads",
+    "validation",
+    "period",
+    "harmonics",
+    "rate",
+    "goals",
+    "hard",
+    "front",
+    "starts",
+    "evaluations",
+    "limits",
+)
 STEPS = (
     SessionStep(
         "describe",
@@ -263,7 +296,7 @@ STEPS = (
         "excite",
         "design the motions to record",
         dynamics_steps.excite,
-        reads=(FITTED_ROBOT, NamedFile("dynamics", "limits")),
+        reads=(FITTED_ROBOT, NamedFile("dynamics", "limits"), IDENTIFY_OPTIONS),
         makes=("6-excitation/training/*", "6-excitation/validation/*"),
         settings=(StepSetting("dynamics", DESIGN_KEYS), StepSetting("seed")),
         stage="dynamics",
@@ -309,7 +342,7 @@ STEPS = (
         ),
         makes=("8-dynamics/unseen/*",),
         settings=(
-            StepSetting("dynamics", ("plan", "validation", "repeats", "tolerance_percent", *MODEL_KEYS)),
+            StepSetting("dynamics", ("plan", "validation", "repeats", *TOLERANCES, *MODEL_KEYS)),
             StepSetting("seed"),
         ),
         stage="dynamics",
@@ -337,7 +370,7 @@ STEPS = (
 
 @dataclass(frozen=True)
 class State:
-    """Status of a step, and the reason."""
+    """Status of a step (such as `DONE` or `WAITING`), and a text with the reason."""
 
     step: SessionStep
     kind: str
@@ -345,21 +378,21 @@ class State:
 
 
 def all_steps() -> tuple[SessionStep, ...]:
-    """Return the steps of any session, in their order."""
+    """Return the steps of all kinds of sessions, in the order in which they run."""
     return (*STEPS, *MORE_STEPS.all())
 
 
 def steps_of(session: Session) -> tuple[SessionStep, ...]:
-    """Return the steps of a session, without those of stages that the settings exclude."""
+    """Return the steps of a session, without those of stages that its settings exclude."""
     included = {"": True, "dynamics": session.dynamic, "geometry": session.geometric, "need": session.needs}
     return tuple(step for step in all_steps() if included[step.stage])
 
 
 def find(session: Session, name: str) -> SessionStep:
-    """Return a step by its name or number.
+    """Return a step of a session by its name or number.
 
     Raises:
-        SessionError: with the names there are.
+        SessionError: for an unknown step, or a step that the session's settings exclude; the message gives advice.
     """
     included = steps_of(session)
     for number, step in enumerate(included, 1):
@@ -376,7 +409,7 @@ def find(session: Session, name: str) -> SessionStep:
 
 
 def states(session: Session) -> list[State]:
-    """Return the status of every step."""
+    """Return the status of every step of a session."""
     recorded = read_state(session)
     result: list[State] = []
     for step in steps_of(session):
@@ -390,16 +423,25 @@ def states(session: Session) -> list[State]:
 
 
 def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
-    """Return the status of a step whose predecessors are all done."""
+    """Return the status of a step whose preceding steps are all done.
+
+    Args:
+        session: the session.
+        step: the step.
+        recorded: content of ``state.json``.
+    """
     missing = _missing(session, step)
     if missing:
         return State(step, WAITING, missing)
     if recorded.running == step.name:
         return State(step, READY, "was interrupted; will be repeated")
     entry = recorded.steps.get(step.name)
+    changes = "" if entry is None else changed_inputs(entry.inputs, _fingerprints(session, step))
+    lacking = step.lacks(session) if entry is None or changes else ""
+    if lacking:
+        return State(step, WAITING, lacking)
     if entry is None:
         return State(step, READY, step.purpose)
-    changes = changed_inputs(entry.inputs, _fingerprints(session, step))
     if changes:
         kinds, reason = step.kept
         if session.brought(*kinds):
@@ -416,7 +458,7 @@ def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
 
 
 def _missing(session: Session, step: SessionStep) -> str:
-    """Return a text on the user's files that a step waits for."""
+    """Return a description of the files for which a step of a session waits; empty if no files are missing."""
     waits = step.waits(session)
     if waits:
         return waits
@@ -427,7 +469,11 @@ def _missing(session: Session, step: SessionStep) -> str:
 
 
 def _fingerprints(session: Session, step: SessionStep) -> dict[str, str]:
-    """Return the fingerprints of the files and settings on which a step depends."""
+    """Return the fingerprints of a session's files and settings on which a step depends.
+
+    Returns:
+        Name -> SHA-256 of the file, or value of the setting as JSON.
+    """
     marks = {}
     for path in step.inputs(session):
         if path.exists():
@@ -445,34 +491,56 @@ def _fingerprints(session: Session, step: SessionStep) -> dict[str, str]:
 
 
 def changed_inputs(before: Mapping[str, str], after: Mapping[str, str]) -> str:
-    """Return a text on the differences between two sets of fingerprints."""
+    """Return a text on the differences between two sets of fingerprints; empty if there are none.
+
+    Args:
+        before, after: name of a file or setting -> fingerprint.
+    """
     parts = []
     for name, mark in after.items():
         if name not in before and _comparable(name, "{}") != _comparable(name, mark):
             parts.append(f"{name} is new")
         if name in before and _comparable(name, before[name]) != _comparable(name, mark):
             parts.append(f"{name} has changed")
-    parts += [f"{name} is gone" for name in sorted(before.keys() - after)]
+    parts += [f"{name} was removed" for name in sorted(before.keys() - after)]
     return ", ".join(parts)
 
 
 def _comparable(name: str, mark: str) -> object:
-    """Return a fingerprint in comparable form: settings as values (3 equals 3.0), missing keys as their defaults."""
+    """Return a fingerprint in a form that can be compared.
+
+    Settings are compared as values (3 equals 3.0), with defaults for missing keys.
+
+    Args:
+        name: name of a file or setting.
+        mark: fingerprint of the file or setting.
+    """
     if not name.startswith(folder.SETTINGS):
         return mark
     section, _, key = name.removeprefix(f"{folder.SETTINGS} [").partition("]")
     value = json.loads(mark)
+    if key.strip() == "payloads":
+        # records of older sessions state masses alone
+        return {label: parse(Payload, mass_as_payload(payload), name) for label, payload in value.items()}
     if key and mark != "{}":
         value = {key.strip(): value}
     if isinstance(value, dict):
-        return default_keys(section) | value
+        return json.loads(json.dumps(default_keys(section))) | value
     return value
 
 
 def run_next(session: Session, say: Say, progress: Say, command: str = "calib next") -> State | None:
-    """Run all steps up to the next step that waits for the user; return this step, or None at the end.
+    """Run steps of a session until one has to wait for the user.
 
-    The session has to be locked.
+    The caller has to lock the session.
+
+    Args:
+        session: the session, locked.
+        say, progress: functions that print permanent lines, and progress messages.
+        command: the command to record for the steps.
+
+    Returns:
+        The status of the step that waits; None if all steps are done.
     """
     clear_staging(session)
     # the folder of a session with the other stages is missing, or this one has files
@@ -487,9 +555,41 @@ def run_next(session: Session, say: Say, progress: Say, command: str = "calib ne
         _run(session, pending[0].step, say, progress, command)
 
 
+def run_instead(session: Session, step: SessionStep, make: Make, say: Say, progress: Say, command: str) -> None:
+    """Run a step with another function, such as one that takes a stored motion instead of a search.
+
+    Args:
+        session: the session, locked.
+        step: the step.
+        make: function that makes the step's outputs and returns notes.
+        say, progress: functions that print permanent lines, and progress messages.
+        command: the command for the record.
+
+    Raises:
+        SessionError: if an earlier step is not completed, or people have carried out what the step planned.
+    """
+    go_on = command_line("next", session.folder)
+    for state in states(session):
+        kinds, reason = step.kept
+        if state.step.name == step.name:
+            require(not session.brought(*kinds), f"step {step.name}: {reason}", SessionError)
+            message = f"step {step.name}: {state.words}; first repeat it: {go_on}"
+            require(state.kind == DONE, message, SessionError)
+            break
+        require(state.kind in (DONE, KEPT), f"first complete the step {state.step.name}: {go_on}", SessionError)
+    _run(session, replace(step, make=make), say, progress, command)
+
+
 def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: str) -> None:
-    """Run a step, record it in ``state.json``, and print its notes."""
-    number = steps_of(session).index(step) + 1
+    """Run a step, record it in ``state.json``, and print its notes.
+
+    Args:
+        session: the session, locked.
+        step: the step.
+        say, progress: functions that print permanent lines, and progress messages.
+        command: the command for the record.
+    """
+    number = [included.name for included in steps_of(session)].index(step.name) + 1
     recorded = read_state(session).without(step.name)
     session.write_state(replace(recorded, running=step.name))
     # files that change while the step runs make it stale
@@ -525,7 +625,11 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
 
 
 def forget(session: Session, step: SessionStep) -> None:
-    """Mark a step and all steps after it to be run again, but not a design that people have carried out."""
+    """Mark a step and all later steps of a session as not done, so that they run again.
+
+    Later steps that selected poses or designed motions are not marked if the user has already measured or recorded
+    them.
+    """
     included = steps_of(session)
     names = [step.name]
     for later in included[included.index(step) + 1 :]:

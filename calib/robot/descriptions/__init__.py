@@ -1,1 +1,1 @@
-"""Descriptions of robots by ROS, MuJoCo and Universal Robots, read as URDF."""
+"""Robot descriptions of ROS (xacro), MuJoCo (MJCF) and Universal Robots, converted to URDF when read."""

@@ -29,10 +29,13 @@ WORLD = "world"
 
 
 def convert(path: str) -> str:
-    """Return the URDF text of an MJCF file; an ``.xml`` file that is a URDF already comes back unchanged.
+    """Return the URDF text for an MJCF file; an ``.xml`` file that is already a URDF is returned unchanged.
+
+    Args:
+        path: the ``.xml`` file.
 
     Raises:
-        RobotError: if MuJoCo is missing or cannot read the file, or the model is no serial arm.
+        RobotError: MuJoCo is missing or cannot read the file, or the model is not a serial arm.
     """
     text = Path(path).read_text(encoding="utf-8", errors="replace")
     if "<robot" in text and "<mujoco" not in text.partition("<robot")[0]:
@@ -51,7 +54,13 @@ def convert(path: str) -> str:
 
 
 def _compiled(spec: NativeModel) -> NativeModel:
-    """Return the model without meshes and pictures, whose files are not needed where masses are stated."""
+    """Return the compiled model, without meshes and textures if their files are missing.
+
+    These files are not needed if the model contains masses.
+
+    Args:
+        spec: MuJoCo's specification of the model (``MjSpec``), parsed from the file.
+    """
     try:
         return spec.compile()
     except ValueError as error:
@@ -67,7 +76,7 @@ def _compiled(spec: NativeModel) -> NativeModel:
 
 
 class _Tree:
-    """URDF of a compiled model, body by body."""
+    """Conversion of a compiled MuJoCo model to a URDF, body by body."""
 
     def __init__(self, model: NativeModel, mujoco: ModuleType, where: str, name: str) -> None:
         self.model, self.mj, self.where = model, mujoco, where
@@ -93,10 +102,11 @@ class _Tree:
         return xml_text(self.root)
 
     def _add_body(self, k: int) -> None:
-        """Add a body's joints, in the order in which MuJoCo moves them, and its link, whose frame is the body's.
+        """Add body k to the URDF: its joints, in the order in which MuJoCo applies them, and its link.
 
-        With several joints: T = T_body · Π Trans(pos) exp(axis (q - ref)) Trans(-pos) (MuJoCo documentation,
-        "Computation", kinematic tree); each joint but the last is followed by a link without mass.
+        The link has the body's frame. With several joints, T = T_body · Π Trans(pos) exp(axis (q - ref)) Trans(-pos)
+        (MuJoCo documentation, "Computation", kinematic tree). Each joint but the last is followed by a link without
+        mass.
         """
         model, name = self.model, self.bodies[k]
         parent, placed = self.bodies[model.body_parentid[k]], _pose(model.body_pos[k], model.body_quat[k])
@@ -128,7 +138,7 @@ class _Tree:
         kind = kinds(int(model.jnt_type[j]))
         if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
             free_or_ball = "free" if kind == kinds.mjJNT_FREE else "ball"
-            advice = "an arm has hinges and slides; give the robot's own file, not a scene with it"
+            advice = "an arm has hinges and slides only; give the robot's own file, not a scene with it"
             refuse_robot(self.where, f"body '{self.bodies[model.jnt_bodyid[j]]}' has a {free_or_ball} joint; {advice}")
         slides = kind == kinds.mjJNT_SLIDE
         limited = bool(model.jnt_limited[j])
@@ -156,7 +166,7 @@ class _Tree:
             ET.SubElement(joint, "mimic", self.leaders[j])
 
     def _efforts(self) -> dict[int, float]:
-        """Return the largest force or torque of each joint's actuators with a limit [N m or N]."""
+        """Return the largest force or torque of each joint's actuators that have a limit [N m or N], by joint index."""
         model = self.model
         efforts = {}
         for k in range(model.nu):
@@ -166,7 +176,11 @@ class _Tree:
         return efforts
 
     def _leaders(self) -> dict[int, dict[str, str]]:
-        """Return the <mimic> of each joint that an equality ties to another; refuse equalities that close a loop."""
+        """Return the attributes of <mimic> for each joint that an equality couples to another joint, by joint index.
+
+        Raises:
+            RobotError: an equality that closes a loop.
+        """
         model = self.model
         mimics: dict[int, dict[str, str]] = {}
         tied: set[int] = set()
@@ -177,9 +191,7 @@ class _Tree:
                 refuse_robot(self.where, f"equality '{name}' closes a loop; describe such a robot as a parallel one")
             offset, ratio, *higher = model.eq_data[k, :5]
             if any(higher):
-                refuse_robot(
-                    self.where, f"equality '{name}' of '{self.joints[follower]}' is no straight line; edit polycoef"
-                )
+                refuse_robot(self.where, f"equality '{name}' of '{self.joints[follower]}' is not linear; edit polycoef")
             follower_reference = model.qpos0[model.jnt_qposadr[follower]]
             leader_reference = model.qpos0[model.jnt_qposadr[leader]]
             urdf_offset = repr(float(follower_reference + offset - ratio * leader_reference))
@@ -187,10 +199,10 @@ class _Tree:
             tied |= {follower, leader}
         for k in range(model.nwrap):
             if model.wrap_type[k] != int(self.mj.mjtWrap.mjWRAP_JOINT) or int(model.wrap_objid[k]) not in tied:
-                refuse_robot(self.where, "a tendon moves it, which a serial arm does not have; take it out of the file")
+                refuse_robot(self.where, "a tendon moves joints of the arm, which is not supported; remove the tendon")
         return mimics
 
 
 def _pose(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    """Return the pose (4, 4) of MuJoCo's position and quaternion w x y z."""
+    """Return the pose (4, 4) for MuJoCo's position (3,) and quaternion (4,) w x y z."""
     return from_quaternion(position, np.roll(quaternion, -1))

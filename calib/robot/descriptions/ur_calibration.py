@@ -41,14 +41,14 @@ FARTHEST = 0.03  # [m] of a joint's axis from the nominal place of its joint: no
 
 
 def convert(path: str) -> str:
-    """Return the URDF text of ``calibration.conf ur_type:=TYPE``, the file's path followed by the arm's type.
+    """Return the URDF text for ``calibration.conf ur_type:=TYPE``, the file's path followed by the arm's type.
 
     Raises:
-        RobotError: for an invalid file, a missing type, or a type that contradicts the file.
+        RobotError: an invalid file, a missing type, or a type that contradicts the file.
     """
     file, arguments = split(path)
     table = tomllib.loads(shipped_text("calib.robot.descriptions", "universal_robots.toml"))
-    message = f'{file}: say of which type the arm is, in quotes: "{file} {TYPE}:=ur5e" (one of {", ".join(table)})'
+    message = f'{file}: state the type of the arm, in quotes: "{file} {TYPE}:=ur5e" (one of {", ".join(table)})'
     require({*arguments} == {TYPE}, message, RobotError)
     kind = one_of(arguments[TYPE], table, f"{file}: {TYPE}", RobotError)
     nominal, deltas = _nominal(**table[kind]), _deltas(file)
@@ -56,9 +56,7 @@ def convert(path: str) -> str:
     axis_frames = np.array([_beside(axis, near) for axis, near in zip(frames[:6], nominal_frames)])
     deviation = float(np.linalg.norm(axis_frames[:, :3, 3] - nominal_frames[:6, :3, 3], axis=1).max())
     if deviation > FARTHEST:
-        refuse_robot(
-            file, f"with it the axes of a {kind} are up to {1e3 * deviation:.0f} mm from their places: another {TYPE}?"
-        )
+        refuse_robot(file, f"the axes of a {kind} would be {1e3 * deviation:.0f} mm from nominal: is {TYPE} another?")
     root = ET.Element("robot", name=kind)
     ET.SubElement(root, "link", name="base")
     parent, previous_frame = "base", np.eye(4)
@@ -75,14 +73,18 @@ def convert(path: str) -> str:
 
 
 def _nominal(a: list[float], d: list[float]) -> np.ndarray:
-    """Return the table (6, 4) of θ, a, d, α of a type."""
+    """Return the nominal table (6, 4) of θ, a, d, α [rad, m] from a type's lengths a and d (6 each) [m]."""
     half = np.pi / 2
     lengths = [0.0, *a, 0.0, 0.0, 0.0], [d[0], 0.0, 0.0, *d[1:]]
     return np.column_stack([np.zeros(6), *lengths, [half, 0.0, 0.0, half, -half, 0.0]])
 
 
 def _deltas(path: str) -> np.ndarray:
-    """Return the corrections (6, 4) to θ, a, d, α in a file [rad, m]."""
+    """Return the corrections (6, 4) to θ, a, d, α [rad, m] in a calibration file.
+
+    Args:
+        path: the file ``calibration.conf``.
+    """
     with refused_as(RobotError, (OSError, UnicodeDecodeError), f"{path}: cannot be read: {{}}"):
         content = Path(path).read_text(encoding="utf-8")
     rows = []
@@ -98,7 +100,7 @@ def _deltas(path: str) -> np.ndarray:
 
 
 def _frames(table: np.ndarray) -> np.ndarray:
-    """Return the frames (7, 4, 4) of the six axes and of the flange, at q = 0, of a table (6, 4) of θ, a, d, α."""
+    """Return the frames (7, 4, 4) of the base and after each row of a table (6, 4) of θ, a, d, α, at q = 0."""
     result = [np.eye(4)]
     for theta, a, d, alpha in table:
         rotation_z, rotation_x = (Rotation.from_euler(axis, angle) for axis, angle in (("z", theta), ("x", alpha)))
@@ -107,7 +109,10 @@ def _frames(table: np.ndarray) -> np.ndarray:
 
 
 def _beside(axis: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-    """Return the frame (4, 4) whose z is the axis of frame `axis`, at that axis's point nearest to frame `nominal`."""
+    """Return a frame (4, 4) on the z axis of the frame `axis`, at the point nearest to the origin of `nominal`.
+
+    The frame's z axis is that of `axis`; its x axis is as near as possible to that of `nominal`.
+    """
     z, start = axis[:3, 2], axis[:3, 3]
     position = start + z * (z @ (nominal[:3, 3] - start))
     x = nominal[:3, 0] - z * (z @ nominal[:3, 0])

@@ -35,7 +35,11 @@ MAX_ABOVE = 4
 
 
 def split(path: str) -> tuple[str, dict[str, str]]:
-    """Return the file and the xacro arguments of what a person gives as a robot: ``arm.urdf.xacro name:=value``."""
+    """Return the file and the xacro arguments in a text such as ``arm.urdf.xacro name:=value``.
+
+    Args:
+        path: the text; without arguments, the path alone.
+    """
     file, *arguments_text = _ARGUMENTS.split(path, maxsplit=1)
     arguments: dict[str, str] = {}
     if arguments_text:
@@ -50,7 +54,7 @@ def split(path: str) -> tuple[str, dict[str, str]]:
 
 
 class _Arguments(dict[str, str]):
-    """Arguments that record which of them the file declares, since xacro silently ignores unknown ones."""
+    """Xacro arguments that record which of them the file declares, since xacro silently ignores undeclared ones."""
 
     def __init__(self, arguments: dict[str, str]) -> None:
         super().__init__(arguments)
@@ -66,11 +70,11 @@ class _Arguments(dict[str, str]):
 
 
 def expand(path: str) -> str:
-    """Return the URDF text of a xacro file, whose path may be followed by arguments (``name:=value``).
+    """Return the URDF text for a xacro file, whose path may be followed by arguments (``name:=value``).
 
     Raises:
-        RobotError: if xacro fails (the message names the file and xacro's error), or for an argument that the file does
-            not declare.
+        RobotError: xacro fails (the message contains the file and xacro's error), or the file does not declare an
+            argument.
     """
     xacro = import_module("xacro")
 
@@ -91,7 +95,7 @@ def expand(path: str) -> str:
             raise cause from None
         reason = " ".join(str(error).split()) or repr(error)
         missing = _MISSING.search(reason)
-        hint = f"; say it behind the file: {missing[1]}:=…" if missing else ""
+        hint = f"; state it after the file: {missing[1]}:=…" if missing else ""
         raise RobotError(f"{_location(xacro, file)}: xacro: {reason}{hint}") from error
     declared = sorted(str(name) for name in arguments.declared)
     for name in stated_arguments:
@@ -110,7 +114,13 @@ def _location(xacro: ModuleType, file: str) -> str:
 
 @contextmanager
 def _packages_for(file: Path) -> Iterator[None]:
-    """Let ``$(find NAME)`` of xacro, which asks ROS's index by this import, find packages by `package_folder`."""
+    """Within this context, xacro's ``$(find NAME)`` finds packages by `package_folder`.
+
+    Xacro looks packages up in ROS's package index, whose module is replaced meanwhile.
+
+    Args:
+        file: the robot description, from whose folder packages are searched.
+    """
     from unittest.mock import patch  # slow to load
 
     index = ModuleType("ament_index_python.packages")
@@ -120,10 +130,10 @@ def _packages_for(file: Path) -> Iterator[None]:
 
 
 def package_folder(name: str, file: Path) -> Path:
-    """Return the folder of a ROS package that a robot's file names.
+    """Return the folder of the ROS package `name`, which the robot description `file` refers to.
 
     Raises:
-        RobotError: if the package is not found.
+        RobotError: the package is not found.
     """
     parents = file.resolve().parents
     packages = map(_packages_in, (*parents[:MAX_ABOVE], *package_folders()))
@@ -132,7 +142,7 @@ def package_folder(name: str, file: Path) -> Path:
             return folder
     refuse_robot(
         file,
-        f"there is no package '{name}' among the folders above it and beside those; say where packages are by "
+        f"there is no package '{name}' among the folders above it and beside those; state where packages are by "
         f"{PACKAGE_PATH}=/folder/that/holds/{name} (several: separated by {os.pathsep})",
     )
 
@@ -144,7 +154,7 @@ def _packages_in(folder: Path) -> Iterator[Path]:
 
 
 def _name_in(package: Path) -> str:
-    """Return the name in a ``package.xml``; "" where there is none."""
+    """Return the package name in a ``package.xml``; "" if the file or the name is missing."""
     with suppress(OSError, ET.ParseError):
         return (ET.parse(package).getroot().findtext("name") or "").strip()
     return ""

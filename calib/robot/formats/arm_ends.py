@@ -44,8 +44,8 @@ class ArmEnds:
 
     Attributes:
         base, tip: names of the two links.
-        reason: reason for the choice of the tip, as words that follow its name.
-        unused: remarks on joints that are not in the arm, columns that are not used, frames that are not taken.
+        reason: why the tip was chosen, worded to follow the tip's name.
+        unused: remarks on joints outside the arm, columns that are not used, and frames that were not chosen.
     """
 
     base: str
@@ -55,20 +55,21 @@ class ArmEnds:
 
     @property
     def words(self) -> str:
-        """The tip, the reason for its choice, and the remarks on what is not part of the arm, as text."""
+        """Text with the tip, why it was chosen, and remarks on what is not part of the arm."""
         return "; ".join([f"{self.tip}, {self.reason}", *self.unused])
 
 
 def choose(tree: UrdfTree, base: str, joint_names: Sequence[str] | None = None) -> ArmEnds:
-    """Return the ends of the arm that begins at `base`.
+    """Return base and tip of the arm that begins at the link `base`.
 
     Args:
         tree: the checked tree of a URDF.
         base: name of the arm's base link.
-        joint_names: joints that have columns in a table; the arm ends with the last of them, gripper jaws excepted.
+        joint_names: joints with columns in a table; the arm ends with the last of them, gripper jaws excepted. None:
+            all joints of the tree.
 
     Raises:
-        RobotError: if the choice is ambiguous; the message lists the candidates.
+        RobotError: the choice is ambiguous; the message lists the candidates.
     """
     axes = _Axes(tree, base)
     ends = axes.chains if joint_names is None else axes.named(joint_names)
@@ -83,10 +84,12 @@ def choose(tree: UrdfTree, base: str, joint_names: Sequence[str] | None = None) 
 
 
 class _Axes:
-    """The joints below a link of a tree, divided into axes of arms and joints that are no axes (jaws, fingers).
+    """The joints below a link of a tree, divided into axes of arms and other joints (gripper jaws, fingers).
+
+    A body is named by the link after its moving joint, and includes all links fixed to this link.
 
     Attributes:
-        aside: actuated joints that are no axes, by name, each with the reason.
+        aside: name of each actuated joint that is not an axis, to the reason.
         chains: last bodies of the longest chains of axes: one, or one per arm.
     """
 
@@ -110,24 +113,26 @@ class _Axes:
         return sum(joint.actuated for joint in self.tree.path(self.base, link))
 
     def height(self, joint: JointTag) -> int:
-        """Return the number of axes on the longest chain that begins with a joint; 0 if the joint is no axis."""
+        """Return the number of axes on the longest chain that begins with a joint; 0 if the joint is not an axis."""
         if joint.name in self.aside:
             return 0
         behind = [self.height(child) for child in self.tree.below[joint.child]]
         return joint.actuated + max(behind, default=0)
 
     def departing(self, body: str) -> list[JointTag]:
-        """Return the moving joints whose parent link is fixed to a body's link."""
+        """Return the moving joints whose parent link is fixed to the body `body`."""
         joints: list[JointTag] = []
         for link, _ in self.tree.rigid(body):
             joints += [joint for joint in self.tree.below[link] if joint.moves]
         return joints
 
     def named(self, joint_names: Sequence[str]) -> list[str]:
-        """Return the last bodies of the chains that hold the named joints, jaws left out where any joint remains.
+        """Return the last bodies of the chains that contain the named joints.
+
+        Gripper jaws are left out, unless only jaws are named.
 
         Raises:
-            RobotError: for the name of a joint that does not exist.
+            RobotError: a joint that does not exist.
         """
         joints = self.tree.joints
         for name in joint_names:
@@ -142,7 +147,12 @@ class _Axes:
         return self._rivals(_leaves(self.tree, bodies))
 
     def remarks(self, body: str, joint_names: Sequence[str] | None) -> tuple[str, ...]:
-        """Return remarks on jaws, columns of which are not used, and on a tool0 that is not at the end of the arm."""
+        """Return remarks on gripper jaws, on columns that are not used, and on a tool0 that does not end the arm.
+
+        Args:
+            body: last body of the arm.
+            joint_names: joints with columns in a table; None without a table.
+        """
         path = {joint.name for joint in self.tree.path(self.base, body)}
         joints = self.tree.joints
         joints_by_reason: dict[str, list[str]] = {}
@@ -162,11 +172,11 @@ class _Axes:
             axes_behind = self.depth(body) - self.depth(joint.child)
             for name, _ in self.tree.rigid(joint.child):
                 if TOOL0.search(name) and name not in links:
-                    result.append(f"{name} is not taken: {axes_behind} axes follow it")
+                    result.append(f"{name} is not taken as the end: {axes_behind} axes follow it")
         return tuple(dict.fromkeys(result))
 
     def _reached(self) -> list[str]:
-        """Return the links below the base, the base first, without those behind joints that are no axes."""
+        """Return the links below the base, the base first, except those after joints that are not axes."""
         result: list[str] = []
         todo = [self.base]
         while todo:
@@ -176,7 +186,7 @@ class _Axes:
         return result
 
     def _last_bodies(self) -> list[str]:
-        """Return the bodies behind axes that no other axis departs from."""
+        """Return the bodies after an axis from which no other axis departs."""
         last: list[str] = []
         for body in self._bodies():
             followed = any(self.height(joint) for joint in self.departing(body))
@@ -185,13 +195,13 @@ class _Axes:
         return _leaves(self.tree, last)
 
     def _is_driven(self, body: str) -> bool:
-        """Return whether a body's joint is actuated, or a mimic of the joint before it in the chain."""
+        """Return whether a body's joint is actuated, or is a mimic of a joint before it in the chain."""
         joint = self.tree.above[body]
         leader = self.tree.joints.get(joint.mimic.leader) if joint.mimic else None
         return joint.actuated or (leader is not None and _hangs(self.tree, body, leader.child))
 
     def _rivals(self, bodies: list[str]) -> list[str]:
-        """Return those of several last bodies that end the longest chain or another arm."""
+        """Return which of the last bodies end the longest chain, or end another arm."""
         depth = max(self.depth(body) for body in bodies)
         longest = [body for body in bodies if self.depth(body) == depth]
         shorter = [body for body in bodies if body not in longest]
@@ -199,7 +209,12 @@ class _Axes:
         return [*longest, *arms]
 
     def _is_another_arm(self, body: str, main: str) -> bool:
-        """Return whether, behind the link where both part, a chain has nearly as many axes as the longest chain."""
+        """Return whether a chain has nearly as many axes as the longest one after the link at which the two branch.
+
+        Args:
+            body: last body of the chain.
+            main: last body of the longest chain.
+        """
         path = self.tree.path(self.base, body)
         main_path = self.tree.path(self.base, main)
         shared = sum(joint.actuated for joint, main_joint in zip(path, main_path) if joint.name == main_joint.name)
@@ -208,7 +223,11 @@ class _Axes:
         return axes >= ARM_AXES and axes >= ARM_SHARE * main_axes
 
     def _mimicking(self) -> dict[str, str]:
-        """Return mimic joints whose leader is in another branch, and leaders that no actuated joint follows."""
+        """Return the joints that a mimic relation between branches shows to be jaws, each with the reason.
+
+        These are mimic joints whose leader is in another branch, and the leaders themselves if no actuated joint
+        follows.
+        """
         tree = self.tree
         result: dict[str, str] = {}
         for joint in tree.joints.values():
@@ -222,7 +241,10 @@ class _Axes:
         return result
 
     def _named_jaws(self) -> dict[str, str]:
-        """Return joints at the ends of chains that are jaws or fingers by name, with those before them."""
+        """Return the joints at the ends of chains that have names of jaws or fingers, each with the reason.
+
+        Joints directly before them with such names are included.
+        """
         result: dict[str, str] = {}
         jaws = [joint for joint in self.tree.joints.values() if joint.actuated and self._is_jaw(joint)]
         jaws.sort(key=self._depth_in_tree, reverse=True)
@@ -241,7 +263,10 @@ class _Axes:
         return len(self.tree.ancestry(joint.child))
 
     def _is_jaw(self, joint: JointTag) -> bool:
-        """Return whether a joint's or its link's name is that of a jaw; words common to the whole arm are ignored."""
+        """Return whether the name of a joint or of its link is that of a jaw.
+
+        Words that also occur in the name of the chain's first joint are ignored, since they are a prefix of all names.
+        """
         first = self._first(joint.child)
         name, link = joint.name.lower(), joint.child.lower()
         if name == first or self._is_named_axis(joint):
@@ -251,9 +276,7 @@ class _Axes:
         return not self._in_series(joint) and any(word in link and word not in first for word in FINGER_WORDS)
 
     def _behind_flange(self) -> dict[str, str]:
-        """Return the joints behind bodies with a tool0 or a flange, if those joints belong to a tool; each with the
-        reason.
-        """
+        """Return the joints after bodies with a tool0 or a flange that belong to a tool, each with the reason."""
         result: dict[str, str] = {}
         for body in self._bodies():
             frames = [link for link, _ in self.tree.rigid(body) if TOOL0.search(link) or FLANGE.search(link)]
@@ -264,7 +287,14 @@ class _Axes:
         return result
 
     def _is_tool(self, body: str, branches: list[JointTag]) -> bool:
-        """Return whether the joints departing from a body with a flange belong to a tool: one joint each, or a hand."""
+        """Return whether the joints that depart from a body with a flange belong to a tool.
+
+        A tool has single joints, or is a hand.
+
+        Args:
+            body: name of the body with the flange.
+            branches: joints that depart from the body.
+        """
         if any(self._in_series(joint) or self._is_named_axis(joint) for joint in branches):
             return False
         heights = [self.height(joint) for joint in branches]
@@ -272,7 +302,10 @@ class _Axes:
         return max(heights) < self.depth(body) and (single or self._is_hand(body, branches))
 
     def _beside_axis(self) -> dict[str, str]:
-        """Return the joints of short branches beside the branch that continues the arm (by name, or up to a flange)."""
+        """Return the joints of short branches beside the branch in which the arm continues, each with the reason.
+
+        The branch that continues the arm is known by its names, or because it leads to a flange.
+        """
         result: dict[str, str] = {}
         for body in self._bodies():
             branches = [joint for joint in self.departing(body) if self.height(joint)]
@@ -285,7 +318,7 @@ class _Axes:
         return result
 
     def _is_flanged(self, joint: JointTag) -> bool:
-        """Return whether a tool0 or a flange hangs on a joint or on what follows it."""
+        """Return whether a tool0 or a flange is fixed to a joint's child link or to a link after it."""
         for name in self._behind(joint):
             body = self.tree.joints[name].child
             if any(TOOL0.search(link) or FLANGE.search(link) for link, _ in self.tree.rigid(body)):
@@ -293,7 +326,7 @@ class _Axes:
         return False
 
     def _forked(self) -> dict[str, str]:
-        """Return the joints of hands: equally short branches at the end of a chain, nearest to the base first."""
+        """Return the joints of hands (equally short branches at the end of a chain), each with the reason."""
         fingers: dict[str, str] = {}
         for body in self._bodies():
             branches = [joint for joint in self.departing(body) if self.height(joint) and joint.name not in fingers]
@@ -303,9 +336,14 @@ class _Axes:
         return fingers
 
     def _is_hand(self, body: str, branches: list[JointTag]) -> bool:
-        """Return whether several branches are fingers: shorter than what is before, of one length, not named as axes.
+        """Return whether several branches are fingers of a hand.
 
-        Three or more may differ by a joint (a thumb).
+        Fingers are shorter than the chain before them, of equal length, and not named as axes. With three or more
+        branches, one may be longer by one joint (a thumb).
+
+        Args:
+            body: name of the body from which the branches depart.
+            branches: first joint of each branch.
         """
         if len(branches) < 2:
             return False
@@ -320,18 +358,19 @@ class _Axes:
         return True
 
     def _bodies(self) -> list[str]:
-        """Return the links behind moving joints that are reached, nearest to the base first."""
+        """Return the bodies below the base that are reached by axes, nearest to the base first."""
         return [link for link in self._reached() if link != self.base and self.tree.above[link].moves]
 
     def _behind(self, joint: JointTag) -> list[str]:
-        """Return the names of a joint and of all moving joints behind it."""
+        """Return the names of a joint and of all moving joints after it."""
         moving = [follower for follower in self.tree.joints.values() if follower.moves]
         behind = [follower.name for follower in moving if _hangs(self.tree, follower.child, joint.child)]
         return [joint.name, *behind]
 
     def _first(self, link: str) -> str:
-        """Return the name of the first actuated joint before a link, in lower case; its words may be a prefix of all
-        names.
+        """Return the name of the first actuated joint between the root and a link, in lower case.
+
+        Words in this name may be a prefix of all names.
         """
         return next(joint.name.lower() for joint in self.tree.ancestry(link) if joint.actuated)
 
@@ -339,13 +378,13 @@ class _Axes:
         return bool((AXIS_WORDS & _words(joint.name)) - _words(self._first(joint.child)))
 
     def _in_series(self, joint: JointTag) -> bool:
-        """Return whether a joint's name is that of the actuated joint before it with the next number or letter."""
+        """Return whether a joint's name is that of the actuated joint before it, with the next number or letter."""
         before = [earlier for earlier in self.tree.ancestry(joint.child)[:-1] if earlier.actuated]
         return bool(before) and _follows(before[-1].name, joint.name)
 
 
 def _follows(before: str, name: str) -> bool:
-    """Return whether two names begin alike up to a number that grows by one: ``joint_1_s``, ``joint_2_l``."""
+    """Return whether `before` and `name` begin alike and end in numbers n and n + 1: ``joint_1_s``, ``joint_2_l``."""
     first = NUMBERED.match(before.lower())
     second = NUMBERED.match(name.lower())
     if first is None or second is None:
@@ -358,7 +397,12 @@ def _hangs(tree: UrdfTree, link: str, on: str) -> bool:
 
 
 def _frame(tree: UrdfTree, body: str) -> tuple[str, str]:
-    """Return the link of a last body at which the arm ends, and why."""
+    """Return the link at which an arm with the last body `body` ends, and the reason.
+
+    Args:
+        tree: the URDF.
+        body: name of the arm's last body.
+    """
     links = [link for link, _ in tree.rigid(body)]
     for pattern, reason in ((TOOL0, "its tool frame (REP 199)"), (FLANGE, "its flange (REP 199)")):
         frames = [link for link in links if pattern.search(link)]
@@ -374,11 +418,18 @@ def _frame(tree: UrdfTree, body: str) -> tuple[str, str]:
         return leaves[0], "the last link"
     if len(leaves) == 1:
         return leaves[0], "the last link that is no gripper or sensor"
-    return body, f"the last moving link ({listing(leaves, 4)} hang on it; --tip takes one of them)"
+    return body, f"the last moving link ({listing(leaves, 4)} are attached to it; choose one by --tip)"
 
 
 def _without_tools(tree: UrdfTree, body: str) -> list[str]:
-    """Return the links fixed to a body, the body's main link first, without grippers, sensors and links on these."""
+    """Return the links fixed to a body, except grippers, sensors and links on these.
+
+    The first one is the body's main link.
+
+    Args:
+        tree: the URDF.
+        body: name of the body.
+    """
     prefix = body.lower()
     result: list[str] = []
     todo = [body]
@@ -397,7 +448,7 @@ def _without_tools(tree: UrdfTree, body: str) -> list[str]:
 
 
 def _leaves(tree: UrdfTree, links: Iterable[str]) -> list[str]:
-    """Return those of `links` that have no child among `links`."""
+    """Return which of `links` have no descendant in `tree` that is also one of `links`."""
     links = list(links)
     before: set[str] = set()
     for link in links:
@@ -406,5 +457,5 @@ def _leaves(tree: UrdfTree, links: Iterable[str]) -> list[str]:
 
 
 def _words(link: str) -> set[str]:
-    """Return the words of a link's name: runs of letters, in small letters."""
+    """Return the words in a link's name: sequences of letters, in lower case."""
     return set(re.findall(r"[a-z]+", link.lower()))

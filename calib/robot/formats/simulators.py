@@ -25,11 +25,13 @@ from calib.transforms import invert
 
 
 def mjcf_text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: np.ndarray, friction: np.ndarray) -> str:
-    """Return the MJCF text of a chain with its bodies and drives.
+    """Return the MJCF text of a chain with bodies and drives.
 
     Args:
-        bodies: (B, 10) standard parameters of the body after each moving element.
-        armature, damping, friction: (n,) of each joint [kg m², N m s/rad, N m, or kg, N s/m, N].
+        chain: the arm.
+        bodies: (B, 10) standard parameters of the body after each of B moving elements.
+        armature, damping, friction: (n,) motor inertia, viscous and Coulomb friction of each joint [kg m², N m s/rad, N
+            m, or kg, N s/m, N].
     """
     root = ET.Element("mujoco", model=chain.name)
     main_elements = set(chain.moving.tolist())
@@ -71,7 +73,7 @@ def mjcf_text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: n
 
 
 def joint_name(chain: Chain, k: int) -> str:
-    """Return the MJCF joint name of moving element k: the chain joint's name, or the name of a mimic follower."""
+    """Return the MJCF name of the joint that moves element k: the chain joint's name, or that of a mimic follower."""
     element = chain.elements[k]
     main = k in chain.moving.tolist()
     return chain.joints[element.joint or 0].name if main else element.name.removesuffix(".offset")
@@ -87,11 +89,11 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
 
     Args:
         source: URDF text.
-        chain: the chain read from the text by `calib.robot.formats.urdf`; its joints are the columns of q.
+        chain: the chain that `calib.robot.formats.urdf` read from the text; its joints are the columns of q.
         q: (m, n) joint values [rad or m].
 
     Raises:
-        RobotError: if Pinocchio cannot read the text.
+        RobotError: Pinocchio cannot read the text.
     """
     pin = import_module("pinocchio")
     model = pinocchio_model(source)
@@ -105,21 +107,29 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def link_frame(model: NativeModel, link: str) -> int:
-    """Return the number of a link's frame in Pinocchio's model; a joint may have the same name."""
+    """Return the index of the frame of the link named `link` in Pinocchio's model; a joint of this name is ignored."""
     pin = import_module("pinocchio")
     return model.getFrameId(link, pin.FrameType.BODY)
 
 
 def driven_joints(model: NativeModel, chain: Chain) -> list[NativeModel]:
-    """Return Pinocchio's joints of a chain's moving elements, including mimic followers."""
+    """Return Pinocchio's joints for the moving elements of a chain, including mimic followers.
+
+    Args:
+        model: Pinocchio's model of the same robot.
+        chain: the arm.
+    """
     return [model.joints[model.getJointId(joint_name(chain, k))] for k in chain.driven.tolist()]
 
 
 def configurations(model: NativeModel, chain: Chain, q: np.ndarray, from_zero: bool = False) -> np.ndarray:
-    """Return Pinocchio's configurations (m, nq) at joint values q (m, n): cosine and sine for continuous joints.
+    """Return Pinocchio's configurations (m, nq) at joint values q (m, n); continuous joints have cosine and sine.
 
     Args:
-        from_zero: whether the model's frames at zero hold the chain's constant values.
+        model: Pinocchio's model.
+        chain: the arm.
+        q: joint values [rad or m].
+        from_zero: whether the model's frames at zero already include the chain's constant values.
     """
     pin = import_module("pinocchio")
     result = np.tile(pin.neutral(model), (len(q), 1))
@@ -139,16 +149,16 @@ def motion_torques(
 
     Args:
         source: URDF or MJCF text.
-        chain: supplies joints, gravity (in the root's frame) and mimic ratios; other joints are fixed at zero.
-        q, v, a: (m, n) [rad or m, and per s, per s²].
-        mjcf: whether it is MJCF, where the frames at q = 0 hold the chain's constant values.
+        chain: the arm, for joints, gravity (in the root's frame) and mimic ratios; all other joints are fixed at zero.
+        q, v, a: (m, n) joint positions, velocities and accelerations [rad or m, per s, per s²].
+        mjcf: whether the text is MJCF, in which the frames at q = 0 already include the chain's constant values.
 
     Returns:
-        Torques (m, n) of `rnea`, armature included; frames of the bodies behind the moving elements (moving, m, 4, 4);
+        Torques (m, n) of `rnea`, armature included; frames (moving, m, 4, 4) of the bodies after the moving elements;
         damping and friction (n,).
 
     Raises:
-        RobotError: if Pinocchio cannot read the text.
+        RobotError: Pinocchio cannot read the text.
     """
     pin = import_module("pinocchio")
     model = pinocchio_model(source, mjcf)
@@ -167,10 +177,14 @@ def motion_torques(
 
 
 def pinocchio_model(source: str, mjcf: bool = False) -> NativeModel:
-    """Return Pinocchio's model of a URDF or MJCF text; it reads MJCF from a temporary file.
+    """Return Pinocchio's model of a URDF or MJCF text; MJCF is written to a temporary file first.
+
+    Args:
+        source: URDF or MJCF text.
+        mjcf: whether the text is MJCF.
 
     Raises:
-        RobotError: where Pinocchio cannot read the text.
+        RobotError: Pinocchio cannot read the text.
     """
     pin = import_module("pinocchio")
     file_format = "MJCF" if mjcf else "URDF"
@@ -190,10 +204,12 @@ def link_poses(source: str, links: Sequence[str], base: str, joints: Sequence[st
     Args:
         source: URDF text; meshes are ignored.
         links, base: names of links.
-        joints: names of the joints that q (m, n) belongs to [rad or m]; others are zero, mimic followers follow.
+        joints: names of the joints in the columns of q. Other joints are zero, and mimic followers follow their
+            leaders.
+        q: (m, n) joint values [rad or m].
 
     Raises:
-        RobotError: if yourdfpy cannot read the text.
+        RobotError: yourdfpy cannot read the text.
     """
     import yourdfpy  # and trimesh with it: a second to load
 

@@ -34,16 +34,16 @@ _SUFFIX = {"tx": "x", "ty": "y", "tz": "z", "rx": "rx", "ry": "ry", "rz": "rz"}
 def read(
     path: str | Path, base: str | None = None, tip: str | None = None, joint_names: Sequence[str] | None = None
 ) -> Chain:
-    """Return the chain from `base` to `tip` of a URDF file.
+    """Return the chain from `base` to `tip` in a URDF file.
 
     Args:
         path: the file.
-        base: a link; default the root.
-        tip: a link; default see `calib.robot.formats.arm_ends`.
-        joint_names: joints named in a measurement file; a chain with other joints is refused.
+        base: name of the base link; None: the root.
+        tip: name of the tip link; None: chosen by `calib.robot.formats.arm_ends`.
+        joint_names: joints named in a measurement file; a chain with other joints is refused. None: no such check.
 
     Raises:
-        RobotError: for an invalid URDF, or if the chain is ambiguous or no serial arm.
+        RobotError: an invalid URDF, an ambiguous chain, or one that is not a serial arm.
     """
     return parse(text(path)[0], str(path), base, tip, joint_names)
 
@@ -55,7 +55,15 @@ def parse(
     tip: str | None = None,
     joint_names: Sequence[str] | None = None,
 ) -> Chain:
-    """Return the chain from `base` to `tip` of a URDF text; `where` names it in messages."""
+    """Return the chain from `base` to `tip` in a URDF text.
+
+    The exceptions are those of `read`.
+
+    Args:
+        source: text of the URDF.
+        where: name of the text in messages.
+        base, tip, joint_names: as in `read`.
+    """
     tree = read_tree(source, where)
     return build(tree, ends(tree, base, tip, joint_names))
 
@@ -63,12 +71,18 @@ def parse(
 def ends(
     tree: UrdfTree, base: str | None = None, tip: str | None = None, joint_names: Sequence[str] | None = None
 ) -> ArmEnds:
-    """Return the base and tip links of the chain, by default chosen from the tree (`calib.robot.formats.arm_ends`).
+    """Return the base and tip links of the chain.
 
-    The base defaults to the root.
+    By default, the base is the root, and the tip is chosen from the tree (`calib.robot.formats.arm_ends`).
+
+    Args:
+        tree: the URDF.
+        base: name of the base link; None: the root.
+        tip: name of the tip link; None: chosen.
+        joint_names: joints with columns in a table; the arm ends with the last of them. None: all joints count.
 
     Raises:
-        RobotError: if the choice is ambiguous; the message lists the candidates.
+        RobotError: the choice is ambiguous; the message lists the candidates.
     """
     if base is None:
         if len(tree.roots) > 1:
@@ -84,7 +98,12 @@ def ends(
 
 
 def build(tree: UrdfTree, between: ArmEnds) -> Chain:
-    """Return the chain between two links of a checked tree."""
+    """Return the chain between two links of a checked URDF tree.
+
+    Args:
+        tree: the URDF.
+        between: base and tip of the chain.
+    """
     path = tree.path(between.base, between.tip)
     actuated = [joint for joint in path if joint.actuated]
     index = {joint.name: j for j, joint in enumerate(actuated)}
@@ -116,7 +135,12 @@ def build(tree: UrdfTree, between: ArmEnds) -> Chain:
 
 
 def _unused_faults(tree: UrdfTree, path: list[JointTag]) -> list[str]:
-    """Return remarks on joints outside the chain whose limits are wrong."""
+    """Return remarks on joints outside the chain `path` that have invalid limits.
+
+    Args:
+        tree: the URDF.
+        path: joints of the chain.
+    """
     path_joints = {joint.name for joint in path}
     result = []
     for joint in tree.joints.values():
@@ -127,9 +151,9 @@ def _unused_faults(tree: UrdfTree, path: list[JointTag]) -> list[str]:
 
 
 def align(axis: np.ndarray) -> np.ndarray:
-    """Return the rotation (4, 4) that turns z onto a unit axis (3,); the identity for ±x ±y ±z.
+    """Return the rotation (4, 4) that maps the z axis to a unit axis (3,); the identity for ±x ±y ±z.
 
-    The columns x and y are any two that complete z (our choice: from the coordinate axis farthest from it).
+    The columns x and y are any two that complete the frame (our choice: from the coordinate axis farthest from z).
     """
     if np.count_nonzero(axis) == 1:
         return _IDENTITY
@@ -141,7 +165,15 @@ def align(axis: np.ndarray) -> np.ndarray:
 def _elements(
     joint: JointTag, placement: np.ndarray, owner: int, mover: int, ratio: float, offset: float
 ) -> list[Element]:
-    """Return the six elements of a joint: translations, rotations, the moving one last."""
+    """Return the six elements of a joint: translations, rotations, and the moving one last.
+
+    Args:
+        joint: the joint.
+        placement: (4, 4) fixed transform before the elements.
+        owner: index of the joint whose frame the elements place.
+        mover: index of the joint that moves the last element.
+        ratio, offset: multiplier and offset of a mimic joint; 1 and 0 for other joints.
+    """
     # An oblique axis is z of the frame that `align` turned.
     direction, sign = 2, 1.0
     if np.count_nonzero(joint.axis) == 1:
@@ -158,7 +190,14 @@ def _elements(
 
 
 def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
-    """Return the actuated joint that moves `joint`, the ratio and the offset, through chains of mimic joints."""
+    """Return the name of the actuated joint that moves `joint`, and ratio and offset of this motion.
+
+    Chains of mimic joints are followed.
+
+    Args:
+        tree: the URDF.
+        joint: a moving joint; an independent one moves itself, with ratio 1 and offset 0.
+    """
     ratio, offset, name = 1.0, 0.0, joint.name
     where = f"{tree.where}, line {joint.node.line}, joint '{joint.name}'"
     passed = {name}
@@ -168,7 +207,7 @@ def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
         ratio *= mimic.multiplier
         name = mimic.leader
         if name in passed:
-            refuse_robot(where, "it mimics a circle")
+            refuse_robot(where, "its <mimic> leads back to itself")
         if name not in tree.joints:
             refuse_robot(where, f"it mimics '{name}', which is not a joint{suggestion(name, tree.joints)}")
         passed.add(name)
@@ -177,7 +216,14 @@ def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
 
 
 def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint_names: Sequence[str] | None) -> None:
-    """Refuse a path that is not a serial arm, or whose joints differ from the measured ones."""
+    """Raise RobotError for a path that is not a serial arm, or whose joints differ from the measured ones.
+
+    Args:
+        tree: the URDF.
+        path: joints from base to tip.
+        base, tip: names of the two links, for messages.
+        joint_names: joints named in a measurement file; None: no comparison.
+    """
     actuated = [joint.name for joint in path if joint.actuated]
     if not actuated:
         refuse_robot(tree.where, f"no actuated joint between '{base}' and '{tip}'; choose another base or tip")
@@ -207,9 +253,13 @@ def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint
 
 
 def _inertias(tree: UrdfTree, path: list[JointTag]) -> np.ndarray | None:
-    """Return standard parameters (n, 10) about the frames after the moving elements; None without masses.
+    """Return standard parameters (n, 10) about the frames after the joints' moving elements; None without masses.
 
-    Also None where the body behind a mimic follower has mass, since there is one row per joint only.
+    None also if the body after a mimic follower has mass, since there is only one row per joint.
+
+    Args:
+        tree: the URDF.
+        path: joints from base to tip.
     """
     rows = []
     for joint in path:

@@ -27,20 +27,20 @@ from calib.transforms import from_xyz_rpy
 
 
 class DescriptionReader(Protocol):
-    """Reader of robots that another program describes, as URDF."""
+    """Protocol of readers that convert another program's robot descriptions to URDF."""
 
     def takes(self, path: str) -> bool:
-        """Return whether `urdf` converts this file."""
+        """Return whether this reader can convert the file at `path`."""
         ...
 
     def urdf(self, path: str) -> str:
-        """Return the URDF text of a file."""
+        """Return the URDF text for the file at `path`."""
         ...
 
 
 DESCRIPTIONS: Point[DescriptionReader] = Point("descriptions", "readers of robots' descriptions that are no URDF")
 
-XACRO = "this is a xacro file; name it so (robot.urdf.xacro)"
+XACRO = "this is a xacro file; rename it to end in .xacro (robot.urdf.xacro)"
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
@@ -49,7 +49,15 @@ _BLANK = re.compile(rb"\s*")
 
 @dataclass(frozen=True)
 class Node:
-    """XML element: tag, attributes, line (from 1), byte position of its ``<`` in the UTF-8 text, children."""
+    """XML element with its position in the text.
+
+    Attributes:
+        tag: tag of the element.
+        attributes: names to values of its attributes.
+        line: line in the text, from 1.
+        start: byte position of its ``<`` in the UTF-8 text.
+        children: the direct child elements.
+    """
 
     tag: str
     attributes: dict[str, str]
@@ -62,12 +70,12 @@ class Node:
         return (child for child in self.children if child.tag == tag)
 
     def first(self, tag: str) -> Node | None:
-        """Return the first direct child with this tag, or None."""
+        """Return the first direct child with this tag; None if there is none."""
         return next(self.all(tag), None)
 
 
 def converter(path: str | Path) -> DescriptionReader | None:
-    """Return the reader that converts this file to a URDF; None where there is none."""
+    """Return the reader that converts the file at `path` to a URDF; None if there is none."""
     for reader in DESCRIPTIONS.all():
         if reader.takes(str(path)):
             return reader
@@ -75,15 +83,24 @@ def converter(path: str | Path) -> DescriptionReader | None:
 
 
 def is_urdf(path: Path) -> bool:
-    """Return whether `text` returns a URDF for this file, read or converted."""
+    """Return whether a file is a URDF, or can be converted to one, so that `text` returns its URDF text.
+
+    Args:
+        path: the file.
+    """
     return path.suffix == ".urdf" or converter(path) is not None
 
 
 def text(path: str | Path) -> tuple[str, str]:
-    """Return a URDF's text with unchanged line ends, and its declared encoding (default UTF-8); converted if need be.
+    """Return the text of a URDF file, with unchanged line ends, and its declared encoding (default UTF-8).
+
+    Other descriptions are converted first; the encoding is then UTF-8.
+
+    Args:
+        path: the file; arguments for a converter may follow.
 
     Raises:
-        RobotError: if the file cannot be read, decoded or converted.
+        RobotError: the file cannot be read, decoded or converted.
     """
     room = converter(path)
     if room is not None:
@@ -106,10 +123,14 @@ def text(path: str | Path) -> tuple[str, str]:
 
 
 def parse(source: str, where: str) -> Node:
-    """Return the root element of an XML text.
+    """Return the root element of an XML text; `where` names the text in messages.
+
+    Args:
+        source: the XML text.
+        where: name of the text in messages.
 
     Raises:
-        RobotError: if the text is not well-formed; with line and column.
+        RobotError: the text is not well-formed; the message has line and column.
     """
     parser = expat.ParserCreate()
     root: list[Node] = []
@@ -135,7 +156,12 @@ def parse(source: str, where: str) -> Node:
 
 
 def edited(source: str, changes: Iterable[tuple[int, int, str]]) -> str:
-    """Return the text with byte ranges (start, end, replacement) of its UTF-8 form replaced, without overlaps."""
+    """Return the text after replacing byte ranges of its UTF-8 form.
+
+    Args:
+        source: the text.
+        changes: (start, end, replacement) of each range; ranges must not overlap.
+    """
     data = source.encode("utf-8")
     for start, end, replacement in sorted(changes, reverse=True):
         data = data[:start] + replacement.encode("utf-8") + data[end:]
@@ -143,7 +169,15 @@ def edited(source: str, changes: Iterable[tuple[int, int, str]]) -> str:
 
 
 def set_attributes(source: str, node: Node, values: dict[str, str]) -> list[tuple[int, int, str]]:
-    """Return the changes (for `edited`) that set a node's attributes, in place or after the last one."""
+    """Return the changes (for `edited`) that set attributes of a node.
+
+    Existing attributes are changed in place; new ones are added after the last attribute.
+
+    Args:
+        source: the text that contains the node.
+        node: the XML element.
+        values: attribute name to new value.
+    """
     data = source.encode("utf-8")
     end = node.start + 1 + len(node.tag.encode())
     matches: dict[str, re.Match[bytes]] = {}
@@ -164,7 +198,13 @@ def set_attributes(source: str, node: Node, values: dict[str, str]) -> list[tupl
 
 
 def insert_child(source: str, node: Node, child: str) -> list[tuple[int, int, str]]:
-    """Return the change that inserts a first child into a node, with the indentation of the next child."""
+    """Return the change (for `edited`) that inserts a first child into a node, indented like the next child.
+
+    Args:
+        source: the text that contains the node.
+        node: the parent element.
+        child: text of the child element.
+    """
     data = source.encode("utf-8")
     attributes_end = max([match.end() for match in _attributes(data, node)], default=node.start)
     tag_end = data.index(b">", attributes_end) + 1
@@ -176,7 +216,12 @@ def insert_child(source: str, node: Node, child: str) -> list[tuple[int, int, st
 
 
 def _attributes(data: bytes, node: Node) -> Iterator[re.Match[bytes]]:
-    """Yield the matches (name, quoted value) of a node's attributes."""
+    """Yield a regular-expression match (name, quoted value) for each attribute of a node.
+
+    Args:
+        data: UTF-8 bytes of the text.
+        node: the XML element.
+    """
     position = node.start + 1 + len(node.tag.encode())
     while match := _ATTRIBUTE.match(data, position):
         yield match
@@ -184,9 +229,13 @@ def _attributes(data: bytes, node: Node) -> Iterator[re.Match[bytes]]:
 
 
 def with_comment(content: bytes, remark: str) -> bytes:
-    """Return an XML file with an ASCII comment inserted after its declaration.
+    """Return an XML file's bytes with the ASCII comment `remark` inserted after the XML declaration.
 
-    A file in UTF-16 is returned as it is.
+    A file in UTF-16 is returned unchanged.
+
+    Args:
+        content: bytes of the file.
+        remark: text of the comment, in ASCII.
     """
     if b"\0" in content[:4]:
         return content
@@ -206,7 +255,7 @@ TURN = 2 * np.pi + 1e-3  # [rad]
 
 @dataclass(frozen=True)
 class Mimic:
-    """Mimic joint: q = multiplier · q_leader + offset [rad or m]."""
+    """Mimic joint: q = multiplier · q_leader + offset [rad or m]; `leader` is the name of the leading joint."""
 
     leader: str
     multiplier: float
@@ -215,9 +264,17 @@ class Mimic:
 
 @dataclass(frozen=True, eq=False)
 class JointTag:
-    """Joint of a URDF: origin (4, 4) in its parent link, unit axis (3,) in its frame, limits as in `_limits`.
+    """Joint of a URDF.
 
-    `fault` describes an error in the limits, which is raised only if the joint is part of the arm.
+    Attributes:
+        name, kind: name and URDF type of the joint.
+        parent, child: names of the two links.
+        origin: (4, 4) pose of the joint's frame in the parent link.
+        axis: (3,) unit axis in the joint's frame.
+        mimic: the mimic relation; None for an independent joint.
+        limits: limits as `_limits` returns them.
+        node: the XML element.
+        fault: description of an error in the limits, which is raised only if the joint is part of the arm; else empty.
     """
 
     name: str
@@ -240,10 +297,10 @@ class JointTag:
         return self.moves and self.mimic is None
 
     def as_joint(self) -> Joint:
-        """Return the `Joint` of a chain for this joint.
+        """Return this joint as a `Joint` of a chain.
 
         Raises:
-            RobotError: for wrong limits.
+            RobotError: invalid limits.
         """
         require(not self.fault, self.fault, RobotError)
         return Joint(self.name, "prismatic" if self.kind == "prismatic" else "revolute", *self.limits)
@@ -251,12 +308,14 @@ class JointTag:
 
 @dataclass(frozen=True, eq=False)
 class UrdfTree:
-    """A checked URDF: every link has one parent joint or none.
+    """A checked URDF, in which every link has at most one parent joint.
 
     Attributes:
-        bodies: link name to (10,) standard parameters XX XY XZ YY YZ ZZ MX MY MZ M about the link frame; None where
-            the link has no inertial.
-        joints: by name, in the order of the file.
+        name: name of the robot.
+        where: name of the URDF in messages.
+        bodies: link name to (10,) standard parameters XX XY XZ YY YZ ZZ MX MY MZ M about the link frame; None if the
+            link has no inertial.
+        joints: joint name to joint, in the order of the file.
         above: link name to its parent joint.
         below: link name to its child joints.
         remarks: remarks on suspicious values.
@@ -275,10 +334,14 @@ class UrdfTree:
         return [link for link in self.bodies if link not in self.above]
 
     def link(self, name: str, role: str) -> str:
-        """Return `name`; refuse a link that does not exist.
+        """Return `name` if a link has this name.
+
+        Args:
+            name: name of the link.
+            role: ``base`` or ``tip``, for the message.
 
         Raises:
-            RobotError: naming the most similar link name.
+            RobotError: there is no such link; the message suggests the most similar name.
         """
         if name not in self.bodies:
             known = ", ".join(self.bodies)
@@ -286,7 +349,7 @@ class UrdfTree:
         return name
 
     def ancestry(self, link: str) -> list[JointTag]:
-        """Return the joints from the root to `link`."""
+        """Return the joints on the path from the root to `link`."""
         result: list[JointTag] = []
         while link in self.above:
             result.append(self.above[link])
@@ -294,10 +357,10 @@ class UrdfTree:
         return result[::-1]
 
     def path(self, base: str, tip: str) -> list[JointTag]:
-        """Return the joints from `base` down to `tip`.
+        """Return the joints on the path from `base` to `tip`.
 
         Raises:
-            RobotError: if `tip` is not after `base`.
+            RobotError: `tip` is not a descendant of `base`.
         """
         joints = self.ancestry(tip)
         links = [*(joint.parent for joint in joints), tip]
@@ -306,7 +369,7 @@ class UrdfTree:
         return joints[links.index(base) :]
 
     def rigid(self, link: str) -> list[tuple[str, np.ndarray]]:
-        """Return the links fixed to `link` (itself first), each with its pose (4, 4) in the frame of `link`."""
+        """Return the links fixed to `link`, first `link` itself, each with its pose (4, 4) in the frame of `link`."""
         result, todo = [], [(link, np.eye(4))]
         while todo:
             name, pose = todo.pop(0)
@@ -316,11 +379,15 @@ class UrdfTree:
 
 
 def read(source: str, where: str) -> UrdfTree:
-    """Return the checked tree of a URDF text; `where` names it in messages.
+    """Return the checked tree of a URDF text; `where` names the text in messages.
+
+    Args:
+        source: text of the URDF.
+        where: name of the text in messages.
 
     Raises:
-        RobotError: with the line, for broken XML, xacro, unknown kinds, missing parts, loops, second parents, and
-            several angles beyond a full turn.
+        RobotError: broken XML, xacro commands, unknown joint types, missing parts, loops, links with two parents, or
+            several angles larger than a full turn. The message has the line.
     """
     root = parse(source, where)
     if root.tag != "robot":
@@ -354,10 +421,14 @@ def read(source: str, where: str) -> UrdfTree:
 
 
 def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
-    """Return a remark on a joint origin rotated by more than a full turn; refuse several (degrees).
+    """Return a remark on a joint origin that is rotated by more than a full turn; () without one.
+
+    Args:
+        joints: joint name to joint.
+        where: name of the URDF in messages.
 
     Raises:
-        RobotError: for several joints.
+        RobotError: several such joints, whose angles are probably in degrees.
     """
     origins = []
     for joint in joints.values():
@@ -375,10 +446,15 @@ def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
 
 
 def transform_body(body: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Return standard parameters (10,) transformed to the frame in which the body's frame has this pose (4, 4).
+    """Return standard parameters (10,) transformed to another frame.
 
-    With R, p of the pose and mc = (MX, MY, MZ): mc' = R mc + M p, and
-    I' = R I R' + S(p)'S(R mc) + S(R mc)'S(p) + M S(p)'S(p)  (Khalil and Dombre, 2002, eq. 9.25, signs of the matrix).
+    With R, p of the pose, M the mass, mc = (MX, MY, MZ), I the inertia about the frame's origin, S(·) the skew matrix
+    of a vector, and a prime for the other frame: mc' = R mc + M p, and I' = R I R' + S(p)'S(R mc) + S(R mc)'S(p) + M
+    S(p)'S(p)  (Khalil and Dombre, 2002, eq. 9.25, signs of the matrix).
+
+    Args:
+        body: standard parameters about the body's frame.
+        pose: (4, 4) pose of the body's frame in the other frame.
     """
     xx, xy, xz, yy, yz, zz = body[:6]
     rotation, lever, mass = pose[:3, :3], pose[:3, 3], body[9]
@@ -395,15 +471,21 @@ def _skew(v: np.ndarray) -> np.ndarray:
 
 
 def _is_macro(node: Node) -> bool:
-    """Return whether a node is a xacro call or include (leftover properties and arguments are accepted)."""
+    """Return whether a node is a xacro call or include; leftover xacro properties and arguments do not count."""
     return node.tag.startswith("xacro:") and node.tag not in ("xacro:property", "xacro:arg")
 
 
 def _fresh(node: Node, names: Iterable[str], where: str) -> str:
-    """Return the name of a link or joint; refuse a missing or duplicate name."""
+    """Return the name of a link or joint; raise RobotError for a missing name or one of `names`.
+
+    Args:
+        node: the XML element <link> or <joint>.
+        names: names that are already used.
+        where: text for messages.
+    """
     name = node.attributes.get("name", "")
-    require(name, f"{where}, line {node.line}: a <{node.tag}> without a name", RobotError)
-    require(name not in names, f"{where}, line {node.line}: a second {node.tag} named '{name}'", RobotError)
+    require(name, f"{where}, line {node.line}: a <{node.tag}> without a name: add one", RobotError)
+    require(name not in names, f"{where}, line {node.line}: a second {node.tag} named '{name}': rename one", RobotError)
     return name
 
 
@@ -425,7 +507,14 @@ def _joint(node: Node, links: Iterable[str], where: str) -> JointTag:
 
 
 def _end(node: Node, role: str, links: Iterable[str], where: str) -> str:
-    """Return the name of a joint's parent or child link."""
+    """Return the name of a joint's parent or child link; raise RobotError if it is missing or unknown.
+
+    Args:
+        node: the joint's XML element.
+        role: ``parent`` or ``child``.
+        links: names of the links.
+        where: text for messages.
+    """
     child = node.first(role)
     link = "" if child is None else child.attributes.get("link")
     if not link:
@@ -436,7 +525,12 @@ def _end(node: Node, role: str, links: Iterable[str], where: str) -> str:
 
 
 def origin(node: Node, where: str) -> np.ndarray:
-    """Return the transform (4, 4) of a node's first <origin>; the identity if absent."""
+    """Return the transform (4, 4) in a node's first <origin>; the identity if there is none.
+
+    Args:
+        node: the XML element that contains <origin>.
+        where: text for messages.
+    """
     tag = node.first("origin")
     if tag is None:
         return np.eye(4)
@@ -466,10 +560,15 @@ def _mimic(node: Node, where: str) -> Mimic | None:
 
 
 def _limits(node: Node, kind: str, where: str) -> tuple[float, float, float, float, tuple[str, ...]]:
-    """Return a joint's limits (lower, upper, velocity, effort), and as text those below `MIN_LIMIT`.
+    """Return a joint's limits (lower, upper, velocity, effort), and as texts those below `MIN_LIMIT`.
 
-    Infinite where not given or beyond 1e9, the last two also below `MIN_LIMIT`: URDF requires velocity and effort;
-    files state 0, and this toolkit 1e9, for unknown ones.
+    Limits that are missing or beyond 1e9 are infinite; so are velocity and effort below `MIN_LIMIT`. The reason is that
+    URDF requires velocity and effort, and files contain 0 for unknown values, and those of this toolkit 1e9.
+
+    Args:
+        node: the XML element <joint>.
+        kind: URDF type of the joint.
+        where: text for messages.
     """
     lower, upper, velocity, effort = -np.inf, np.inf, np.inf, np.inf
     tag = node.first("limit")
@@ -502,7 +601,12 @@ def _limits(node: Node, kind: str, where: str) -> tuple[float, float, float, flo
 
 
 def _body(node: Node, where: str) -> np.ndarray | None:
-    """Return the standard parameters (10,) of a link about its frame; None without mass."""
+    """Return the standard parameters (10,) of a link about the link's frame; None for a link without mass.
+
+    Args:
+        node: the XML element <link>.
+        where: text for messages.
+    """
     link_where = f"{where}, line {node.line}, link '{node.attributes.get('name')}'"
     inertial = node.first("inertial")
     if inertial is None:
@@ -520,7 +624,16 @@ def _body(node: Node, where: str) -> np.ndarray | None:
 
 
 def numbers(node: Node, key: str, where: str, default: str = "", count: int = 3, infinite: bool = False) -> np.ndarray:
-    """Return the numbers (count,) of an attribute, `default` if absent; only finite ones unless `infinite`."""
+    """Return the numbers (count,) in an attribute; raise RobotError for other texts.
+
+    Args:
+        node: the XML element.
+        key: name of the attribute.
+        where: text for messages.
+        default: value of a missing attribute.
+        count: number of numbers.
+        infinite: whether infinite numbers are accepted.
+    """
     attribute = node.attributes.get(key)
     numerals = default if attribute is None else attribute
     try:
@@ -539,7 +652,7 @@ def _number(node: Node, key: str, default: float, where: str) -> float:
 
 
 def _check_loops(tree: UrdfTree) -> None:
-    """Refuse a tree whose links form a loop, or that has no link."""
+    """Raise RobotError for a tree without links, or whose links form a loop."""
     reached: set[str] = set()
     todo = tree.roots
     while todo:

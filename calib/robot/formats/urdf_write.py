@@ -59,10 +59,10 @@ def put(
     """Return the URDF text with new inertials of some links and new ``<dynamics>`` of some joints.
 
     Args:
-        source: the text of a URDF.
+        source: text of a URDF.
         where: name of the URDF in messages.
         bodies: link name to standard parameters (10,) about the link's frame; all zero to remove the inertial.
-        friction: joint name to damping [N m s/rad or N s/m] and friction [N m or N].
+        friction: joint name to damping [N m s/rad or N s/m] and friction [N m or N]; None: unchanged.
     """
     root = parse(source, where)
     friction = friction or {}
@@ -80,9 +80,15 @@ def put(
 
 
 def hanging(tree: UrdfTree, path: list[JointTag], link: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return the links that move with a link of a path: links fixed to it, and links after other joints (at zero).
+    """Return the links that move with a link of a path: those fixed to it, and those after other joints (at zero).
 
-    Each is a map from a link's name to its pose (4, 4) in the frame of `link`; `link` is in the first map.
+    Args:
+        tree: the URDF.
+        path: joints of the path, which are not followed.
+        link: name of the link.
+
+    Returns:
+        Two mappings from link name to pose (4, 4) in the frame of `link`; the first one includes `link`.
     """
     onward = {joint.name for joint in path}
     fixed = dict(tree.rigid(link))
@@ -99,7 +105,11 @@ def hanging(tree: UrdfTree, path: list[JointTag], link: str) -> tuple[dict[str, 
 
 
 def centred(body: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return mass, centre of mass (3,) and the six moments about it of standard parameters (10,)."""
+    """Return a body's mass [kg], centre of mass (3,) [m], and the six moments about the centre of mass [kg m²].
+
+    Args:
+        body: (10,) standard parameters XX XY XZ YY YZ ZZ MX MY MZ M about the body's frame.
+    """
     mass = float(body[9])
     x, y, z = centre = body[6:9] / mass if mass else np.zeros(3)
     steiner = mass * np.array([y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y])
@@ -107,7 +117,11 @@ def centred(body: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def _inertial_parts(body: np.ndarray) -> dict[str, dict[str, str]]:
-    """Return the attributes of <origin>, <mass> and <inertia> of standard parameters (10,), by tag."""
+    """Return the attributes of <origin>, <mass> and <inertia> for standard parameters (10,), by tag.
+
+    Args:
+        body: (10,) standard parameters about the link's frame.
+    """
     mass, centre, moments = centred(body)
     inertia = {name: repr(float(moment)) for name, moment in zip(MOMENTS, moments)}
     xyz = " ".join(repr(float(coordinate)) for coordinate in centre)
@@ -132,7 +146,14 @@ def _tag(tag: str, values: Mapping[str, str]) -> str:
 
 
 def _child(source: str, node: Node, tag: str, values: dict[str, str]) -> list[tuple[int, int, str]]:
-    """Return the changes that set attributes of a node's first child with this tag; a missing child is inserted."""
+    """Return the changes that set attributes of a node's first child with this tag, which is inserted if missing.
+
+    Args:
+        source: the text that contains the node.
+        node: the parent element.
+        tag: tag of the child.
+        values: attribute name to new value.
+    """
     child = node.first(tag)
     if child is not None:
         return set_attributes(source, child, values)
@@ -140,23 +161,31 @@ def _child(source: str, node: Node, tag: str, values: dict[str, str]) -> list[tu
 
 
 def edit_file(source: str | Path, target: str | Path, nominal: Chain, calibrated: Chain) -> Path:
-    """Write `source` with the calibrated geometry to `target`, in the encoding the source declares."""
+    """Write the URDF `source` with the calibrated geometry to `target`, in the encoding that the source declares.
+
+    The path of the new file is returned.
+
+    Args:
+        source: the URDF of the nominal robot.
+        target: the file to write.
+        nominal, calibrated: the chain before and after calibration, as in `edit`.
+    """
     content, encoding = text(source)
     return files.write(target, edit(content, nominal, calibrated, str(source)).encode(encoding))
 
 
 def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") -> str:
-    """Return the URDF text with the calibrated geometry in its joint origins (equations above).
+    """Return the URDF text with the calibrated geometry in its joint origins (equations in the module's docstring).
 
     Args:
-        source: the text of a URDF that describes the nominal robot.
+        source: text of a URDF that describes the nominal robot.
         nominal: the chain before calibration; read from this URDF, or an MDH table of the same robot.
         calibrated: the same chain with other values.
         where: name of the text in messages.
 
     Raises:
-        RobotError: if the URDF does not describe the nominal robot (naming joint and difference), or if the calibrated
-            chain differs from the nominal one in more than values.
+        RobotError: the URDF does not describe the nominal robot (the message names joint and difference), or the
+            calibrated chain differs from the nominal one in more than values.
     """
     _check_pair(nominal, calibrated)
     tree = read_tree(source, where)
@@ -184,11 +213,11 @@ def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") ->
 
 
 def write_new(chain: Chain) -> str:
-    """Return a new URDF text of a chain, with a link frame after each moving element.
+    """Return a new URDF text for a chain, with a link frame after each moving element.
 
-    Constant elements are folded into the joint origins. Limits are kept; where velocity or effort is not known 1e9
-    stands, since URDF demands a number. A body of unknown inertia gets no inertial. Pinocchio reads the same
-    kinematics.
+    Constant elements are combined into the joint origins. Limits are kept; an unknown velocity or effort limit is
+    written as 1e9, since URDF requires a number. A body of unknown inertia gets no inertial. Pinocchio computes the
+    same kinematics from the text.
     """
     root = ET.Element("robot", name=chain.name)
     ET.SubElement(root, "link", name=chain.base)
@@ -203,7 +232,10 @@ def write_new(chain: Chain) -> str:
             continue
         main = k in main_elements
         if main and element.ratio != 1.0:
-            refuse_robot(f"element '{element.name}'", f"a URDF joint moves by q, not by {element.ratio:g} q")
+            refuse_robot(
+                f"element '{element.name}'",
+                f"a URDF joint moves by q, not by {element.ratio:g} q: it cannot be written as a URDF",
+            )
         child = _link_name(chain, k, element.joint, main)
         link = ET.SubElement(root, "link", name=child)
         if main and chain.inertias is not None and chain.inertias[element.joint].any():
@@ -220,7 +252,7 @@ def write_new(chain: Chain) -> str:
 
 
 def xml_text(root: ET.Element) -> str:
-    """Return the indented text of an XML tree."""
+    """Return the indented text of the XML tree `root`."""
     ET.indent(root)
     return ET.tostring(root, encoding="unicode").replace(" />", "/>") + "\n"
 
@@ -229,9 +261,10 @@ def _link_frames(tree: UrdfTree, path: Sequence[JointTag], chain: Chain, q: np.n
     """Return the frames (moving, m, 4, 4) of the links after a path's moving joints, in the path's first link.
 
     Args:
-        path: joints base to tip.
-        chain: the chain whose joints, in the order of the path's actuated ones, are the columns of q.
-        q: (m, n) [rad or m].
+        tree: the URDF.
+        path: joints from base to tip.
+        chain: a chain whose joints, in the order of the path's actuated joints, are the columns of q.
+        q: (m, n) joint values [rad or m].
     """
     index: dict[str, int] = {}
     for joint in path:
@@ -257,13 +290,18 @@ def _screw(axis: np.ndarray, amount: np.ndarray, slides: bool) -> np.ndarray:
 
 
 def _motion(element: Element, amount: float | np.ndarray) -> np.ndarray:
-    """Return the motion exp(sign · axis · amount) of an element, (4, 4) or (m, 4, 4)."""
+    """Return the transform exp(sign · axis · amount) of an element, (4, 4), or (m, 4, 4) for amounts (m,).
+
+    Args:
+        element: the element, which gives sign and axis.
+        amount: displacement along or about the axis [m or rad].
+    """
     axis = element.sign * np.eye(3)[AXES.index(element.axis) % 3]
     return _screw(axis, np.asarray(amount, dtype=float), element.axis[0] == "t")
 
 
 def _check_pair(nominal: Chain, calibrated: Chain) -> None:
-    """Refuse a calibrated chain that differs from the nominal one in more than its elements' values."""
+    """Raise RobotError if a calibrated chain differs from the nominal one in more than the values of its elements."""
 
     def motions(chain: Chain) -> list[tuple[str, int | None, float]]:
         moving = [chain.elements[k] for k in chain.driven]
@@ -279,7 +317,11 @@ def _check_pair(nominal: Chain, calibrated: Chain) -> None:
 def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
     """Return the URDF's joints from the first moving one to the tip; refuse joints that differ from the chain's.
 
-    Joints are matched by name, or, where the URDF has none of the names, in the order of its longest chain.
+    Joints are matched by name. If the URDF has none of the names, they are matched by the order of its longest chain.
+
+    Args:
+        tree: the URDF.
+        nominal: the chain to match.
     """
     names = nominal.joint_names
     named = any(name in tree.joints for name in names)
@@ -298,7 +340,7 @@ def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
         refuse_robot(
             tree.where,
             f"its joints to '{tip}' are {', '.join(actuated)}; the nominal robot '{nominal.name}' has "
-            f"{', '.join(names)}: not the same arm",
+            f"{', '.join(names)}: give the URDF of the nominal robot",
         )
     return path[path.index(moving[0]) :]
 
@@ -308,8 +350,15 @@ def _base_offset(
 ) -> np.ndarray:
     """Return the pose (4, 4) of the path's first link in the chain's base; refuse a URDF of another robot.
 
-    The chain's base is the URDF's link of this name if it exists, else the best-fitting link among those fixed to the
-    root.
+    The chain's base is the URDF's link of this name if there is one, else the best-fitting link among those fixed to
+    the root.
+
+    Args:
+        tree: the URDF.
+        path: joints of the path.
+        nominal: the nominal chain.
+        frames: (moving, m, 4, 4) frames after the chain's moving elements, in the chain's base.
+        links: (moving, m, 4, 4) frames of the URDF's links, in the path's first link.
     """
     foot = path[0].parent
     top = foot
@@ -341,7 +390,13 @@ def _base_offset(
 
 
 def _origins(tree: UrdfTree, path: list[JointTag], goal: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the new origins (4, 4) by joint name; `goal` (moving, 4, 4): link frames at q = 0."""
+    """Return the new origins (4, 4) of the moving joints, by name, from the wanted link frames.
+
+    Args:
+        tree: the URDF.
+        path: joints of the path.
+        goal: (moving, 4, 4) wanted frames of the links after the moving joints, at q = 0.
+    """
     frame, origins, k = np.eye(4), {}, 0
     for joint in path:
         if not joint.moves:
@@ -357,10 +412,15 @@ def _origins(tree: UrdfTree, path: list[JointTag], goal: np.ndarray) -> dict[str
 def _tip_origin(
     tree: UrdfTree, path: list[JointTag], nominal: Chain, calibrated: Chain, last: np.ndarray, goal: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Return the new origin of the first fixed joint after the last moving one, if the chain changed there.
+    """Return the new origin of the first fixed joint after the last moving one, by name.
+
+    The mapping is empty if calibration did not change the chain after its last moving element.
 
     Args:
-        last, goal: (4, 4), the last moving link at q = 0 in the chain's base, before and after.
+        tree: the URDF.
+        path: joints of the path.
+        nominal, calibrated: the two chains.
+        last, goal: (4, 4) frame of the last moving link at q = 0 in the chain's base, before and after calibration.
     """
     zero = np.zeros((1, nominal.n))
     nominal_end = invert(moving_frames(nominal, zero)[-1, 0]) @ forward(nominal, zero)[0]
@@ -385,7 +445,13 @@ def _tip_origin(
 
 
 def _change(source: str, joint: JointTag, origin: np.ndarray) -> list[tuple[int, int, str]]:
-    """Return the changes that write a joint's new origin; values equal to 1e-12 stay as written."""
+    """Return the changes that write a joint's new origin; values that are equal within 1e-12 are not rewritten.
+
+    Args:
+        source: text of the URDF.
+        joint: the joint.
+        origin: (4, 4) the new origin.
+    """
     xyz, rpy = to_xyz_rpy(origin)
     values = {}
     if np.abs(xyz - joint.origin[:3, 3]).max() > UNCHANGED:
@@ -396,7 +462,7 @@ def _change(source: str, joint: JointTag, origin: np.ndarray) -> list[tuple[int,
 
 
 def numbers_text(values: np.ndarray) -> str:
-    """Return numbers as text in full precision (repr), values below 1e-15 as 0."""
+    """Return numbers as text in full precision, with 0 for absolute values below 1e-15."""
     numerals = []
     for value in values.tolist():
         numeral = "0" if abs(value) < MIN_NUMBER else repr(value)
@@ -405,9 +471,16 @@ def numbers_text(values: np.ndarray) -> str:
 
 
 def _link_name(chain: Chain, k: int, joint: int, main: bool) -> str:
-    """Return the name of the link after element k, moved by `joint`: the chain's, unless base or tip has it.
+    """Return the name of the link after element k, moved by `joint`.
 
-    The tip's name may go to the last link where nothing follows it.
+    It is the chain's name of the link, unless base or tip has this name. The last link may have the tip's name if
+    nothing follows it.
+
+    Args:
+        chain: the arm.
+        k: index of the element.
+        joint: index of the joint.
+        main: whether the element is the first one that the joint moves.
     """
     if not main:
         return f"{chain.elements[k].name}_link"
@@ -422,7 +495,14 @@ def _link_name(chain: Chain, k: int, joint: int, main: bool) -> str:
 
 
 def add_joint(root: ET.Element, name: str, kind: str, parent: str, child: str, origin: np.ndarray) -> ET.Element:
-    """Add a <joint> with its links and its origin (4, 4) to a URDF, and return it."""
+    """Add a <joint> with its links and its origin (4, 4) to a URDF, and return the new XML element.
+
+    Args:
+        root: the URDF's root element, to which the joint is added.
+        name, kind: name and URDF type of the joint.
+        parent, child: names of the two links.
+        origin: (4, 4) pose of the joint's frame in the parent link.
+    """
     xyz, rpy = to_xyz_rpy(origin)
     joint = ET.SubElement(root, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=parent)
@@ -434,7 +514,16 @@ def add_joint(root: ET.Element, name: str, kind: str, parent: str, child: str, o
 def _add_moving_joint(
     root: ET.Element, chain: Chain, element: Element, main: bool, parent: str, child: str, origin: np.ndarray
 ) -> None:
-    """Add a moving <joint> to a URDF; a second element of a joint becomes a mimic joint."""
+    """Add a moving <joint> to a URDF; a joint's second element (`main` is False) becomes a mimic joint.
+
+    Args:
+        root: the URDF's root element, to which the joint is added.
+        chain: the arm.
+        element: the moving element.
+        main: whether the element is the first one that its joint moves.
+        parent, child: names of the two links.
+        origin: (4, 4) pose of the joint's frame in the parent link.
+    """
     joint = chain.joints[element.joint or 0]
     if element.axis[0] == "t":
         kind = "prismatic"

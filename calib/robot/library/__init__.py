@@ -1,4 +1,4 @@
-"""Robots by name: of the library (one TOML file per robot), of a file, or of a folder with ``robot.toml``."""
+"""Robots by name or path: a robot of the library (one TOML file each), a file, or a folder with ``robot.toml``."""
 
 import logging
 from collections.abc import Sequence
@@ -24,7 +24,11 @@ def names() -> tuple[str, ...]:
 
 
 def path(name: str) -> Path:
-    """Return the path of the file of a library robot, or of its simulated truth (``lwr4plus_truth``)."""
+    """Return the path of a library robot's file, or of its simulated true parameters (``lwr4plus_truth``).
+
+    Args:
+        name: name of a library robot; with the suffix ``_truth`` the true parameters.
+    """
     return Path(str(resources.files(__name__).joinpath(f"{name}.toml")))
 
 
@@ -34,14 +38,14 @@ def load(
     """Return the chain of a robot given by name or path; the log states where a URDF's arm ends, and why.
 
     Args:
-        robot: a library name, the path of a ``.urdf``, ``.urdf.xacro``, MJCF or ``.toml`` file, or a folder that holds
+        robot: a library name, the path of a ``.urdf``, ``.urdf.xacro``, MJCF or ``.toml`` file, or a folder with
             ``robot.toml``.
-        base, tip: links of a URDF between which the arm runs.
+        base, tip: names of the links of a URDF between which the arm is; None: chosen from the tree.
         joint_names: joints named in a measurement file, which select the chain of a URDF; None to select it from the
             tree.
 
     Raises:
-        RobotError: if no such robot is found; the message lists the library's names and the most similar one.
+        RobotError: no such robot is found; the message lists the library's names and the most similar one.
     """
     path = resolve(robot)
     if is_urdf(path):
@@ -61,7 +65,12 @@ def _check_ends(path: Path, chain: Chain, base: str | None, tip: str | None) -> 
 
 
 def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None = None) -> CalibratedChain:
-    """Return the calibrated robot of a name or path, with covariance and corrections; arguments as in `load`."""
+    """Return the calibrated robot for a name or path, with covariance and corrections if it was fitted.
+
+    Args:
+        robot: a library name, or a path, as in `load`.
+        base, tip: names of the links of a URDF between which the arm is; None: chosen from the tree.
+    """
     path = resolve(robot)
     if is_urdf(path):
         return CalibratedChain(load(path, base, tip), source=str(robot))
@@ -71,7 +80,7 @@ def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None 
 
 
 def resolve(robot: str | Path) -> Path:
-    """Return the file of a robot given by name or path; the working folder takes precedence over the library."""
+    """Return the file of a robot given by name or path; files in the working folder precede the library."""
     location = Path(robot)
     library = names()
     require(str(robot).strip(), f"the robot's name is empty; the library has {', '.join(library)}", RobotError)

@@ -35,7 +35,7 @@ def test_nominal_frames_fit_as_metrics_say(fit):
     """The frames of the nominal arm fit as its metrics say."""
     folder, q, seen = fit
     out = delivery_text(folder, controller_named("ros2"))
-    assert "Its axes are not mastered" in out and "Mastering, " not in out
+    assert "Users cannot master the axes" in out and "Mastering, " not in out
     form = " ".join(["xyz", *[NUMBER] * 3]) + ", rpy " + " ".join([NUMBER] * 3)
     found = [from_xyz_rpy(v[:3], v[3:]) for v in np.array(re.findall(form, out), float)]
     points = (invert(found[1]) @ forward(load("ur5"), q) @ found[0])[:, :3, 3]
@@ -62,7 +62,7 @@ def test_controllers_say_what_they_take(fit):
     """Every controller says what it takes and what is closed."""
     for name, each in controllers().items():
         out = delivery_text(fit[0], each)
-        assert "It takes: " in out and "It does not: " in out and "instrument seen: " in out, name
+        assert "The controller accepts: " in out and "It does not accept: " in out and "instrument seen: " in out, name
 
 
 def test_signs_and_coupled_axes_are_undone():

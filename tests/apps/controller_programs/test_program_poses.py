@@ -99,10 +99,10 @@ def test_gaps_of_program_named_or_stated(fitted, tmp_path, capsys):
     (tmp_path / "frames.txt").write_text(line("UTOOL[2]", TOOL))
     words = "--frames", tmp_path / "frames.txt", "--tool", "0,0,0.1", *statements[2:]
     code, _, err = run(capsys, folder, path, "--out", tmp_path / "no.ls", *words)
-    assert code == 2 and "--tool says 0, 0, 100 mm" in err and "in the program's files" in err
+    assert code == 2 and "--tool states 0, 0, 100 mm" in err and "in the program's files" in err
     path.write_text(program(chain, "UF : F, UT : F"))
     code, _, err = run(capsys, folder, path, "--out", tmp_path / "no.ls")
-    assert code == 2 and "the tool that is active" in err and "the user frame that is active" in err
+    assert code == 2 and "the active tool" in err and "the active user frame" in err
 
 
 def test_foreign_configuration_is_said(fitted, tmp_path, capsys):
@@ -115,7 +115,7 @@ def test_foreign_configuration_is_said(fitted, tmp_path, capsys):
     assert code == 2 and "CONFIG N U B 0 0 0 (behind axis 1" in err and "before axis 1" in err
     path.write_text(program(chain, configuration="N U T, 3, 0, 0"))
     code, _, err = run(capsys, folder, path, "--out", tmp_path / "no.ls", *statements)
-    assert code == 2 and "none within the joints' limits has its turns" in err and "line 9: " in err
+    assert code == 2 and "none within the joints' limits has the stated turns" in err and "line 9: " in err
     near = ",".join(map(str, Q[0]))
     code, out, err = run(capsys, folder, path, "--out", tmp_path / "near.ls", "--start", near, *statements)
     assert code == 0 and "warning: line 9: CONFIG N U T 3 0 0 has no posture" in out, err

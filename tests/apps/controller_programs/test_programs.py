@@ -101,13 +101,13 @@ def test_what_controller_refuses_is_named(tmp_path):
     }.items():
         with pytest.raises(UsageError, match=words):
             program_files(*given)
-    with pytest.raises(UsageError, match="raises no output"):
+    with pytest.raises(UsageError, match="the operator presses a key"):
         program_files(path, tmp_path / "cal", "ros2", ProgramSettings(output=1))
     (tmp_path / "empty.src").write_text("DEF empty()\n; PTP {A1 1,A2 2,A3 3,A4 4,A5 5,A6 6}\nPTP {A1 5}\nEND\n")
-    with pytest.raises(MeasurementError, match="has no targets"):
+    with pytest.raises(MeasurementError, match="has no complete targets"):
         read_program(tmp_path / "empty.src")
     (tmp_path / "rail.csv").write_text("rail [mm],joint1 [deg]\n1,2\n")
-    with pytest.raises(UsageError, match="rail slides"):
+    with pytest.raises(UsageError, match=r"not lengths: rail"):
         program_files(tmp_path / "rail.csv", tmp_path / "cal", "ros2")
     (tmp_path / "plain.csv").write_text("q1,q2\n1,2\n")
     with pytest.raises(UsageError, match="no column of joint angles"):

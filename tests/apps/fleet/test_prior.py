@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.apps.fleet import prior
+from calib.apps.fleet import arm_distribution
 from calib.apps.fleet.tools import tools
 from calib.data.poses.fit_options import read_options
 from calib.data.poses.measurements import Positions
@@ -33,7 +33,7 @@ def arms(count: int, seed: int, uncertainty: float = 0.3) -> tuple[np.ndarray, l
 
 def test_mean_and_deviation_are_recovered() -> None:
     """Without what the fits themselves are uncertain by; the nominal, far off, counts as one of 101."""
-    found = prior.spread(arms(100, 1, uncertainty=1.0)[1])
+    found = arm_distribution.spread(arms(100, 1, uncertainty=1.0)[1])
     assert [one.name for one in found] == list(NOMINAL.names) and {one.arms for one in found} == {100}
     mean, sigma = np.array([[one.mean, one.sigma] for one in found]).T
     assert np.abs((mean - MEAN) / BETWEEN).max() < 0.4
@@ -46,7 +46,7 @@ def test_next_arm_is_where_expected(count: int) -> None:
     total = []
     for seed in range(20):
         true, robots = arms(count + 1, seed)
-        found = prior.spread(robots[:-1])
+        found = arm_distribution.spread(robots[:-1])
         mean, width = np.array([[one.mean, one.width] for one in found]).T
         total.append(np.mean(((true[-1] - NOMINAL.values - mean) / width) ** 2))
     assert 0.7 < np.mean(total) < 1.4, np.mean(total)
@@ -58,16 +58,16 @@ def test_rare_parameter_has_family_deviation() -> None:
     assert robots[0].covariance is not None
     fewer = robots[0].covariance.copy()
     fewer[0], fewer[:, 0] = 0.0, 0.0
-    found = prior.spread([robots[0], *(replace(one, covariance=fewer) for one in robots[1:])])
+    found = arm_distribution.spread([robots[0], *(replace(one, covariance=fewer) for one in robots[1:])])
     assert (found[0].arms, found[1].arms) == (1, 6)
     with pytest.raises(UsageError, match="no fit of these arms states the covariance"):
-        prior.spread([replace(one, covariance=None) for one in robots])
+        arm_distribution.spread([replace(one, covariance=None) for one in robots])
 
 
 def test_ten_poses_are_enough_with_a_prior(tmp_path) -> None:
     """Without, they are refused. The prior is read from its folder, as the command does."""
     true, robots = arms(9, 5)
-    prior.write(tmp_path, robots[:-1], prior.spread(robots[:-1]))
+    arm_distribution.write(tmp_path, robots[:-1], arm_distribution.spread(robots[:-1]))
     arm = NOMINAL.with_values(true[-1])
 
     def measured(count: int, seed: int) -> Positions:
@@ -80,7 +80,7 @@ def test_ten_poses_are_enough_with_a_prior(tmp_path) -> None:
     with pytest.raises(CalibError, match="10 poses are too few"):
         calib.fit_geometry("ur5", few, settings, validate=unseen)
     found = calib.fit_geometry(
-        tmp_path, few, settings, validate=unseen, options=read_options(tmp_path / prior.OPTIONS)
+        tmp_path, few, settings, validate=unseen, options=read_options(tmp_path / arm_distribution.OPTIONS)
     ).validation["a.csv"]
     expected, calibrated = (1e3 * one.position.mean() for one in found.errors)
     assert calibrated < 0.2 * expected, (calibrated, expected)

@@ -9,8 +9,8 @@ import pytest
 
 import calib
 from calib import cli
-from calib.apps.fleet import report, visits
-from calib.apps.monitoring.comparison.places import Place
+from calib.apps.fleet import fleet_report, visits
+from calib.apps.monitoring.comparison.calibration_sources import Place
 from calib.data.poses.measurements import Positions
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward
@@ -55,7 +55,7 @@ def test_an_arm_that_drifted_is_named(fits: Path, monkeypatch) -> None:
         return found
 
     monkeypatch.setattr(visits, "read_fit", with_serial)
-    found = report.report_fleet([fits / "one", fits / "two", fits / "three"])
+    found = fleet_report.report_fleet([fits / "one", fits / "two", fits / "three"])
     ((arm, change),) = found.changes
     assert arm == "R7" and change.verdict.level == "marginal" and "R7 drifts" in found.verdict.reason
     assert [len(one.arms) for one in found.types] == [2] and found.types[0].parameters[0].arms == 2
@@ -70,7 +70,7 @@ def test_failed_fit_is_not_in_distribution(fits: Path, tmp_path: Path) -> None:
     for name, level in (("one", "marginal"), ("two", "fail"), ("odd", "fail")):
         path = tmp_path / name / "metrics.json"
         path.write_text(json.dumps(json.loads(path.read_text()) | {"verdict": level, "reason": f"{name}'s reason"}))
-    found = report.report_fleet([tmp_path / name for name in ("one", "two", "three", "odd")])
+    found = fleet_report.report_fleet([tmp_path / name for name in ("one", "two", "three", "odd")])
     (only,) = found.types
     assert only.failed == (str(tmp_path / "two"), str(tmp_path / "odd")) and not only.odd
     assert found.verdict == "marginal" and {one.arms for one in only.parameters} == {2}
@@ -78,10 +78,10 @@ def test_failed_fit_is_not_in_distribution(fits: Path, tmp_path: Path) -> None:
     named = {(one.code, one.values["reason"]) for one in found.noticed if "reason" in one.values}
     assert {("arm-failed", "two's reason"), ("arm-failed", "odd's reason"), ("arm-marginal", "one's reason")} <= named
     assert "arms-without-serial" in [one.code for one in found.noticed] and "2 failed" in found.verdict.reason
-    five = report.report_fleet([fits / "two", *(tmp_path / name for name in ("one", "two", "three", "odd"))])
+    five = fleet_report.report_fleet([fits / "two", *(tmp_path / name for name in ("one", "two", "three", "odd"))])
     (unnamed,) = [one for one in five.noticed if one.code == "tools-unnamed"]
     assert unnamed.values["tool"] == "tool" and unnamed.values["away"] < 5e-3
-    alone = report.report_fleet(tmp_path / "two")
+    alone = fleet_report.report_fleet(tmp_path / "two")
     assert alone.verdict == "fail" and not alone.types[0].parameters
     alone.save(tmp_path / "out")
     assert not (tmp_path / "out/prior").exists()

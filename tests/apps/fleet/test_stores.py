@@ -53,7 +53,7 @@ def test_object_storage_without_folders() -> None:
         (folder / "5-validation").mkdir()
         (folder / "5-validation/metrics.json").write_text("{}")
     assert sorted(files.find("/bucket/a")) == ["/bucket/a/5-validation/metrics.json", "/bucket/a/session.toml"]
-    with pytest.raises(UsageError, match="no session is there"):
+    with pytest.raises(UsageError, match="no session"):
         stores.sessions("memory://bucket/nothing")
     with pytest.raises(UsageError, match="smoke"):
         stores.sessions("smoke://bucket/*")

@@ -69,5 +69,5 @@ def test_unfinished_sessions_are_left_out(given) -> None:
     assert list(by_arm) == ["a", "b"] and noticed["sessions-unfinished"].values["sessions"] == ("c", "d")
     assert noticed["arms-without-serial"].values["arms"] == ("a", "b")
     del rows["b"]
-    with pytest.raises(UsageError, match="c, d; 1 of 3 left"):
+    with pytest.raises(UsageError, match="c, d; 1 of 3 have one"):
         given(rows)

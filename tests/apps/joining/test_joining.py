@@ -86,7 +86,7 @@ def test_wrong_order_or_arm_is_noticed(tmp_path, joints, arm, q):
     found = calib.join(joints, write(tmp_path / "p.csv", POINT, points), by="row", robot="lwr4plus")
     np.testing.assert_allclose(found.table.numbers("x", "length")[3], 1e-3 * points[7, 0])
     other = write(tmp_path / "o.csv", POINT, seen(arm, random_joints(arm, 40, 9)))
-    with pytest.raises(MeasurementError, match="not those of these 40 poses in any order"):
+    with pytest.raises(MeasurementError, match="do not fit the 40 poses in any order"):
         calib.join(joints, other, robot="lwr4plus")
     with pytest.raises(UsageError, match="by 'rows' is not one of name, time, row, geometry"):
         calib.join(joints, other, by="rows")
@@ -99,7 +99,7 @@ def test_near_readings_are_averaged(tmp_path, joints, arm, q):
     rows[8][1] += 5.0
     found = calib.join(joints, write(tmp_path / "p.csv", ["Name", *POINT], rows))
     assert 4 not in found.poses and len(found.poses) == 39
-    assert any("between readings of pose P5 (rows 9, 10), which is left out" in note for note in found.notes)
+    assert any("pose P5 left out: its readings (rows 9, 10) differ by" in note for note in found.notes)
     sigma = found.table.numbers("sigma_x", "length")
     assert sigma == pytest.approx(0.02e-3 / np.sqrt(2.0), rel=0.3)
 

@@ -46,7 +46,7 @@ def test_planted_joint_offset_is_named(fits):
     assert found.verdict == "marginal" and found.geometry.alone and first.name == "joint_3.offset"
     assert abs(first.alone - 1e-3) < 3.0 * first.alone_sigma < 2e-4
     assert max(found.geometry.by_joint, key=lambda one: one[1])[0] == "joint_3"
-    assert "joint_3.offset alone explains it" in str(found)
+    assert "a change of joint_3.offset alone (" in str(found)
 
 
 def test_tolerance_near_fits_is_marginal(fits):

@@ -45,7 +45,7 @@ def test_a_line_per_calibration_oldest_first(sessions):
 
 
 def test_robots_are_not_mixed_unless_told(sessions):
-    with pytest.raises(UsageError, match=r"different serial numbers \(A7, B1\); --mixed"):
+    with pytest.raises(UsageError, match=r"different serial numbers \(A7, B1\); give --mixed"):
         log([sessions / "old", sessions / "other"])
     assert [line.serial for line in log([sessions / "old", sessions / "other"], mixed=True).lines] == ["A7", "B1"]
 

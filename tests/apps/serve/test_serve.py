@@ -72,7 +72,7 @@ def test_files_get_the_sessions_names(session: Session, client: TestClient) -> N
     names = {kind: [path.name for path in session.brought(kind)] for kind in ("measured", "validation")}
     assert names == {"measured": ["Shots 1.csv"], "validation": ["validation_later.csv"]}
     assert client.app.state.work.current.task == CHECK  # type: ignore[attr-defined]
-    for name, words in (("validation.csv", "says other files"), ("shots.xlsx", "expected .csv")):
+    for name, words in (("validation.csv", "have another upload"), ("shots.xlsx", "expected .csv")):
         refused = bring(client, "measured", name)
         assert refused.status_code == 400 and words in refused.text
     assert bring(client, "training", "log.csv").status_code == 404, "the session has no dynamics"

@@ -118,7 +118,7 @@ def test_bits_and_orientation_change_nothing(tmp_path):
         assert np.nanmax(np.abs(detect(read, BOARDS["charuco"]).pixel - want)) < most
 
 
-@pytest.mark.parametrize("content, words", [(b"", "empty"), (b"\x89PNG\r\n\x1a\nxxxx", "no image format")])
+@pytest.mark.parametrize("content, words", [(b"", "empty"), (b"\x89PNG\r\n\x1a\nxxxx", "image format is unknown")])
 def test_a_corrupt_file_is_refused(content, words, tmp_path):
     (tmp_path / "bad.png").write_bytes(content)
     with pytest.raises(MeasurementError, match=words):

@@ -122,7 +122,7 @@ def half_seen(rows):
             f"{XYZ},socket", lambda rows: [[*row[:6], 0] for row in rows],
             "allows the kinds sockets, position; state one", None, None, {},
         ),
-        (TWO, half_seen, "is empty, others of x2, y2, z2 are not", 3, "y2", {}),
+        (TWO, half_seen, "is empty, unlike others of x2, y2, z2", 3, "y2", {}),
         (TWO, joints_and(*[""] * 6), "no target was seen", None, "x1", {}),
         (
             SIGMAS, lambda rows: [[*row[:6], 1e-5, 1e-5, 0 if i == 8 else 1e-5] for i, row in enumerate(rows)],
@@ -153,7 +153,7 @@ def half_seen(rows):
         (POSE, as_is, "no row is selected by where = 9", None, "q1", {"options": FileOptions(where={"q1": ("9",)})}),
         (
             f"{XYZ},base_x,base_y", lambda rows: [row[:8] for row in rows],
-            "base_x, base_y, base_z, .* go together", None, "base_z", {},
+            "base_x, base_y, base_z go together", None, "base_z", {},
         ),
         (POSE, as_is, "'socket' is missing", None, None, {"options": FileOptions(kind="sockets")}),
         (XYZ, lambda rows: [row[:6] for row in rows], "needs qx qy", None, None, {"options": FileOptions(kind="pose")}),

@@ -99,7 +99,7 @@ def test_too_few_images_refused_with_reasons(folder):
         (lambda f: [p.unlink() for p in f.glob("*.png")], "none of the images named in joints.csv exists"),
         (
             lambda f: write_lens(Lens(LENS.model, LENS.values, (640, 480)), f / "camera.yaml"),
-            "is for images of 640 x 480 pixels, the images here have 480 x 360",
+            "is for images of 640 x 480 pixels, but the images here have 480 x 360",
         ),
     ],
 )

@@ -127,7 +127,7 @@ def test_partial_map_is_completed(write, good):
     "header, columns, said",
     [
         ("x_meas,y_meas,z_meas", {"x": "z_meas"}, "is read as two different columns"),
-        ("x,y,z,x_meas,y_meas,z_meas", {"x": "x_meas", "y": "y_meas"}, "z and z_meas could be it"),
+        ("x,y,z,x_meas,y_meas,z_meas", {"x": "x_meas", "y": "y_meas"}, "z and z_meas could be meant"),
         ("a,b,height", {"x": "a", "y": "b"}, "map this one"),
         ("x,y,z,qx_meas", {"qx": "qx_meas"}, "map this one"),
         ("x,y,z,std", {"sigma_distance": "std"}, "not read in a file of kind 'position'"),
@@ -204,7 +204,7 @@ def test_socket_groups_and_pairs_by_options(write, good):
     assert block.links == ((0, 2, 0.05),)
     block = read(path, FileOptions(groups=("day",), kind="sockets"))
     assert block.group_names[:4] == ("0/0", "0/1", "0/2", "1/0")
-    assert any("group of one row" in note for note in block.notes)
+    assert any("measured in one row only" in note for note in block.notes)
 
 
 def test_where_keeps_rows_and_their_numbers(write, good):

@@ -61,4 +61,6 @@ def test_tiago_three_markers(data):
     names = ["torso_lift_joint", *(f"arm_{i}_joint" for i in range(1, 8))]
     block = load(data, "tiago_laas/mocap_35poses.csv", "model.urdf", names)
     assert block.kind == "position" and len(block) == 105 and len(block.tool_names) == 3
-    assert block.notes == ("torso_lift_joint is outside its limits in 1 of 35 rows, most in row 3, by 0.00018 m; kept",)
+    assert block.notes == (
+        "torso_lift_joint is outside its limits in 1 of 35 rows, most in row 3, by 0.00018 m; these rows are used",
+    )

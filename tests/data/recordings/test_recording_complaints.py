@@ -115,7 +115,7 @@ def test_all_nan_column_is_not_provided():
     q = np.column_stack([np.sin(3.0 * t), np.cos(3.0 * t)])
     absent = np.full_like(q, np.nan)
     checked = check_recording(Recording.of(t, q, q + 1.0, v=absent))
-    assert checked.v is None and any("not provided" in note for note in checked.notes)
+    assert checked.v is None and any("NaN in every row" in note for note in checked.notes)
     with pytest.raises(MeasurementError, match=r"torque of q1, q2 is NaN in every row: its driver does not provide"):
         check_recording(Recording.of(t, q, absent))
 

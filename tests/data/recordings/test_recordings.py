@@ -142,7 +142,7 @@ def test_ros2_bags_without_ros(tmp_path, series, kind):
     np.testing.assert_array_equal(recording.q, series["q"][:600])
     np.testing.assert_array_equal(recording.effort, series["tau"][:600])
     np.testing.assert_allclose(recording.t, series["t"][:600], atol=1e-9)
-    assert recording.kind == "torque" and recording.notes == ("60 messages without one of the joints are not used",)
+    assert recording.kind == "torque" and recording.notes == ("60 messages that lack a joint are not used",)
     if kind == "mcap":
         bare = next((tmp_path / "bag").glob("*.mcap"))
         np.testing.assert_array_equal(read_recording(f"{bare}@1:2", ROBOT).q, series["q"][200:400])
@@ -258,7 +258,7 @@ def test_what_is_odd_is_noted(archive, series):
     still = series["q"].copy()
     still[:, 1] = 0.7
     (note,) = read_recording(archive(q=still, dq=None), ROBOT).notes
-    assert note.startswith("b never moves (its position is one number)")
+    assert note.startswith("b never moves (its position is constant)")
     notes = read_recording(archive(tau=-series["tau"]), ROBOT).notes
     assert any("is their sign reversed?" in note for note in notes)
     notes = read_recording(archive(tau=series["tau"] / 80), ROBOT).notes

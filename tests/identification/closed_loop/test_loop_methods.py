@@ -229,7 +229,7 @@ REFUSED = [
     ({}, GAINS + 'reference = "nowhere.csv"\n', "cannot be read"),
     ({}, GAINS + 'reference = "short.csv"\n', "do not span"),
     ({}, GAINS + 'feedforward = "recording"\n', "no column tau_ff"),
-    ({}, "", "state the controller"),
+    ({}, "", "needs the closed loop"),
 ]
 
 

@@ -68,7 +68,7 @@ LOOP = LoopSettings(controller="pd", kp=(1.0,), kd=(1.0,))
 def test_foreign_torque_rows_are_refused(method, rows, works, fails):
     """Torque rows that a method does not take are refused with all that do."""
     settings = IdentificationSettings(method=method, torque_rows=rows, loop=LOOP)
-    with pytest.raises(UsageError, match=f"rows = '{rows.name}' is not supported; methods that do: ") as caught:
+    with pytest.raises(UsageError, match=f"rows = '{rows.name}' is not supported; methods that support it: ") as caught:
         require_usable(settings, METHODS[method])
     named = str(caught.value).split(": ")[-1].split(", ")
     assert set(works.split()) <= set(named) and not set(fails.split()) & set(named)
@@ -81,7 +81,7 @@ def test_friction_is_what_the_method_takes():
         "auto", "auto", "standard", "standard", "auto",
     ]  # fmt: skip
     assert require_usable(replace(auto, friction="stribeck"), METHODS["clie"]).friction == "stribeck"
-    with pytest.raises(UsageError, match=r"standard friction only.* methods that take it: .*iv"):
+    with pytest.raises(UsageError, match=r"standard friction only.* methods that support it: .*iv"):
         require_usable(replace(auto, friction="stribeck"), METHODS["ukf"])
 
 
@@ -94,5 +94,5 @@ def test_friction_without_slopes_is_refused():
     terms = drives.offered("presliding", 0, RecordedRange(0.2, 2.0, 3.0, 3.0))
     rows = tuple(one.extend(terms, np.ones((*one.target.shape, len(terms)))) for one in problem.rows)
     found = replace(problem, rows=rows, terms=(*problem.terms, *terms))
-    with pytest.raises(Exception, match=r"no derivatives .* iv and didim take it"):
+    with pytest.raises(Exception, match=r"no derivatives .* iv and didim support it"):
         comparison(found, "cloe").linearised(np.zeros(len(found.terms)))

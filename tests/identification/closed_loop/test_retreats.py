@@ -20,7 +20,9 @@ def test_step_is_halved_until_stable(monkeypatch: pytest.MonkeyPatch, stable: fl
 def test_unstable_steps_are_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where no part of the step is stable, that is the error."""
     start, end = step(monkeypatch, 0.0)
-    with pytest.raises(CannotSimulate, match="no robot on the way to the estimate can be simulated: unstable"):
+    with pytest.raises(
+        CannotSimulate, match="no parameters between the start and the estimate can be simulated: unstable"
+    ):
         simulated_runs.nearer(start, end, [])
 
 

@@ -153,7 +153,7 @@ def test_possible_bodies_are_unchanged(problem):
     assert np.abs((held.estimate.values - free.estimate.values) / free.estimate.sigma).max() < 0.02
     last = WeightedSum({"ZZ3": 1.0, "Ia3": 1.0}, most=-1.0)
     found = METHODS["pc-wls"].estimate(asked(problem, sum=(last,), signs=False, bodies=True))
-    assert not found.found and "no bodies that can exist satisfy 1 ZZ3 + 1 Ia3 <= -1" in str(found.failure)
+    assert not found.found and "no physically consistent bodies satisfy 1 ZZ3 + 1 Ia3 <= -1" in str(found.failure)
 
 
 def test_told_sum_is_its_base_parameter(problem):

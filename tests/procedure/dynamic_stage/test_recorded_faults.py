@@ -35,9 +35,9 @@ def test_faults_are_named_with_their_file(robot, tmp_path, capsys):
     plain = planted.write(tmp_path, "plain.npz", 0)
     loaded = planted.write(tmp_path, "loaded.npz", 1, tau=planted.series(1, payload=True)["tau"])
     words = said(capsys, robot, plain, loaded, "--validate", spoiled(tmp_path), "--out", tmp_path / "out", "-v")
-    assert "spoiled.npz: torque of joint2 stands at one extreme value in motion" in words
-    assert "spoiled.npz: position of joint3 stands at 7.5 to 7.995 s" in words
-    assert "spoiled.npz: measured velocity of joint1 stands at 5 to 5.495 s" in words
+    assert "spoiled.npz: torque of joint2 stays at one extreme value while the joint moves" in words
+    assert "spoiled.npz: position of joint3 frozen from 7.5 to 7.995 s" in words
+    assert "spoiled.npz: measured velocity of joint1 frozen from 5 to 5.495 s" in words
     assert "loaded.npz: an unstated payload of 2" in words
 
 
@@ -48,7 +48,7 @@ def test_sound_payload_recordings_are_clear(robot, tmp_path, capsys):
     options = tmp_path / "options.toml"
     options.write_text('[payload.load]\n[files."loaded.npz"]\npayload = ["load"]\n')
     words = said(capsys, robot, plain, loaded, "--options", options, "--out", tmp_path / "out", "-v")
-    assert "unstated payload" not in words and " stand at " not in words
+    assert "unstated payload" not in words and " frozen from " not in words
     codes = json.dumps(json.loads((tmp_path / "out" / "metrics.json").read_text()))
     assert not any(code in codes for code in CODES)
 
@@ -60,6 +60,6 @@ def test_standing_joint_is_no_fault(robot, tmp_path, capsys):
     noise = 0.2 * np.random.default_rng(0).normal(size=q.shape)
     np.savez(tmp_path / "standing.npz", t=t, q=q, tau=planted.torques(q, v, a) + noise)
     words = said(capsys, robot, tmp_path / "standing.npz", "--out", tmp_path / "out", "-v")
-    assert " stands at " not in words and "joint1 never moves" in words
+    assert " frozen from " not in words and "extreme value" not in words and "joint1 never moves" in words
     found = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert 1.0 < found["condition_number"]["normalised"] < 1e3

@@ -220,10 +220,10 @@ def test_waypoints_do_not_shorten_the_arm(room, capsys):
     "change, message",
     [
         ({"M": -2.0}, "body after A4: a negative mass"),
-        ({"velocity": 0.0}, "no limit for the speed of A4 (velocity 0 is no limit)"),
-        ({"velocity": 1e8}, "no limit for the speed of A4 (velocity 1e+08 is no limit)"),
+        ({"velocity": 0.0}, "no limit for the speed of A4 (velocity 0 is not a limit)"),
+        ({"velocity": 1e8}, "no limit for the speed of A4 (velocity 1e+08 is not a limit)"),
         ({"velocity": np.inf}, "no limit for the speed of A4; without it"),
-        ({"effort": 0.0}, "no limit for the acceleration of A4 (effort 0 is no limit)"),
+        ({"effort": 0.0}, "no limit for the acceleration of A4 (effort 0 is not a limit)"),
     ],
 )
 def test_impossible_robot_gets_no_plan(room, capsys, change, message):

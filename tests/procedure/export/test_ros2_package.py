@@ -120,7 +120,7 @@ def test_names_are_those_of_rep_149():
 def test_foreign_srdf_and_files_are_refused(tmp_path, export):
     """Another robot's SRDF, and files that are there already, are refused."""
     (tmp_path / "other.srdf").write_text(SRDF.replace("foot", "panda_link0"))
-    with pytest.raises(UsageError, match=r"none of its 1 disabled pairs .* another robot's"):
+    with pytest.raises(UsageError, match=r"none of its 1 disabled pairs .* another robot"):
         write_package(export, "arm", tmp_path / "src", moveit=[tmp_path / "other.srdf"])
     write_package(export, "arm", tmp_path / "src")
     (tmp_path / "src/arm/package.xml").write_text("mine")

@@ -385,7 +385,7 @@ def test_unreached_target_has_its_line(cell, fitted, here, calib):
     near = ("--start", "0,-1,1,0,1,0", "--partial", *AT_FLANGE)
     code, out, err = calib("compensate", fitted, "part.src", "--out", "sent.src", *near)
     assert "warning: 4 moves, 3 targets" in out
-    assert code == 0 and "1 of 3 targets written" in out and "left as it was: line 4: " in out, err
+    assert code == 0 and "1 of 3 targets written" in out and "target unchanged: line 4: " in out, err
     assert (here / "sent.src").read_text().split("\n")[3:] == text.split("\n")[3:]
     (here / "joints.src").write_text("\n".join(line for line in text.split("\n") if "LIN" not in line))
     code, _, err = calib("compensate", fitted, "joints.src", "--out", "no.src")
@@ -399,4 +399,4 @@ def test_saved_registers_are_no_program(fitted, tmp_path, capsys):
         "[1,1] =   'P1'   Group: 1\n" + "  ".join(f"J{k} = 1.0 deg" for k in range(1, 7))
     )
     assert cli.run(["compensate", str(fitted), str(tmp_path / "POSREG.VA"), "--out", str(tmp_path / "o.VA")]) == 2
-    assert "lists registers that the controller saved, no program" in capsys.readouterr().err
+    assert "contains saved registers, not a program" in capsys.readouterr().err

@@ -13,7 +13,7 @@ from calib.cli import run
 from calib.data.images.board import read_board
 from calib.data.images.board_print import make
 from calib.data.images.image_bags import ImageBag, write_image_folder
-from calib.data.images.pixels import Detection, Found
+from calib.data.images.pixels import Detection, Detections
 from calib.data.poses.measurements import Distances, PoseMeasurements
 from calib.data.poses.pose_lists import read_poses
 from calib.errors import UsageError
@@ -150,7 +150,7 @@ def shots(cell, q, seed, folder):
     images = {name: Detection(pixel, sigma) for name, pixel, sigma in zip(block.names, block.pixel, block.sigma)}
     images[block.names[2]] = Detection(np.full_like(block.pixel[2], np.nan), block.sigma[2], "blurred: still moving")
     write_image_folder(
-        ImageBag(block.names, block.joint_names, block.q, Found(images, block.size), ()), block.board, folder
+        ImageBag(block.names, block.joint_names, block.q, Detections(images, block.size), ()), block.board, folder
     )
 
 

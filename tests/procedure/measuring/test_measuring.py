@@ -101,7 +101,7 @@ def test_the_cell_as_told_becomes_tables():
     ("answers", "words"),
     [
         ({"instrument_at": "3000,0,1"}, "are these mm"),
-        ({"instrument_at": "3,0"}, "expected x,y,z in metres, or unknown"),
+        ({"instrument_at": "3,0"}, "expected x,y,z in metres, or the word unknown"),
         ({"cone": "30"}, "--cone needs --instrument-at"),
         ({"instrument_at": "3,0,1", "cone": "wide"}, "instrument.sight: cannot read"),
         ({"instrument_at": "3,0,1", "cone": "0"}, "instrument.sight: expected"),

@@ -67,12 +67,12 @@ def test_moveit_folder_limits_motions(tmp_path, arm):
         ("joint_limits.yaml", "1.5", "-1.6", r"joints\.j1: -1\.57\S* is not below -1\.6"),
         ("joint_limits.yaml", "joint_limits", "limits", r"is no joint_limits\.yaml of MoveIt"),
         ("joint_limits.yaml", "j1: {", "j1: [", r"cannot be read as YAML"),
-        ("arm.srdf", '"l', '"panda_l', r"another robot's"),
+        ("arm.srdf", '"l', '"panda_l', r"is it for another robot"),
         ("arm.srdf", "</robot>", "", r"arm\.srdf.*line 2"),
     ],
 )
 def test_foreign_configuration_is_refused(tmp_path, arm, file, old, new, says):
-    """A configuration that cannot be, or is another robot's, is refused."""
+    """A configuration that cannot be, or is is it for another robot, is refused."""
     path, chain = arm
     place = tmp_path / "config" / file
     place.write_text(place.read_text().replace(old, new))

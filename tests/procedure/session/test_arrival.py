@@ -104,3 +104,12 @@ def test_camera_is_asked_for_its_own_place():
     for mounting, others in (("unknown", 0), ("in hand", 4), ("to-hand", 4)):
         given = with_answer(Answers("lwr4plus", "camera"), asked["camera"][1], mounting)
         assert sum(question.open(given) for question in QUESTIONS if question.name in CAMERA) == others
+
+
+def test_unknown_program_is_refused_when_typed() -> None:
+    """The question is asked again at once, so that no answer is lost at the end."""
+    ask = {question.name: question for question in QUESTIONS}
+    answers = with_answer(Answers(), ask["robot"], "lwr4plus")
+    with pytest.raises(UsageError, match=r"'0\.5' is not one of"):
+        with_answer(answers, ask["program"], "0.5")
+    assert with_answer(answers, ask["program"], "none").program == "none"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from without_figures import run
 
-from calib.apps.cell_demo.summary import SECONDS, Telling
+from calib.apps.cell_demo.step_lines import SECONDS, Telling
 from calib.procedure.session import steps
 from calib.procedure.session.folder import open_session
 from calib.robot.formats import urdf
@@ -79,7 +79,7 @@ def test_demo_by_camera_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture) 
 
 def test_hard_names_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert run("demo", "--hard", "--robot", "tx40", "--out", tmp_path / "d") == 2
-    assert "--hard names a robot, too" in capsys.readouterr().err
+    assert "--hard both name a robot" in capsys.readouterr().err
 
 
 def test_progress_tells_stage_and_time() -> None:

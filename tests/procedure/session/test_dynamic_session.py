@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from pypdf import PdfReader
 from sessions import begin, copy_of, edit, go_on, kinds
+from without_figures import run
 
 from calib import cli
 from calib.apps.cell_demo import demo
@@ -18,6 +19,7 @@ from calib.data.csv_table import read_header
 from calib.data.recordings.recording_files import read_recording
 from calib.errors import MeasurementError
 from calib.identification.model_file import read_dynamics
+from calib.procedure.excitation import stored_front
 from calib.procedure.robot_kinds import joints_of
 from calib.procedure.session import commands, steps
 from calib.procedure.session.dynamics_steps import check_motion, designed_motions
@@ -298,3 +300,29 @@ def test_massless_robot_gets_no_dynamics(tmp_path: Path, capsys: pytest.CaptureF
     """A robot without masses is calibrated without dynamics."""
     session = begin(tmp_path / "cell", "ur5", "cmm", 5, 0, dynamics=False)
     assert not session.dynamic and not session.path("7-recorded").exists()
+
+
+def test_front_motion_is_picked_before_recording(waiting: Session, capsys: pytest.CaptureFixture) -> None:
+    """A picked motion becomes the training motion, its step stays done; recorded motions are not exchanged."""
+    path = waiting.path("session.toml")
+    edit(path, "goals = []", 'goals = ["wrist=0.5"]')
+    edit(path, "front = 0", "front = 3")
+    capsys.readouterr()
+    assert run("next", waiting.folder) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert "goal wrist=0.5 is missed" in words and "motions to choose from" in words
+    front = stored_front.read(waiting.path("6-excitation/training"))
+    number = 2 if front.values.designed == 0 else 1
+    assert run("next", waiting.folder, "--pick", number) == 0
+    assert stored_front.read(waiting.path("6-excitation/training")).values.designed == number - 1
+    assert kinds(waiting)["excite"] == steps.DONE
+    assert run("next", waiting.folder, "--pick", 99) == 2
+    assert kinds(waiting)["excite"] == steps.DONE, "a pick that is refused changes nothing"
+    edit(path, 'goals = ["wrist=0.5"]', 'goals = ["wrist=0.4"]')
+    assert run("next", waiting.folder, "--pick", 1) == 2
+    edit(path, 'goals = ["wrist=0.4"]', 'goals = ["wrist=0.5"]')
+    capsys.readouterr()
+    waiting.path("7-recorded").mkdir(exist_ok=True)
+    waiting.path("7-recorded/training_log.csv").write_text("t\n")
+    assert run("next", waiting.folder, "--pick", 1) == 2
+    assert "already recorded" in capsys.readouterr().err

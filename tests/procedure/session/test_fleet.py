@@ -35,7 +35,7 @@ def test_one_that_fails_stops_none(cells: Path, capsys: pytest.CaptureFixture) -
     assert "[red]" not in said and "[/]" not in said
     assert "1 of 4 done" in said and "1 waiting, 2 failed" in said
     assert f"{cells / 'b'} failed" in said and "looks like" in said and f"{cells / 'c'} waits for a file" in said
-    assert "looks like" in (cells / "b/run.log").read_text() and "Bring " in (cells / "c/run.log").read_text()
+    assert "looks like" in (cells / "b/run.log").read_text() and "Provide " in (cells / "c/run.log").read_text()
     assert not list((cells / "d").iterdir())
     assert run("run", cells / "a/session.toml") == 0
     assert run("run", cells / "a", cells / "a/session.toml") == 2
@@ -89,7 +89,7 @@ def test_a_fleet_on_a_cluster(cells: Path, tmp_path: Path, monkeypatch, capsys: 
     assert "1 of 3 done" in said and "a: done, " in said and " mm, " in said and "d failed: " in said
     table = said[said.index("session ") :].splitlines()
     assert [line.split()[0] for line in table[1:4]] == ["d", "c", "a"]
-    assert "Bring " in (cells / "c/run.log").read_text()
+    assert "Provide " in (cells / "c/run.log").read_text()
 
 
 def test_a_session_runs_at_its_address(cells: Path, capsys: pytest.CaptureFixture) -> None:
@@ -98,7 +98,7 @@ def test_a_session_runs_at_its_address(cells: Path, capsys: pytest.CaptureFixtur
     assert run("run", f"{address}/[ac]") == 0
     said = capsys.readouterr().out
     assert "1 of 2 done" in said and "1 waiting" in said
-    assert "Bring " in (cells / "c/run.log").read_text() and not list(cells.glob("*/calib.claim"))
+    assert "Provide " in (cells / "c/run.log").read_text() and not list(cells.glob("*/calib.claim"))
     assert run("run", f"{address}/*", f"{address}/a") == 2
     assert "is given twice" in capsys.readouterr().err
 

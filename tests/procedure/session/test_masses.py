@@ -102,7 +102,7 @@ def test_masses_return_until_nothing_moves(tmp_path):
     assert run("next", session) == 1  # without its corrections the arm is no better: the springs are what was wrong
     state = read_state(open_session(session))
     words = " ".join(state.steps["identify"].notes)
-    assert "settled" in words and "not settled" not in words
+    assert "converged" in words and "not converged" not in words
     assert read_json(session / MASSES / ROUNDS, "", dict[str, int]) == {"rounds": 0}
     found = calibrated.read(session / "4-fit").deflection
     own = found.names(planted.arm()).index("elbow compliance")

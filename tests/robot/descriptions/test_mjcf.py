@@ -112,11 +112,11 @@ OTHER = '<geom size="0.1"/><body name="c"><joint name="k" axis="0 1 0"/><geom si
         (one_joint(TWO, OTHER, '<equality><connect body1="c" anchor="0 0 1"/></equality>'), r"closes a loop"),
         (
             one_joint(TWO, OTHER, '<equality><joint joint1="k" joint2="j" polycoef="0 1 2 0 0"/></equality>'),
-            r"equality 'number 1' of 'k' is no straight line",
+            r"equality 'number 1' of 'k' is not linear",
         ),
         (
             one_joint(TWO, OTHER, '<tendon><fixed><joint joint="k" coef="1"/></fixed></tendon>'),
-            r"a tendon moves it, which a serial arm does not have",
+            r"a tendon moves joints of the arm, which is not supported",
         ),
         (one_joint('<joint type="screw"/>'), r"MuJoCo cannot read it: .*screw"),
         ("<mujoco><worldbody/></mujoco>", r"no actuated joint"),

@@ -58,8 +58,8 @@ def test_poses_are_of_table_and_near_nominal(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "content", "says"),
     [
-        ("", written(TABLE), r"say of which type the arm is.*one of ur3"),
-        (" ur_type:=ur5e", written(TABLE), r"axes of a ur5e are up to \d+ mm from their places: another ur_type"),
+        ("", written(TABLE), r"state the type of the arm.*one of ur3"),
+        (" ur_type:=ur5e", written(TABLE), r"axes of a ur5e would be \d+ mm from nominal: is ur_type another"),
         (" ur_type:=ur10x", written(TABLE), r"ur_type 'ur10x' is not one of .*did you mean 'ur10'"),
         (" ur_type:=ur10e", "[mounting]\n", r"is no calibration\.conf of a UR: expected delta_theta .*found 0"),
         (" ur_type:=ur10e", written(TABLE).replace("delta_d = [", "delta_d = [ nan,"), r"delta_d .*found 7"),

@@ -87,7 +87,10 @@ def test_a_session_keeps_the_expanded_file(arm, tmp_path):
         ("<xacro:macro name='m' params=''><xacro:m/></xacro:macro><xacro:m/></robot>", r"nested without end"),
         ("<xacro:include filename='bad.xacro'/></robot>", r"nested without end: .* includes itself"),
         ("<xacro:include filename='none.xacro'/></robot>", r"No such file"),
-        ("<link name='$(arg side)'/></robot>", r"Undefined substitution argument side; say it behind the file: side:="),
+        (
+            "<link name='$(arg side)'/></robot>",
+            r"Undefined substitution argument side; state it after the file: side:=",
+        ),
     ],
 )
 def test_xacro_error_is_refused_in_its_words(tmp_path, content, says):

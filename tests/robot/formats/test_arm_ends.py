@@ -43,7 +43,7 @@ def ends(*more: str, names: list[str] | None = None, base: str | None = None) ->
         ([fixed("link_ee"), fixed("camera_link", "link_ee")], "link_ee", "end-effector"),
         ([fixed("probe"), fixed("camera")], "probe", "no gripper or sensor"),
         ([fixed("hand"), moving("finger_1", "hand"), moving("finger_2", "hand")], "link_6", "no gripper"),
-        ([fixed("a"), fixed("b"), fixed("c")], "link_6", "a, b, c hang on it; --tip"),
+        ([fixed("a"), fixed("b"), fixed("c")], "link_6", "a, b, c are attached to it; choose one"),
         ([joint("t", "fixed", "link_2", "tool0")], "link_6", "the last link"),
     ],
 )
@@ -55,7 +55,7 @@ def test_the_tip_is_the_flange(more, tip, why):
 def test_tool0_on_second_link_is_not_taken():
     """A tool0 on the second link is named and not taken."""
     found = ends(joint("t", "fixed", "link_2", "tool0"))
-    assert found.unused == ("tool0 is not taken: 4 axes follow it",)
+    assert found.unused == ("tool0 is not taken as the end: 4 axes follow it",)
     assert (
         urdf.ends(read_tree(robot(*WRIST, joint("t", "fixed", "link_2", "tool0")), "arm"), tip="tool0").tip == "tool0"
     )

@@ -179,7 +179,7 @@ def arm_with(limit: str) -> str:
         (three(joint("j", "revolute", "a", "b", axis("0 0 nan"))), r'xyz="0 0 nan" of <axis> in line 2 is not 3'),
         (three(joint("j", "fixed", "a", "b", xyz="0 0")), r'xyz="0 0" of <origin> .* 3 finite numbers'),
         (three(joint("j", "fixed", "a", "b", rpy="0 x 0")), r'rpy="0 x 0" of <origin>'),
-        (three(joint("j", "fixed", "a", "b", xyz="0 0 ${h}")), r"this is a xacro file; name it so"),
+        (three(joint("j", "fixed", "a", "b", xyz="0 0 ${h}")), r"this is a xacro file; rename it"),
         ("<robot xmlns:xacro='x'><xacro:include filename='f'/></robot>", r"found <xacro:include>: this is a xacro"),
         (arm_with('<limit lower="1" upper="1"/>'), r"'j': lower limit 1 is not below"),
         (arm_with('<limit lower="one" upper="1"/>'), r'lower="one" of <limit> in line'),
@@ -194,7 +194,7 @@ def test_bad_files(source, message):
     "one, two, three, message",
     [
         (("revolute", "b"), ("revolute", ""), ("fixed", ""), r"joint 'a': the joint it mimics, 'b', comes after it"),
-        (("revolute", "b"), ("revolute", "a"), ("revolute", ""), r"joint 'a': it mimics a circle"),
+        (("revolute", "b"), ("revolute", "a"), ("revolute", ""), r"joint 'a': its <mimic> leads back to itself"),
         (("revolute", ""), ("revolute", "aa"), ("revolute", ""), r"joint 'b': it mimics 'aa', which is not a joint"),
         (("revolute", ""), ("floating", ""), ("revolute", ""), r"joint 'b': type 'floating' cannot be part of an arm"),
     ],

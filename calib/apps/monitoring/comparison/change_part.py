@@ -1,4 +1,4 @@
-"""A part of a comparison, geometry or dynamics: verdict, findings, report section, numbers; subclasses add figures."""
+"""Common base of the two parts of a comparison, geometry and dynamics: verdict, findings, report section, numbers."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class ChangePart(ABC):
     """Change of the geometry, or of the dynamics, and whether the earlier parameters are still good enough.
 
     Attributes:
-        before, after: the calibrations, with ``name``, ``judged`` and ``serial``.
-        change: result of the test, and further figures of this kind.
-        tolerance: largest accepted `today`; None without.
+        before, after: the calibrations, with the attributes ``name``, ``judged`` and ``serial``.
+        change: result of the change test, and figures specific to geometry or dynamics.
+        tolerance: largest accepted value of `today`; None without one.
     """
 
     kind: ClassVar[str]
@@ -47,41 +47,44 @@ class ChangePart(ABC):
     @property
     @abstractmethod
     def today(self) -> float:
-        """The robot's error today with the earlier parameters, in the unit of the tolerance."""
+        """The robot's error if it still used the earlier parameters today, in the unit of the tolerance."""
 
     @property
     @abstractmethod
     def words(self) -> str:
-        """The change in words, for the verdict's reason."""
+        """Short description of the change, for the verdict's reason."""
 
     @abstractmethod
     def specific_findings(self) -> list[Finding]:
-        """Return the findings that only this kind of part has."""
+        """Return the findings that are specific to geometry or dynamics."""
 
     @abstractmethod
     def blocks(self) -> list[Block]:
-        """Return the report blocks of this kind; the first precedes the notes, the table of parameters follows all."""
+        """Return the report blocks specific to geometry or dynamics.
+
+        The first block is put before the notes; the table of parameters follows the last one.
+        """
 
     @abstractmethod
     def charts(self) -> dict[str, Chart]:
-        """Return the figures, by name."""
+        """Return the figures of this part, by name."""
 
     @abstractmethod
     def shown(self, value: float) -> str:
-        """Return an error as text with its unit."""
+        """Return `value`, an error in the unit of the tolerance, as text with its unit."""
 
     @abstractmethod
     def numbers(self) -> dict[str, object]:
-        """Return the numbers that only this kind of part has [SI]."""
+        """Return the numbers specific to geometry or dynamics, by name [SI]."""
 
     @cached_property
     def noticed(self) -> tuple[Finding, ...]:
-        """Findings, worst first."""
+        """All findings on this part, worst first."""
         return settle([*self.specific_findings(), *self._shared_findings()])
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Whether the earlier parameters are still within tolerance."""
+        """Verdict on whether the earlier parameters are still within tolerance."""
         figures = f"{self.words}, χ² {self.change.chi2:.3g} on {self.change.freedom}"
         if self.tolerance:
             state = "not"
@@ -110,14 +113,14 @@ class ChangePart(ABC):
             yield finding("other-serial-number", first=self.before.serial, second=self.after.serial, **names)
 
     def section(self) -> Section:
-        """Return a report section with verdict, changes, changed parameters and notes."""
+        """Return the report section with verdict, changes, notes and changed parameters."""
         allowed = ""
         if self.tolerance:
             allowed = self.shown(self.tolerance)
         reached = met(self.today, self.tolerance or 0.0)
         figure = KeyFigure(self.error_words, "", self.shown(self.today), "", self.basis, allowed, reached)
 
-        title = "Changed parameters, those first that explain most"
+        title = "Changed parameters, in the order of how much of the change they explain"
         compared = [parameter for parameter in self.change.parameters if parameter.sigma or parameter.explained]
         parameters = table(title, _PARAMETERS, compared[:MAX_PARAMETERS], f"All in {self.table}.")
         blocks = [*self.blocks(), parameters]
@@ -127,10 +130,10 @@ class ChangePart(ABC):
     @property
     @abstractmethod
     def basis(self) -> str:
-        """The measurements on which `today` is based, in words."""
+        """Description of the measurements from which `today` is computed."""
 
     def to_dict(self) -> dict[str, object]:
-        """Return the numbers as in ``metrics.json`` [SI]."""
+        """Return all numbers as ``metrics.json`` contains them [SI]."""
         change_test: ChangeTest = self.change
         return {
             "verdict": self.verdict.level,
@@ -146,7 +149,12 @@ class ChangePart(ABC):
 
 
 def plus_minus(value: float, sigma: float, unit: str) -> str:
-    """Return a change with its σ as text; empty where σ is zero or NaN."""
+    """Return a change with its σ as text; empty where σ is zero or NaN.
+
+    Args:
+        value, sigma: change and its σ [SI].
+        unit: SI unit; small units (mm, mrad, …) are printed instead.
+    """
     if not sigma or np.isnan(sigma):
         return ""
     factor, printed = SMALL.get(unit, (1.0, unit))

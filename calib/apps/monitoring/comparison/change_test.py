@@ -1,15 +1,16 @@
-"""Test of whether two estimates of a robot's parameters differ, in the combinations that data can show.
+"""Test of whether two estimates of a robot's parameters differ, in combinations of parameters that data identify.
 
-With δ the difference of the combinations, Σ the sum of both covariances, and V the derivative of the combinations by
-each of p parameters,
+Let δ be the difference of the combinations between both estimates, Σ the sum of both covariances, and V the derivative
+of the combinations by each of p parameters. Then
 
     χ² = δᵀ Σ⁻¹ δ
 
-has as many degrees of freedom as combinations were estimated. If parameter k alone changed, by the size x, then
-δ = x v_k with v_k the column of V: x = v_kᵀ Σ⁻¹ δ / v_kᵀ Σ⁻¹ v_k, σ² = 1 / v_kᵀ Σ⁻¹ v_k, and χ² falls by (x/σ)² (Baarda
-1968, data snooping); for several parameters together, by what their columns explain. The difference is tested as a
-whole, and for the parameter that explains most. A combination that only one of the two estimates has is removed by
-conditioning: that estimate is treated as if it had fixed the combination at the value of the other one.
+has as many degrees of freedom as combinations were estimated. If only parameter k changed, by x, then δ = x v_k with
+v_k column k of V. Its least-squares estimate is x = v_kᵀ Σ⁻¹ δ / v_kᵀ Σ⁻¹ v_k with σ² = 1 / v_kᵀ Σ⁻¹ v_k, and it lowers
+χ² by (x/σ)² (Baarda 1968, data snooping). Several parameters together lower χ² by the least-squares fit of their
+columns. Two hypotheses are tested: that nothing changed, and that the parameter with the largest decrease of χ² did not
+change. A combination that only one of the two estimates has is removed by conditioning: this estimate is treated as if
+the combination had been fixed at the value of the other estimate.
 """
 
 from __future__ import annotations
@@ -35,10 +36,11 @@ class ParameterChange(NamedTuple):
 
     Attributes:
         name, unit: name and unit of the parameter.
-        before, after: its values; where it was not fitted, the nominal value.
-        sigma: σ of the difference, from both covariances; 0 where it was fitted in neither.
-        alone, alone_sigma: its change, with σ, if no other parameter had changed; NaN where no data show it.
-        explained: by how much that change lowers χ².
+        before, after: values of the parameter; where it was not fitted, the nominal value.
+        sigma: σ of the difference, from both covariances; 0 where neither estimate fitted the parameter.
+        alone, alone_sigma: estimated change of the parameter if no other parameter changed, and its σ; NaN where the
+            data do not identify it.
+        explained: decrease, by that change, of the χ² statistic of the hypothesis that nothing changed.
     """
 
     name: str
@@ -53,12 +55,12 @@ class ParameterChange(NamedTuple):
 
 @dataclass(frozen=True)
 class ChangeTest:
-    """Result of the test.
+    """Result of the test for a change between two estimates.
 
     Attributes:
         chi2, freedom: χ² of the hypothesis that nothing changed, and its degrees of freedom.
-        parameters: changes of the parameters, the one that explains most first.
-        extra: number of combinations that only the earlier, and only the later calibration estimated.
+        parameters: changes of the parameters, in descending order of the decrease of χ².
+        extra: number of parameter combinations that only the earlier estimate has, and that only the later one has.
     """
 
     chi2: float
@@ -68,9 +70,11 @@ class ChangeTest:
 
     @property
     def probability(self) -> float:
-        """Probability of so large a χ², or of one parameter explaining so much of it, if nothing changed (Bonferroni).
+        """p value of the hypothesis that nothing changed.
 
-        1 where nothing was estimated that could have changed.
+        It is twice the smaller of two p values (Bonferroni). The first is that of the χ² statistic of the difference
+        between both estimates, the second that of the largest decrease of χ² by a change of one parameter. 1 where no
+        estimated combination of parameters could have changed.
         """
         if self.freedom == 0:
             return 1.0
@@ -82,34 +86,42 @@ class ChangeTest:
 
     @property
     def sigmas(self) -> float:
-        """Significance of the change: the deviation of a normal variable that is as unlikely, at most 37."""
+        """Significance of the change: the deviation, in σ, of a normal variable with the same p value, at most 37."""
         return float(norm.isf(max(self.probability, 1e-300) / 2.0))
 
     @property
     def changed(self) -> bool:
-        """Whether the test says that something changed."""
+        """Whether the change is significant."""
         return self.sigmas > limit("arm-changed", "sigmas", "marginal")
 
     @property
     def unexplained(self) -> float:
-        """χ² that remains if only the first parameter changed."""
+        """The χ² statistic of the remaining difference if only the first of `parameters` changed."""
         if not self.parameters:
             return self.chi2
         return max(self.chi2 - self.parameters[0].explained, 0.0)
 
     @property
     def alone(self) -> bool:
-        """Whether the change of the first parameter alone explains the whole difference."""
+        """Whether a change of the first of `parameters` alone explains the whole difference."""
         return self.suffices(self.chi2 - self.unexplained, 1)
 
     @property
     def rivals(self) -> tuple[str, ...]:
-        """The parameters whose change explains the difference about as well as that of the first one."""
+        """Names of further parameters whose change alone would explain the difference nearly as well as the first's.
+
+        Their decrease of the χ² statistic is less than `AS_WELL` below that of the first of `parameters`.
+        """
         best = self.parameters[0].explained
         return tuple(parameter.name for parameter in self.parameters[1:] if parameter.explained > best - AS_WELL)
 
     def suffices(self, explained: float, count: int) -> bool:
-        """Return whether χ² remaining after `count` parameters explained `explained` of it is no more than chance."""
+        """Return whether the remaining difference between both estimates may be chance.
+
+        Args:
+            explained: decrease of the χ² statistic by changes of some parameters.
+            count: number of these parameters.
+        """
         residual = max(self.chi2 - explained, 0.0)
         freedom = max(self.freedom - count, 1)
         return bool(chi2.sf(residual, freedom) > CHANCE)
@@ -117,12 +129,12 @@ class ChangeTest:
 
 @dataclass(frozen=True, eq=False)
 class Tested:
-    """The tested quantities, whitened by their covariance.
+    """The tested combinations of parameters, whitened by their covariance.
 
     Attributes:
-        difference: (k,) difference of the combinations.
+        difference: (k,) difference of the combinations between both estimates.
         columns: (k, p) derivative of the combinations by each of p parameters.
-        extra: see `ChangeTest`.
+        extra: number of combinations that only the earlier estimate has, and that only the later one has.
     """
 
     difference: np.ndarray
@@ -134,7 +146,12 @@ class Tested:
         return float(self.difference @ self.difference)
 
     def alone(self, k: int, identifiable: bool = True) -> tuple[float, float, float]:
-        """Return change, σ and explained χ² of parameter k if it changed alone; NaN, NaN, 0 if not `identifiable`."""
+        """Return change, σ and decrease of the χ² statistic of a parameter if only this parameter changed.
+
+        Args:
+            k: index (from 0) of the parameter among the p parameters.
+            identifiable: whether the parameter is identifiable; if not, NaN, NaN and 0 are returned.
+        """
         size = float(np.linalg.norm(self.columns[:, k]))
         if not identifiable or not size:
             return np.nan, np.nan, 0.0
@@ -142,7 +159,14 @@ class Tested:
         return along / size**2, 1.0 / size, (along / size) ** 2
 
     def together(self, chosen: np.ndarray) -> tuple[np.ndarray, float, int]:
-        """Return changes (p,) of several parameters that explain most together, the χ² explained, and their rank."""
+        """Return the changes of several parameters that lower the χ² statistic most together.
+
+        Args:
+            chosen: indices of the parameters that may have changed; the change of all others is 0.
+
+        Returns:
+            The changes (p,), the decrease of χ², and the rank of the chosen parameters' derivatives.
+        """
         columns = self.columns[:, chosen]
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         unit_columns = columns / size
@@ -156,13 +180,16 @@ class Tested:
 def tested(
     change: np.ndarray, covariances: list[np.ndarray], spans: list[np.ndarray], columns: np.ndarray
 ) -> tuple[Tested, np.ndarray]:
-    """Return the quantities that can be tested of two estimates, and the columns (k, p) before whitening.
+    """Return the combinations that can be compared between two estimates, and their derivatives before whitening.
 
     Args:
-        change: (s,) later minus earlier, of combinations of a size near 1.
+        change: (s,) later minus earlier values of combinations, each of a size near 1.
         covariances: (s, s) covariance of each estimate.
         spans: (s, any) orthonormal columns that span the combinations of each estimate.
         columns: (s, p) derivative of the combinations by each parameter.
+
+    Returns:
+        The k combinations, and their derivatives (k, p) by each parameter.
     """
     no_combination = np.zeros((len(change), 0))
     extra = [no_combination, no_combination]
@@ -187,6 +214,10 @@ def tested(
 
 
 def span(columns: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (k, r) of the space of columns (k, any), each of norm near 1 or zero."""
+    """Return an orthonormal basis (k, r) of the column space of a matrix of rank r.
+
+    Args:
+        columns: the matrix (k, any), with columns of norm near 1 or zero.
+    """
     basis, size, _ = np.linalg.svd(columns, full_matrices=False)
     return basis[:, size > SPAN]

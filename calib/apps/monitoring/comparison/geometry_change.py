@@ -1,8 +1,9 @@
-"""Change between two calibrations of a robot: a test in identifiable combinations, and the tool's motion.
+"""Change of the geometry between two calibrations: a test in identifiable combinations, and the motion of the tool.
 
-With J the derivative of the target's pose at the poses of both fits, after projecting out every motion of base and tool
-(they do not belong to the robot), the rows of Vᵀ from J = U S Vᵀ are the combinations that poses can show. They
-are tested (`calib.apps.monitoring.comparison.change_test`).
+J is the derivative of the target's pose at the poses of both fits by the parameters. Motions of base and tool are
+projected out of J, since their placements are not properties of the robot. With the singular value decomposition J = U
+S Vᵀ, the rows of Vᵀ are the identifiable combinations of parameters, which are tested
+(`calib.apps.monitoring.comparison.change_test`).
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.apps.monitoring.comparison.calibrations import Calibration
 from calib.apps.monitoring.comparison.change_test import ChangeTest, ParameterChange, Tested, span, tested
+from calib.apps.monitoring.comparison.geometry_calibration import Calibration
 from calib.apps.monitoring.settings import DiffSettings
 from calib.errors import UsageError, require
 from calib.toolkit.chains import evaluate, random_joints
@@ -28,15 +29,17 @@ PARALLEL = 1e-2  # share of a parameter's motion that base and tool do not take 
 
 @dataclass(frozen=True, eq=False)
 class ToolMotion:
-    """Motion of the target between two calibrations at poses; base and tool placement are fitted where they do not
-    count.
+    """Motion of the target between two calibrations, at several poses.
+
+    Where changes of base and tool placement are not to count, both placements are fitted so that the motion is
+    smallest.
 
     Attributes:
-        where: which poses, in words.
+        where: description of the poses.
         q: (m, n) joint values [rad or m].
         points: (m, 3) target positions in the base frame [m].
-        position, orientation: (m,) sizes of the motion [m], [rad].
-        expected: rms of the position's motion that is expected from both covariances alone [m].
+        position, orientation: (m,) distance [m] and angle [rad] of the motion.
+        expected: rms of the distance that is expected from both covariances if nothing changed [m].
     """
 
     where: str
@@ -54,12 +57,12 @@ class ToolMotion:
 
 @dataclass(frozen=True)
 class GeometryChange(ChangeTest):
-    """Change of the geometry between two calibrations; `ChangeTest` has the test.
+    """Change of the geometry between two calibrations, with the result of the change test.
 
     Attributes:
-        by_joint: (joint, rms motion of the target if only what describes that joint had changed [m]).
-        motions: at the poses of both fits, then at random ones.
-        frames: motion (6,) [m, rad] of ``base`` and ``tool`` between the two; empty for a nominal robot.
+        by_joint: for each joint (name, rms motion of the target if only that joint's parameters had changed [m]).
+        motions: motion of the target at the poses of both fits, then at random poses.
+        frames: motion (6,) [m, rad] of ``base`` and ``tool`` between the calibrations; empty for a nominal robot.
     """
 
     by_joint: tuple[tuple[str, float], ...]
@@ -69,13 +72,13 @@ class GeometryChange(ChangeTest):
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Target poses at joint values q, with motions of base and tool that do not count projected out.
+    """Target poses at joint values q, and their change; motions of base and tool that do not count are projected out.
 
     Attributes:
         q: (m, n) joint values [rad or m].
         points: (m, 3) target positions in the base frame [m].
-        rows: (p, 6 m) derivatives of the poses by the parameters, turns multiplied by `LEVER`.
-        change: (6 m,) change of the poses, turns multiplied by `LEVER`.
+        rows: (p, 6 m) derivatives of the poses by the parameters, rotations multiplied by the length `LEVER`.
+        change: (6 m,) change of the poses, rotations multiplied by `LEVER`.
     """
 
     q: np.ndarray
@@ -84,7 +87,12 @@ class _Seen:
     change: np.ndarray
 
     def motion(self, where: str, covariance: np.ndarray) -> ToolMotion:
-        """Return the targets' motion, with the motion expected from the covariance (p, p) of the parameters' change."""
+        """Return the motion of the target at these poses.
+
+        Args:
+            where: description of the poses, such as "at random poses".
+            covariance: (p, p) covariance of the parameters' change, from which the expected motion is computed.
+        """
         motions = self.change.reshape(2, 3, -1)
         distances = np.linalg.norm(motions[0], axis=0)
         turns = np.linalg.norm(motions[1], axis=0) / LEVER
@@ -92,7 +100,11 @@ class _Seen:
         return ToolMotion(where, self.q, self.points, distances, turns, expected)
 
     def size(self, steps: np.ndarray) -> float:
-        """Return the rms motion [m] of the targets under independent steps (k, p) of the parameters."""
+        """Return the rms motion [m] of the target if the parameters change by independent steps.
+
+        Args:
+            steps: (k, p) steps of the p parameters.
+        """
         displacements = (steps @ self.rows).reshape(len(steps), 6, len(self.q))[:, :3]
         return float(np.sqrt(np.sum(displacements**2) / len(self.q)))
 
@@ -101,14 +113,15 @@ class _Seen:
 class _Pair:
     """Two arms with one station and one target each, and the difference of their parameters.
 
-    The parameters are those of the arm, then, where they count, of base and tool, then of the joint corrections.
+    The parameters are those of the arm, those of base and tool where they count, and those of the joint corrections.
 
     Attributes:
         cells: earlier and later installation; a base or tool that does not count is equal in both.
-        taken_up: indices in the cells' parameter vector of base and tool where they do not count.
-        free: indices of the p parameters.
-        change: (p,) later minus earlier.
-        covariances: (p, p) of either.
+        taken_up: indices of base and tool in the cells' parameter vector where they do not count; they are projected
+            out.
+        free: indices of the p compared parameters.
+        change: (p,) later minus earlier values.
+        covariances: (p, p) covariance of the earlier, and of the later estimate.
     """
 
     cells: tuple[Installation, Installation]
@@ -118,7 +131,7 @@ class _Pair:
     covariances: tuple[np.ndarray, np.ndarray]
 
     def see(self, q: np.ndarray) -> _Seen:
-        """Return the targets' poses and their change at joint values q (m, n) [rad or m]."""
+        """Return the target's poses and their change between both arms at joint values q (m, n) [rad or m]."""
         earlier, later = self.cells
         base_before = base_after = None
         if earlier.deflection.terms:
@@ -145,8 +158,12 @@ class _Pair:
 def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> GeometryChange:
     """Return the change of the geometry between two calibrations.
 
+    Args:
+        before, after: the earlier and the later calibration.
+        settings: whether changes of base and tool placement count, and the seed of random poses.
+
     Raises:
-        UsageError: base or tool shall count, but are not known of both.
+        UsageError: base or tool are to count, but one calibration does not have them.
     """
     pair = _pair(before, after, settings)
     chain = before.chain
@@ -189,7 +206,12 @@ def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> 
 
 
 def corrected_motion(before: Calibration, after: Calibration, settings: DiffSettings) -> float:
-    """Return the rms motion [m] of the target at the poses of the later fit, with the joint corrections of both."""
+    """Return the rms motion [m] of the target at the poses of the later fit, joint corrections of both included.
+
+    Args:
+        before, after: the earlier and the later calibration.
+        settings: whether changes of base and tool placement count.
+    """
     pair = _pair(before, after, settings)
     earlier, later = pair.cells
     cells = (
@@ -206,7 +228,11 @@ def corrected_motion(before: Calibration, after: Calibration, settings: DiffSett
 
 
 def frame_changes(before: Calibration, after: Calibration) -> dict[str, np.ndarray]:
-    """Return the motions (6,) [m, rad] of ``base`` and ``tool`` between two fits; empty for a nominal robot."""
+    """Return the motions (6,) [m, rad] of ``base`` and ``tool`` between two fits; empty for a nominal robot.
+
+    Args:
+        before, after: the earlier and the later calibration.
+    """
     if before.nominal or after.nominal:
         return {}
     station_before, station_after = _compared(before.cell.station_names, after.cell.station_names)
@@ -218,14 +244,20 @@ def frame_changes(before: Calibration, after: Calibration) -> dict[str, np.ndarr
 
 
 def _step(T_first: np.ndarray, T_second: np.ndarray) -> np.ndarray:
-    """Return the motion (6,) [m, rad] from one placement to the other, in the frame of the first."""
+    """Return the motion (6,) [m, rad] from the first placement to the second, in the frame of the first.
+
+    Args:
+        T_first, T_second: (4, 4) the two placements.
+    """
     step = invert(T_first) @ T_second
     return np.concatenate([step[:3, 3], rotation_vector(step[:3, :3])])
 
 
 def _compared(names_before: Sequence[str], names_after: Sequence[str]) -> tuple[int, int]:
-    """Return the indices of the two stations, or tools, that are compared: those of the first common name, else 0 and
-    0.
+    """Return the indices (from 0) of the two stations, or tools, to compare: those with a common name, else 0 and 0.
+
+    Args:
+        names_before, names_after: names of the stations or tools in the earlier and in the later calibration.
     """
     for name in names_before:
         if name in names_after:
@@ -291,7 +323,12 @@ def _pair(before: Calibration, after: Calibration, settings: DiffSettings) -> _P
 
 
 def _tested(pair: _Pair, sight: _Seen) -> tuple[Tested, np.ndarray]:
-    """Return the test of the combinations that the poses show, and their derivatives (k, p) by each parameter."""
+    """Return the test of the combinations that are identifiable at the poses, and their derivatives (k, p).
+
+    Args:
+        pair: the two arms.
+        sight: target poses of both arms.
+    """
     _, size, directions = np.linalg.svd(sight.rows.T, full_matrices=False)
     directions = directions[size > SHOWN * size[0]]
     covariances = []

@@ -1,4 +1,4 @@
-"""An identified model of a robot's dynamics, read from its folder, to be compared with another one."""
+"""An identified dynamic model of a robot, read from its folder, for comparison with another one."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import folders
-from calib.apps.monitoring.comparison.places import Place, check_same_robot
+from calib.apps.monitoring.comparison.calibration_sources import Place, check_same_robot
 from calib.errors import UsageError, require
 from calib.toolkit.chains import CalibratedChain, read_calibrated
 from calib.toolkit.pose_data import read_table
@@ -25,7 +25,13 @@ from calib.units import TORQUE
 
 @dataclass(frozen=True, eq=False)
 class MotionStates:
-    """States of a motion: times t (N,) [s]; q, v, a (N, n); measured torques (N, rows), None where there are none."""
+    """States along a motion.
+
+    Attributes:
+        t: (N,) times [s].
+        motion: q, v and a, each (N, n).
+        measured: (N, rows) measured torques; None if none were measured.
+    """
 
     t: np.ndarray
     motion: tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -34,17 +40,18 @@ class MotionStates:
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """An identified model.
+    """An identified dynamic model.
 
     Attributes:
-        name: as the user gave it.
-        robot: the arm on whose geometry it was identified.
-        dynamics: model and values.
+        name: folder that the user gave.
+        robot: the arm with whose geometry the model was identified.
+        dynamics: the model and its parameter values.
         names, units: names and units of the b estimated parameters.
-        columns: (b,) their columns in the regressor.
-        covariance: (b, b), the part due to the geometry included; zero for parameters that were not measured.
-        regrouping: key of a base parameter to standard parameter to coefficient.
-        motions: held-out motions by name, else the fitted one.
+        columns: (b,) indices of their columns in the regressor.
+        covariance: (b, b) covariance, including the part due to uncertain geometry; zero for parameters that were not
+            measured.
+        regrouping: key of a base parameter to its linear combination: standard parameter to coefficient.
+        motions: held-out motions by name; the fitted motion if none was held out.
         unit: unit of the torques.
         judged: level and reason of the verdict.
         tolerance: largest accepted unexplained share of the torque [%]; 0: none.
@@ -76,21 +83,27 @@ class Identified:
 
     @property
     def values(self) -> np.ndarray:
-        """The estimate (b,)."""
+        """Values (b,) of the estimated parameters."""
         return self.dynamics.values[self.columns]
 
     @property
     def keys(self) -> list[Hashable]:
-        """Key of each estimated parameter: its standard name; for a drive's term also its form."""
+        """Keys that match each estimated parameter between models.
+
+        The key is the standard name of the parameter; for friction terms it also contains the form of the term.
+        """
         return [_key(self.model, k) for k in self.columns]
 
 
 def read_models(before: Place, after: Place) -> tuple[Identified, Identified]:
     """Return two identified models of one robot, each read from its folder.
 
+    Args:
+        before, after: sources of the earlier and of the later model.
+
     Raises:
-        UsageError: their torques are of different kinds.
-        RobotError: they are of different robots.
+        UsageError: the torques are of different kinds or units.
+        RobotError: the models are of different robots.
     """
     earlier = _read(before)
     later = _read(after)
@@ -154,11 +167,16 @@ def _key(model: IdentificationModel, column: int) -> Hashable:
 
 
 def read_states(path: Path, joints: int) -> MotionStates | None:
-    """Return the states of a motion from a table, with the torques ``measured_…`` if there are any; None without q, v
-    or a.
+    """Return the states of a motion from a table; None if the table lacks positions, velocities or accelerations.
+
+    Columns ``measured_…`` are the torques, if there are any.
+
+    Args:
+        path: CSV file with columns ``q_…``, ``v_…``, ``a_…``.
+        joints: number of joints.
 
     Raises:
-        UsageError: another number of joints.
+        UsageError: a number of joints other than `joints`.
     """
     table = read_table(path)
     q = table.block("q")

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calib.apps.monitoring import pages
+from calib.apps.monitoring import report_folder
 from calib.apps.monitoring.comparison import geometry_change, torque_change
-from calib.apps.monitoring.comparison.calibrations import read_fits
+from calib.apps.monitoring.comparison.calibration_sources import Place, place_of
 from calib.apps.monitoring.comparison.change_part import ChangePart
 from calib.apps.monitoring.comparison.change_test import ParameterChange
+from calib.apps.monitoring.comparison.geometry_calibration import read_fits
 from calib.apps.monitoring.comparison.geometry_change import GeometryChange
 from calib.apps.monitoring.comparison.identifications import read_models, read_states
-from calib.apps.monitoring.comparison.places import Place, place_of
 from calib.apps.monitoring.comparison.tool_part import ToolPart
 from calib.apps.monitoring.comparison.torque_change import DynamicsChange
 from calib.apps.monitoring.comparison.torque_part import TorquePart
@@ -41,10 +41,12 @@ TABLES = (ToolPart.table, TorquePart.table)
 
 @dataclass(frozen=True, eq=False)
 class RobotChange(ChartedResult, ReportedResult):
-    """Change between two calibrations of a robot. ``print`` shows the verdict, the motion of the tool, the parameters.
+    """Change between two calibrations of a robot.
+
+    ``print`` shows the verdict, the motion of the tool and the changed parameters.
 
     Attributes:
-        parts: geometry, dynamics, or both.
+        parts: change of the geometry, of the dynamics, or both.
     """
 
     parts: tuple[ChangePart, ...]
@@ -54,7 +56,7 @@ class RobotChange(ChartedResult, ReportedResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the earlier parameters are still within tolerance: the verdict of the worst part."""
+        """Verdict on whether the earlier parameters are still within tolerance: that of the worst part."""
         worst = max(self.parts, key=lambda part: LEVELS.index(part.verdict.level))
         verdict = worst.verdict
         if len(self.parts) == 1:
@@ -63,7 +65,7 @@ class RobotChange(ChartedResult, ReportedResult):
 
     @property
     def noticed(self) -> tuple[Finding, ...]:
-        """The findings of all parts."""
+        """Findings on all parts of the comparison."""
         findings: list[Finding] = []
         for part in self.parts:
             findings += part.noticed
@@ -96,7 +98,7 @@ class RobotChange(ChartedResult, ReportedResult):
         return Section("Change", blocks, self.verdict.level, self.verdict.reason, figures)
 
     def charts(self) -> dict[str, Chart]:
-        """Return the figures by name: the tool's motion over the workspace, changes of parameters and torque."""
+        """Return the figures by name: motion of the tool over the workspace, change of the torque."""
         charts: dict[str, Chart] = {}
         for part in self.parts:
             charts |= part.charts()
@@ -104,8 +106,13 @@ class RobotChange(ChartedResult, ReportedResult):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write a folder with report.html, tables of all parameters, metrics.json, and the figures as PNG; return the
-        folder.
+        """Write the comparison into a folder and return its path.
+
+        The folder contains report.html, tables of all parameters, metrics.json, and the figures as PNG.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
         """
         parts = []
         for part in self.parts:
@@ -113,10 +120,10 @@ class RobotChange(ChartedResult, ReportedResult):
             if plots:
                 charts = part.charts()
             parameters = (part.table, ParameterChange._fields, part.change.parameters)
-            parts.append(pages.ResultPart(part.section(), charts, part.captions, parameters))
+            parts.append(report_folder.ResultPart(part.section(), charts, part.captions, parameters))
         earlier, later, robot = self._names
         setup = {"earlier": earlier, "later": later}
-        return pages.save(Path(out), "comparison", f"Change of {robot}", setup, parts, self.to_dict(), TABLES)
+        return report_folder.save(Path(out), "comparison", f"Change of {robot}", setup, parts, self.to_dict(), TABLES)
 
     @property
     def _names(self) -> tuple[str, str, str]:
@@ -124,7 +131,7 @@ class RobotChange(ChartedResult, ReportedResult):
         return part.before.name, part.after.name, part.before.robot.chain.name
 
     def to_dict(self) -> dict[str, object]:
-        """Return the numbers as in ``metrics.json`` [SI]."""
+        """Return the numbers as ``metrics.json`` contains them [SI]."""
         before, after, _ = self._names
         numbers: dict[str, Any] = {
             "before": before,
@@ -148,17 +155,19 @@ def diff(before: Compared, after: Compared, settings: DiffSettings = DEFAULT_DIF
     """Compare two calibrations of one robot: what changed, and whether the earlier parameters are still good enough.
 
     Args:
-        before, after: fits, identifications, their folders, or folders of sessions. Geometry, dynamics or both are
-            compared, as far as both have them; one fit may be compared with the nominal robot (file or name).
-        settings: tolerances, whether base and tool placement count, further motions.
+        before, after: fits, identifications, their folders, or folders of sessions. Geometry and dynamics are compared
+            where both calibrations contain them. One of the two may be the nominal robot (file or name), for a
+            comparison of geometry with a fit.
+        settings: tolerances, whether changes of base and tool placement count, and files of motions along which the
+            change of the torque is computed.
 
     Returns:
         ``verdict``, ``geometry`` with the test and the tool's motion, ``dynamics`` with the test and the change of the
         torque, figures (`plot`), `save`.
 
     Raises:
-        UsageError: the two have nothing in common, or a folder holds no calibration.
-        RobotError: they are of different robots.
+        UsageError: the calibrations have no part in common, or a folder contains no calibration.
+        RobotError: the calibrations are of different robots.
     """
     with saved(before) as first, saved(after) as second:
         earlier = place_of(first)
@@ -193,7 +202,7 @@ def _torque_parts(before: Place, after: Place, settings: DiffSettings) -> list[C
         states = read_states(Path(name), later.model.n)
         require(states, f"{name}: no accelerations; expected columns q_…, v_… and a_…", UsageError)
         motions[name] = states  # type: ignore[assignment]
-    message = f"neither {earlier.name} nor {later.name} holds a motion without payload; give one with --motion"
+    message = f"neither {earlier.name} nor {later.name} contains a motion without payload; give one with --motion"
     require(motions, message, UsageError)
     change = torque_change.compare(earlier, later, motions)
     tolerance = settings.torque_tolerance or later.tolerance or earlier.tolerance or None

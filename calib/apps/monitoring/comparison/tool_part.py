@@ -1,4 +1,4 @@
-"""The change of the geometry as a part of a comparison: motion of the tool in mm and mrad, with its map."""
+"""The geometry's part of a comparison: motion of the tool in mm and mrad, with a map over the workspace."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ToolPart(ChangePart):
-    """Change of geometry; ``today`` is the rms error [m] with the earlier parameters over the poses of both fits."""
+    """Change of the geometry; ``today`` is the rms error [m] with the earlier parameters at the poses of both fits."""
 
     kind: ClassVar = "geometry"
     table: ClassVar = "changes.csv"
@@ -42,7 +42,7 @@ class ToolPart(ChangePart):
     @property
     def words(self) -> str:
         motion = self.change.motions[0]
-        return f"the tool moved by {1e3 * motion.rms:.3g} mm rms (σ lets expect {1e3 * motion.expected:.2g} mm)"
+        return f"the tool moved by {1e3 * motion.rms:.3g} mm rms (expected from σ: {1e3 * motion.expected:.2g} mm)"
 
     @property
     def basis(self) -> str:
@@ -100,10 +100,10 @@ class ToolPart(ChangePart):
     def blocks(self) -> list[Block]:
         motions = [
             RecordColumn("target's motion at", "{0.where}", number=False),
-            RecordColumn("poses", lambda motion: f"{len(motion.q)}"),
+            RecordColumn("poses", _pose_count),
             RecordColumn("median mm", _median_mm),
-            RecordColumn("rms mm", lambda motion: f"{1e3 * motion.rms:.3g}"),
-            RecordColumn("σ of that mm", lambda motion: f"{1e3 * motion.expected:.2g}"),
+            RecordColumn("rms mm", _rms_mm),
+            RecordColumn("expected from σ mm", _expected_mm),
             RecordColumn("worst mm", _worst_mm),
             RecordColumn("median mrad", _median_mrad),
             RecordColumn("worst mrad", _worst_mrad),
@@ -116,11 +116,11 @@ class ToolPart(ChangePart):
         return [
             Text("Motion", self._motion()),
             table("Motion of the tool", motions, self.change.motions),
-            table("Motion of the tool by what describes one joint", by_joint, self.change.by_joint),
+            table("Motion of the tool that the parameters of one joint explain", by_joint, self.change.by_joint),
         ]
 
     def _motion(self) -> list[str]:
-        """Return sentences on the target's motion: how far, where most, and by which joint."""
+        """Return sentences on the target's motion: its size, the pose where it is largest, and the joint causing it."""
         change = self.change
         lines = []
         for motion in change.motions:
@@ -130,11 +130,15 @@ class ToolPart(ChangePart):
             lines.append(f"{beginning}, {worst}, {turns}")
         if change.changed:
             joint, joint_rms = max(change.by_joint, key=itemgetter(1))
-            lines.append(f"most of it comes from {joint}: {1e3 * joint_rms:.3g} mm rms")
+            lines.append(f"most of this motion comes from {joint}: {1e3 * joint_rms:.3g} mm rms")
         return lines
 
     def _worst_joints(self, motion: ToolMotion) -> str:
-        """Return the joint values at the pose where the target moved most, as text."""
+        """Return as text the joint values at the pose where the target moved most.
+
+        Args:
+            motion: motion of the target at several poses.
+        """
         values = []
         for joint, value in zip(self.before.chain.joints, motion.q[motion.position.argmax()]):
             factor, unit = JOINT[joint.kind]
@@ -172,6 +176,18 @@ class ToolPart(ChangePart):
                 "turn_worst": float(motion.orientation.max()),
             }
         return {"motions": motions, "by_joint": dict(self.change.by_joint)}
+
+
+def _pose_count(motion: ToolMotion) -> str:
+    return f"{len(motion.q)}"
+
+
+def _rms_mm(motion: ToolMotion) -> str:
+    return f"{1e3 * motion.rms:.3g}"
+
+
+def _expected_mm(motion: ToolMotion) -> str:
+    return f"{1e3 * motion.expected:.2g}"
 
 
 def _median_mm(motion: ToolMotion) -> str:

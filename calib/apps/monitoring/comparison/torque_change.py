@@ -1,9 +1,10 @@
-"""Change between two identified models of a robot's dynamics: a test in base parameters, and the torque's change.
+"""Change between two identified models of a robot's dynamics: a test in base parameters, and the change of the torque.
 
-The combinations are the base parameters, each divided by its σ; their derivatives by a standard parameter, or by all of
-a joint's friction or a link's body, come from the regrouping of the later model. They are tested (`change_test`). The
-change of the torque is the difference of the two models over motions, Δτ = W₂ χ₂ - W₁ χ₁, each with its own geometry;
-by both covariances the expected square is w₁ Σ₁ w₁ᵀ + w₂ Σ₂ w₂ᵀ.
+The tested combinations (`change_test`) are the base parameters, each divided by its σ. Their derivatives by a standard
+parameter, by a joint's friction or by a link's inertial parameters follow from the later model's regrouping of standard
+parameters into base parameters. The change of the torque along a motion is the difference of the two models' torques,
+Δτ = W₂ χ₂ - W₁ χ₁, each with the model's own geometry. If nothing changed, both covariances give its expected square,
+w₁ Σ₁ w₁ᵀ + w₂ Σ₂ w₂ᵀ.
 """
 
 from __future__ import annotations
@@ -25,16 +26,15 @@ NEARLY_ALL = 0.9
 
 @dataclass(frozen=True, eq=False)
 class TorqueChange:
-    """Change of the torque over one motion.
+    """Change of the torque along one motion.
 
     Attributes:
-        where: which motion.
+        where: name of the motion.
         t: (N,) times of the samples [s]; sample numbers where the table has no times.
-        change, expected: (N, rows) later minus earlier torque, and its σ by both covariances [N m or N].
+        change, expected: (N, rows) later minus earlier torque, and σ of this difference by both covariances [N m or N].
         torque: (N, rows) torque of the later model [N m or N].
-        unexplained: share of the measured torque that the earlier and the later model leave unexplained, over all rows
-            [%];
-            None if no torque was measured.
+        unexplained: share of the measured torque that the earlier, and that the later model leaves unexplained, over
+            all rows [%]; None if no torque was measured.
     """
 
     where: str
@@ -46,19 +46,19 @@ class TorqueChange:
 
     @property
     def rms(self) -> float:
-        """Rms change over all rows [N m or N]."""
+        """Rms change of the torque over all samples and rows [N m or N]."""
         return _rms(self.change)
 
 
 @dataclass(frozen=True)
 class PartChange:
-    """Friction of a joint, or body of a link: the share of the difference that it explains if it changed alone.
+    """The friction of a joint, or the inertial parameters of a link, as the only change between two models.
 
     Attributes:
         name: name of the part.
-        explained: χ² explained.
-        count: number of its combinations.
-        rms: change of the torque over the first motion if only this part had changed [N m or N].
+        explained: decrease of the χ² statistic of the difference between the models, if only this part changed.
+        count: number of parameter combinations that the part changes.
+        rms: rms change of the torque along the first motion if only this part changed [N m or N].
     """
 
     name: str
@@ -69,11 +69,11 @@ class PartChange:
 
 @dataclass(frozen=True)
 class DynamicsChange(ChangeTest):
-    """Change between two identified models; `ChangeTest` has the test.
+    """Change between two identified models, with the result of the change test.
 
     Attributes:
-        parts: friction of each joint, body of each link: the one that explains most first.
-        torques: change of the torque over each motion.
+        parts: friction of each joint and inertial parameters of each link, in descending order of the decrease of χ².
+        torques: change of the torque along each motion.
     """
 
     parts: tuple[PartChange, ...]
@@ -81,7 +81,10 @@ class DynamicsChange(ChangeTest):
 
     @property
     def part(self) -> PartChange | None:
-        """The part that explains most, if what it leaves is chance, or it explains `NEARLY_ALL` of χ²; else None."""
+        """The first of `parts`, if its change alone explains the difference; else None.
+
+        It does if the remaining χ² may be chance, or if it explains the share `NEARLY_ALL` of χ².
+        """
         first = self.parts[0]
         if self.suffices(first.explained, first.count) or first.explained > NEARLY_ALL * self.chi2:
             return first
@@ -89,7 +92,12 @@ class DynamicsChange(ChangeTest):
 
 
 def compare(before: Identified, after: Identified, motions: dict[str, MotionStates]) -> DynamicsChange:
-    """Return the change between two models of one robot, with the change of the torque over motions."""
+    """Return the change between two models of one robot, with the change of the torque along the given motions.
+
+    Args:
+        before, after: the earlier and the later model.
+        motions: states by the name of the motion.
+    """
     keys = list(dict.fromkeys([*before.keys, *after.keys]))
     values_before, covariance_before = _among(before, keys)
     values_after, covariance_after = _among(after, keys)
@@ -123,7 +131,14 @@ def compare(before: Identified, after: Identified, motions: dict[str, MotionStat
 
 
 def _among(model: Identified, keys: list[Hashable]) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (s,) and covariance (s, s) of a model's parameters in order of `keys`, zero for those it lacks."""
+    """Return values (s,) and covariance (s, s) of a model's base parameters in the order of `keys`.
+
+    Both are zero for parameters that the model does not have.
+
+    Args:
+        model: the model.
+        keys: keys of s base parameters, as in `Identified.keys`.
+    """
     indices = [keys.index(key) for key in model.keys]
     values = np.zeros(len(keys))
     values[indices] = model.values
@@ -133,7 +148,12 @@ def _among(model: Identified, keys: list[Hashable]) -> tuple[np.ndarray, np.ndar
 
 
 def _standard(before: Identified, after: Identified, keys: list[Hashable]) -> list[tuple[str, str, np.ndarray]]:
-    """Return (name, unit, derivative (s,) of the combinations) of each estimated and each regrouped parameter."""
+    """Return (name, unit, derivatives (s,) of the base parameters) of each estimated and each regrouped parameter.
+
+    Args:
+        before, after: the two models.
+        keys: keys of the s base parameters.
+    """
     names_and_units = {}
     for model in (before, after):
         for key, name, unit in zip(model.keys, model.names, model.units):
@@ -161,7 +181,12 @@ def _standard(before: Identified, after: Identified, keys: list[Hashable]) -> li
 
 
 def _distinct(columns: np.ndarray, first: int) -> list[int]:
-    """Return indices of columns (s, p) that are not parallel to an earlier one; the `first` ones are always kept."""
+    """Return the indices of columns of a matrix (s, p) that are not parallel to an earlier column.
+
+    Args:
+        columns: the matrix, whose columns are derivatives by p parameters.
+        first: number of columns at the beginning that are always included.
+    """
     size = np.linalg.norm(columns, axis=0)
     unit = columns / np.where(size > 0.0, size, 1.0)
     chosen = list(range(first))
@@ -172,7 +197,14 @@ def _distinct(columns: np.ndarray, first: int) -> list[int]:
 
 
 def _parts(test: Tested, arm: IdentificationModel, names: list[str], states: MotionStates) -> tuple[PartChange, ...]:
-    """Return each joint's friction and each link's body with the χ² that it explains."""
+    """Return each joint's friction and each link's inertial parameters with the decrease of χ² if only they changed.
+
+    Args:
+        test: test of the tested combinations of parameters.
+        arm: the model whose parameters are grouped.
+        names: names of the tested parameters.
+        states: motion along which the change of the torque is computed.
+    """
     column_of = {name: k for k, name in enumerate(arm.names)}
     result = []
     for part, members in {**_frictions(arm), **_links(arm)}.items():
@@ -190,7 +222,7 @@ def _parts(test: Tested, arm: IdentificationModel, names: list[str], states: Mot
 
 
 def _frictions(model: IdentificationModel) -> dict[str, set[str]]:
-    """Return, for each joint's friction, the names of its drive terms."""
+    """Return the names of the friction terms of each joint in a model, by the text "the friction of joint …"."""
     frictions: dict[str, set[str]] = {f"the friction of joint {j + 1}": set() for j in range(model.n)}
     for term in model.columns:
         part = f"the friction of joint {term.acts[0][0] + 1}"
@@ -200,7 +232,7 @@ def _frictions(model: IdentificationModel) -> dict[str, set[str]]:
 
 
 def _links(model: IdentificationModel) -> dict[str, set[str]]:
-    """Return the names of the ten inertial parameters of each link."""
+    """Return the names of each link's ten inertial parameters in a model, by the text "the body of link …"."""
     names = model.names[: model.inertial]
     return {f"the body of link {k // 10 + 1}": set(names[k : k + 10]) for k in range(0, len(names), 10)}
 

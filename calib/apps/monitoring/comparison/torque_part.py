@@ -1,4 +1,4 @@
-"""The change of the dynamics as a part of a comparison: change of the torque over motions, with its curve."""
+"""The dynamics' part of a comparison: change of the torque along motions, with a figure of its course."""
 
 from __future__ import annotations
 
@@ -18,7 +18,13 @@ if TYPE_CHECKING:
 
 
 class _TorqueRow(NamedTuple):
-    """The change of one torque row over one motion, rms and worst [N m or N]."""
+    """The change of one torque row along one motion.
+
+    Attributes:
+        motion, name: names of the motion and of the torque row.
+        change, expected, worst: rms change, σ of the change, and largest change [N m or N].
+        torque: rms torque of the later model [N m or N].
+    """
 
     motion: str
     name: str
@@ -30,7 +36,11 @@ class _TorqueRow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TorquePart(ChangePart):
-    """Change of dynamics; ``today`` is the worst share [%] of later measured torques that the earlier model leaves."""
+    """Change of the dynamics.
+
+    ``today`` is the share [%] of the torque measured for the later model that the earlier model leaves unexplained, on
+    the worst motion.
+    """
 
     kind: ClassVar = "dynamics"
     table: ClassVar = "torque_changes.csv"
@@ -40,7 +50,7 @@ class TorquePart(ChangePart):
 
     @cached_property
     def judged(self) -> TorqueChange:
-        """The motion on which `today` is based: the worst of those measured for the later model."""
+        """Change on the motion from which `today` is computed: the worst of those measured for the later model."""
         measured = [
             change for change in self.change.torques if change.unexplained and change.where in self.after.motions
         ]
@@ -55,7 +65,7 @@ class TorquePart(ChangePart):
     @property
     def words(self) -> str:
         change = self.judged
-        expected = f"σ lets expect {_rms(change.expected):.2g} {self.unit}"
+        expected = f"expected from σ: {_rms(change.expected):.2g} {self.unit}"
         return f"the torque changed by {change.rms:.3g} {self.unit} rms ({expected})"
 
     @property
@@ -121,7 +131,7 @@ class TorquePart(ChangePart):
             RecordColumn("motion", "{0.motion}", number=False),
             RecordColumn("torque of", "{0.name}", number=False),
             RecordColumn(f"change rms {unit}", "{0.change:.3g}"),
-            RecordColumn("σ of that", "{0.expected:.2g}"),
+            RecordColumn("expected from σ", "{0.expected:.2g}"),
             RecordColumn("worst", "{0.worst:.3g}"),
             RecordColumn("torque rms", "{0.torque:.3g}"),
         ]
@@ -134,14 +144,14 @@ class TorquePart(ChangePart):
         return [
             Text("Torque", [self._words(change) for change in self.change.torques]),
             table("Change of the torque", torques, rows),
-            table("What one joint's friction or one link's body explains", parts, self.change.parts, most=6),
+            table("Change that one joint's friction or one link's body explains", parts, self.change.parts, most=6),
         ]
 
     def _words(self, change: TorqueChange) -> str:
         text = f"{change.where}: the torque changed by {change.rms:.3g} {self.unit} rms"
         if change.unexplained:
             earlier, later = change.unexplained
-            text += f"; the earlier model leaves {earlier:.3g} % of it unexplained, the later one {later:.3g} %"
+            text += f"; the earlier model leaves {earlier:.3g} % of the torque unexplained, the later one {later:.3g} %"
         return text
 
     def charts(self) -> dict[str, Chart]:
@@ -174,7 +184,11 @@ class TorquePart(ChangePart):
 
 
 def _unexplained_before(change: TorqueChange) -> float:
-    """Return the share [%] that the earlier model leaves unexplained; 0 where no torque was measured."""
+    """Return the share of the torque [%] that the earlier model leaves unexplained; 0 where no torque was measured.
+
+    Args:
+        change: change of the torque along one motion.
+    """
     if change.unexplained is None:
         return 0.0
     return change.unexplained[0]

@@ -1,1 +1,1 @@
-"""Certificate (HTML, PDF) of at most four pages, and report with all tables and figures, of sessions and results."""
+"""Calibration certificates of at most four pages (HTML, PDF), and complete reports, for sessions and single results."""

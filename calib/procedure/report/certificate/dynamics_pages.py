@@ -1,4 +1,4 @@
-"""Page of the certificate on the dynamics: torque errors in N·m and as shares of the limits, torques, uncertainty."""
+"""The certificate's page on the dynamics: torque errors in N·m and as shares of the limits, and uncertainty."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ NOTE = (
 
 
 def stage(report: DynamicReport, section: Section, plots: bool, tolerance: float = 0.0) -> StageRecord:
-    """Return the record of an identification for report and certificate.
+    """Return the content of report and certificate on an identification.
 
     Args:
-        report: report of the identification.
+        report: stored results of the identification.
         section: section of the report, with verdict and key figures.
         plots: whether to include figures.
-        tolerance: largest acceptable torque error on unseen motion [%]; 0: no tolerance.
+        tolerance: largest acceptable torque error on held-out motion [%]; 0: no tolerance.
     """
     order = _worst_first(report)
     pictures = list(_curves(report, order)) if plots else []
@@ -57,7 +57,12 @@ def stage(report: DynamicReport, section: Section, plots: bool, tolerance: float
 
 
 def _unchecked(report: DynamicReport, tolerance: float) -> Iterator[str]:
-    """Yield texts on what the recordings of an identification cannot prove."""
+    """Yield texts on the properties that the recordings of an identification cannot prove.
+
+    Args:
+        report: stored results of the identification.
+        tolerance: largest acceptable torque error [%]; 0: no tolerance.
+    """
     if not report.unseen.proofs:
         yield "torque errors on unseen motion: none was recorded"
     if not tolerance:
@@ -69,9 +74,12 @@ def _uncertainty_findings(report: DynamicReport) -> list[str]:
 
 
 def _worst_first(report: DynamicReport) -> np.ndarray:
-    """Return the indices of the torque rows, sorted by error, worst first.
+    """Return the indices (from 0) of the torque rows, sorted by error, largest first.
 
-    Errors are taken as shares of the torque limits if all limits are known, else in absolute terms.
+    Errors are divided by the torque limits if all limits are known.
+
+    Args:
+        report: stored results of the identification.
     """
     _, proof, _ = proof_of(report.unseen)
     errors = np.nan_to_num(proof.raw.rms)
@@ -104,7 +112,12 @@ def _torque_table(report: DynamicReport, order: np.ndarray) -> ReportTable:
 
 
 def _curves(report: DynamicReport, order: np.ndarray) -> Iterator[Picture]:
-    """Yield the picture of measured and predicted torques with the largest errors."""
+    """Yield a picture of the torques with the largest errors, measured and predicted; nothing without curves.
+
+    Args:
+        report: stored results of the identification.
+        order: indices of the torque rows, the row with the largest error first.
+    """
     from calib.procedure.report.charts import vector
     from calib.procedure.report.dynamics_figures import torques
 
@@ -140,7 +153,13 @@ def _uncertainty(report: DynamicReport) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class _DesignSetting:
-    """Settings of a design: period [s], columns to identify, and number of verified instants."""
+    """Settings of a designed motion.
+
+    Attributes:
+        period: period of the motion [s].
+        columns: names of the columns to identify.
+        instants_verified: number of instants at which the limits were checked.
+    """
 
     period: float
     columns: tuple[str, ...]
@@ -149,15 +168,19 @@ class _DesignSetting:
 
 @dataclass(frozen=True)
 class _LimitMargin:
-    """Distance of a motion from a limit, as a share of the limit."""
+    """Smallest distance of a motion from a limit, as a share of the limit."""
 
     share: float
 
 
 @dataclass(frozen=True)
 class _DesignMetrics:
-    """Entries of a designed motion's ``metrics.json`` that the certificate uses: condition number, settings,
-    margins.
+    """Entries of a designed motion's ``metrics.json`` that the certificate uses.
+
+    Attributes:
+        condition_number: ``raw`` (SI units) and ``normalised`` (unit columns) -> condition number.
+        setting: settings of the design.
+        margins: name of a limit -> distance of the motion from the limit.
     """
 
     condition_number: Mapping[str, float]
@@ -166,7 +189,12 @@ class _DesignMetrics:
 
 
 def trained_on(folder: Path, joints: Sequence[Joint]) -> Captioned:
-    """Return the chart of a designed motion from its folder, with its condition number in the caption."""
+    """Return a chart of the designed training motion in a folder, and a caption that states its condition number.
+
+    Args:
+        folder: folder of the designed motion.
+        joints: the robot's joints.
+    """
     from calib.procedure.report.motion_figures import motion_sheet
 
     motion = coefficients.read(folder)

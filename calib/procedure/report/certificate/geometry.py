@@ -1,4 +1,4 @@
-"""The certificate's page on the geometry: errors on held-out poses, worst pose, ISO 9283, uncertainty."""
+"""The certificate's page on the geometry: errors on held-out poses, worst pose, ISO 9283 figures, and uncertainty."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -32,10 +32,10 @@ NO_ISO = (
 
 
 def stage(report: Report, drawn: Mapping[str, Picture]) -> StageRecord:
-    """Return the record of a fit for report and certificate.
+    """Return the content of report and certificate on a fit.
 
     Args:
-        report: report of the fit.
+        report: stored results of the fit.
         drawn: figures of the report by name; empty: the certificate has no figures either.
     """
     blocks = list(_blocks(report, bool(drawn)))
@@ -64,7 +64,11 @@ def _blocks(report: Report, plots: bool) -> Iterator[Block]:
 
 
 def _unchecked(report: Report) -> Iterator[str]:
-    """Yield texts on what the measurements of a fit cannot prove."""
+    """Yield texts on the properties that the measurements of a fit cannot prove.
+
+    Args:
+        report: stored results of the fit.
+    """
     metrics = report.metrics
     if not metrics.proofs:
         yield "errors on held-out poses: none were measured"
@@ -79,8 +83,12 @@ def _uncertainty_findings(metrics: FitMetrics) -> list[str]:
 
 
 def _figures(report: Report, row_errors: RowErrors, label: str) -> Iterator[Picture]:
-    """Yield the histograms of nominal and calibrated errors, and the map of calibrated errors with the worst pose
-    marked.
+    """Yield histograms of nominal and calibrated errors, and a map of calibrated errors that marks the worst pose.
+
+    Args:
+        report: stored results of the fit.
+        row_errors: errors on the rows to show.
+        label: text that names these rows in captions.
     """
     from calib.procedure.report.charts import text, vector
     from calib.procedure.report.geometry_figures import error_histogram, error_map
@@ -113,7 +121,12 @@ def _figures(report: Report, row_errors: RowErrors, label: str) -> Iterator[Pict
 
 
 def _worst(report: Report, row_errors: RowErrors) -> Iterator[str]:
-    """Yield a sentence on the pose with the largest error: its errors, joints, and position."""
+    """Yield sentences on the pose with the largest error: its errors, joint values, and target position.
+
+    Args:
+        report: stored results of the fit.
+        row_errors: errors on the rows to show.
+    """
     rows = row_errors.worst or row_errors
     deliverable = report.metrics.deliverable
     nature = next(iter(rows.nominal))

@@ -1,7 +1,8 @@
-"""Contents of a certificate and a report as records; `calib.procedure.report.certificate.rendering` renders them.
+"""Contents of a certificate and a report as records, which `calib.procedure.report.certificate.rendering` renders.
 
-The records contain every word, so that HTML and PDF have the same text. A certificate has at most `MAX_PAGES` pages:
-lists and texts of unlimited length are cut here at a stated number, and the report contains them completely.
+The records contain all words, so that HTML and PDF have the same text. A certificate has at most `MAX_PAGES` pages:
+lists and texts of unlimited length are shortened in this module to a fixed number of entries or letters. The report
+contains them completely.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ NOTES = (Text("Limitations", LIMITATIONS), Text("Conventions", CONVENTIONS))
 
 @dataclass(frozen=True)
 class Entry:
-    """A line of a certificate: label and value; an empty value is a line to fill in by hand."""
+    """A line of a certificate: label and value; an empty value is a blank line to be filled in by hand."""
 
     label: str
     value: str = ""
@@ -74,7 +75,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Page:
-    """A report: kind, title, subtitle, date of issue, and sections; sections of a stage have a verdict."""
+    """A report: kind, title, subtitle, date of issue, and sections; a section on a calibration stage has a verdict."""
 
     kind: str
     title: str
@@ -85,7 +86,7 @@ class Page:
 
 @dataclass(frozen=True)
 class Judgement:
-    """A verdict: title of its subject, level, label of the level, and the reason as a sentence."""
+    """A verdict as printed: title of what is judged, level, label of the level, and the reason as a sentence."""
 
     title: str
     level: str
@@ -95,15 +96,15 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Certificate(Page):
-    """A certificate.
+    """A calibration certificate.
 
     Attributes:
         number: number of the certificate.
-        alert: warning at the top, such as that the results are simulated; empty without one.
+        alert: warning at the top, such as that the results are simulated; empty: no warning.
         verdicts: verdict on each stage.
-        tolerances: requested tolerance and whether it is met, for each quantity and deliverable.
-        setup: robot, instrument and method, as stated by the results.
-        details: entries by a person, and lines to fill in.
+        tolerances: table of requested tolerances, by quantity and deliverable, and whether they are met.
+        setup: robot, instrument and method, as stated in the results.
+        details: entries made by a person, and blank lines to fill in.
         signatures: labels of the signature fields.
         sections: pages of the certificate, one per section.
     """
@@ -119,12 +120,12 @@ class Certificate(Page):
 
 @dataclass(frozen=True)
 class StageRecord:
-    """A stage of a calibration, as report and certificate show it.
+    """Content of report and certificate on one stage of a calibration (geometry or dynamics).
 
     Attributes:
         section: section of the report, with verdict and key figures.
-        sheet: blocks of the certificate's page on the stage.
-        unchecked: texts on what the measurements cannot prove.
+        sheet: content of the certificate's page on the stage.
+        unchecked: texts on the properties that the measurements cannot prove.
         findings: texts of the findings.
     """
 
@@ -147,13 +148,13 @@ def records(
     """Return certificate and report of a calibration.
 
     Args:
-        title, subtitle: of both documents.
-        setup: robot, instrument and method; the certificate contains the entries of `CERTIFIED_SETUP`.
-        stages: records of the stages.
-        unchecked: what was not checked in addition to the stages' lists.
-        files: input files, see `calib.procedure.report.fit_report.file_row`; the most important ones first.
-        details: entries by a person.
-        alert: warning at the top; empty without one.
+        title, subtitle: title and subtitle of both documents.
+        setup: robot, instrument and method; the certificate contains only the entries of `CERTIFIED_SETUP`.
+        stages: contents on the stages.
+        unchecked: texts on unproven properties in addition to those of the stages.
+        files: input files (name, role, size in bytes, SHA-256), the most important ones first.
+        details: entries made by a person.
+        alert: warning at the top; empty: no warning.
     """
     certified = []
     for entry in setup:
@@ -195,12 +196,17 @@ def records(
 
 
 def _certificate_page(title: str, blocks: Sequence[Block]) -> Section:
-    """Return a page of a certificate, with its texts shortened."""
+    """Return a page of a certificate, with texts shortened to the allowed number of letters.
+
+    Args:
+        title: title of the page.
+        blocks: its content.
+    """
     return Section(title, [_cut(block) if isinstance(block, Text) else block for block in blocks])
 
 
 def judgement(section: Section, max_letters: int | None = None) -> Judgement:
-    """Return the verdict of a section, its reason cut at `max_letters`."""
+    """Return the verdict of a section for printing; the reason is cut at `max_letters` (None: not cut)."""
     level = section.verdict
     label = level.upper()
     if "(" in level:
@@ -213,7 +219,11 @@ def judgement(section: Section, max_letters: int | None = None) -> Judgement:
 
 
 def key_table(sections: Sequence[Section]) -> ReportTable:
-    """Return the table of key figures: nominal, calibrated, requested tolerance, and whether it is met."""
+    """Return the table of key figures: nominal value, calibrated value, requested tolerance, and whether it is met.
+
+    Args:
+        sections: sections of the report, with key figures.
+    """
     header = ("quantity", "nominal", "after", "standard error", "on", "tolerance asked", "met")
     rows, with_tolerance = [], set()
     for section in sections:
@@ -232,9 +242,7 @@ def _cells(figure: KeyFigure) -> tuple[str, ...]:
 
 
 def _cut(block: Text) -> Text:
-    """Return a text of a certificate with at most `MAX_LINES` sentences of `MAX_LINE` letters; the report is
-    complete.
-    """
+    """Return the text `block` of a certificate shortened to `MAX_LINES` sentences of at most `MAX_LINE` letters."""
     lines = [shortened(_local(str(line)), MAX_LINE) for line in block.lines]
     if len(lines) > MAX_LINES:
         count = len(lines) - MAX_LINES + 1
@@ -243,14 +251,17 @@ def _cut(block: Text) -> Text:
 
 
 def _local(text: str) -> str:
-    """Return a text with file names instead of absolute paths of this machine."""
+    """Return a text in which file names replace absolute paths, since paths of this machine mean nothing elsewhere."""
     return re.sub(r"(?<![\w.~/])/(?:[^/\s]+/)+(?=[^/\s])", "", text)
 
 
 def files_table(files: Sequence[FileRow], max_files: int | None = None) -> ReportTable:
-    """Return the table of files with their SHA-256.
+    """Return the table of files with their SHA-256 digests.
 
-    With `max_files`, only so many files, those edited by hand first, with short digests; None: all.
+    Args:
+        files: the files.
+        max_files: largest number of files; files edited by hand are listed first, and digests are shortened; None: all
+            files, with complete digests.
     """
     if max_files is None:
         return ReportTable("", ("file", "what it is", "bytes", "SHA-256"), files, numbers=(2,))
@@ -268,7 +279,14 @@ def files_table(files: Sequence[FileRow], max_files: int | None = None) -> Repor
 def report(
     title: str, subtitle: str, setup: Sequence[Entry], sections: Sequence[Section], files: Sequence[FileRow] = ()
 ) -> Page:
-    """Return the record of a report: verdicts, all sections, setup, files, conventions."""
+    """Return the record of a report: verdicts, all sections, setup, files, limitations and conventions.
+
+    Args:
+        title, subtitle: title and subtitle of the report.
+        setup: robot, instrument and method.
+        sections: sections on the stages.
+        files: input files; empty: no list of files.
+    """
     verdicts = [judgement(section) for section in sections if section.verdict]
     reasons = [f"{verdict.title}: {verdict.label}. {verdict.reason}" for verdict in verdicts]
     report_sections = [Section("Result", [Text("Verdict", reasons), key_table(sections)]), *sections]

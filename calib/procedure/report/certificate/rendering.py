@@ -1,7 +1,7 @@
 """Certificates and reports as HTML (one file without external resources) and as PDF (PDF/A-2b, by Typst).
 
-The templates only arrange the texts of the records. The PDF's font is the one delivered with matplotlib; the computer's
-own fonts are used only for letters that it lacks.
+The templates only arrange the texts of the records. The PDF uses the font that matplotlib contains; fonts installed on
+the computer are used only for letters that this font lacks.
 """
 
 import json
@@ -28,7 +28,7 @@ STANDARD = "a-2b"
 
 
 def write(folder: Path, certificate: Certificate, report: Page) -> list[str]:
-    """Write a certificate as HTML and PDF and the report into a folder; return notes for the user."""
+    """Write a certificate as HTML and PDF, and the report as HTML, into a folder; return notes for the user."""
     document, notes = pdf(certificate)
     for name, content in zip(PAGES, (html(certificate), document, html(report))):
         if content:
@@ -39,7 +39,12 @@ def write(folder: Path, certificate: Certificate, report: Page) -> list[str]:
 
 
 def write_figures(folder: Path, page: Page) -> int:
-    """Write the figures of a report as SVG into a folder, numbered by section; return their number."""
+    """Write the figures of a report as SVG into a folder, numbered by section; return the number of figures.
+
+    Args:
+        folder: the folder.
+        page: the report.
+    """
     from calib.procedure.report.charts import vector
 
     count = 0
@@ -56,7 +61,7 @@ def write_figures(folder: Path, page: Page) -> int:
 
 
 def html(page: Page) -> str:
-    """Return a certificate or report as HTML."""
+    """Return a certificate or report (`page`) as HTML."""
     template = "sheet.html" if isinstance(page, Certificate) else "report.html"
     return filled(PACKAGE, template, page=page)
 
@@ -64,8 +69,8 @@ def html(page: Page) -> str:
 def pdf(page: Certificate) -> tuple[bytes, list[str]]:
     """Return a certificate as PDF, and notes for the user.
 
-    If it would have more than `MAX_PAGES` pages, which only very long entries cause, it is set in smaller type. The PDF
-    is empty in a process forked from one that has used Typst, whose threads do not exist after a fork.
+    A certificate above `MAX_PAGES` pages, which only very long entries cause, is set in smaller type. The PDF is empty
+    in a process forked from one that has used Typst, since Typst's threads do not exist after a fork.
     """
     if _first_user() != os.getpid():
         return b"", [f"{PAGES[1]} was not written, since this process was forked: start processes by spawn"]
@@ -93,12 +98,17 @@ def _first_user() -> int:
 
 
 def pages(document: bytes) -> int:
-    """Return the number of pages of a PDF written by Typst."""
+    """Return the number of pages of a PDF (`document`, the file's content) written by Typst."""
     return len(re.findall(rb"/Type\s*/Page\b", document))
 
 
 def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]]:
-    """Return the PDF of a template and its inputs, and a note on letters that no font has."""
+    """Return the PDF that Typst makes, and a note on letters that no font has.
+
+    Args:
+        inputs: file name -> content, of the template and the texts.
+        dense: whether smaller type is used.
+    """
     import typst  # 80 MB, and needed for nothing else
 
     notes: list[str] = []
@@ -115,12 +125,12 @@ def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]
             lacking = re.search('the text `"(.*)"` could not be displayed', str(error))
             if lacking is None or not standard:
                 raise
-            notes = [f"{PAGES[1]}: no font here has {lacking[1]!r}: a box stands for it; {PAGES[0]} shows it"]
+            notes = [f"{PAGES[1]}: no font here has {lacking[1]!r}: a box replaces it; {PAGES[0]} shows it"]
     raise AssertionError("without a standard every letter is accepted")
 
 
 def _fonts() -> Iterator[tuple[list[str], Any]]:
-    """Yield lists of fonts to try in this order, with the PDF standard; None: plain PDF."""
+    """Yield lists of fonts in the order of the trials, each with a PDF standard; None: PDF without a standard."""
     import typst
 
     yield [FONT], STANDARD

@@ -1,4 +1,4 @@
-"""Certificate and report of a fit or an identification outside sessions."""
+"""Certificate and report of a single fit or identification, outside a session."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 def write_fit(fit_report: Report, drawn: Mapping[str, Picture], folder: Path) -> None:
-    """Write certificate and report of a fit into its folder.
+    """Write certificate and report of a fit into the folder of the fit.
 
     Args:
-        fit_report: report of the fit.
+        fit_report: stored results of the fit.
         drawn: the report's figures by name; empty: the certificate has no figures either.
         folder: folder of the fit.
     """
@@ -32,7 +32,13 @@ def write_fit(fit_report: Report, drawn: Mapping[str, Picture], folder: Path) ->
 
 
 def read_fit(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
-    """Return certificate and report of the fit in a folder."""
+    """Return certificate and report of the fit in a folder.
+
+    Args:
+        folder: folder of the fit.
+        plots: whether to include figures.
+        details: certificate entries made by a person.
+    """
     from calib.procedure.kinematic_stage.folder import FitFolder
     from calib.procedure.report import fit_report
 
@@ -49,7 +55,13 @@ def read_fit(folder: Path, plots: bool, details: CertificateSection) -> tuple[Ce
 def of_fit(
     fit_report: Report, drawn: Mapping[str, Picture], details: CertificateSection = NO_DETAILS
 ) -> tuple[Certificate, Page]:
-    """Return certificate and report of a fit."""
+    """Return certificate and report of a fit.
+
+    Args:
+        fit_report: stored results of the fit.
+        drawn: figures by name; empty: no figures.
+        details: certificate entries made by a person.
+    """
     from calib.procedure.report.certificate import geometry  # slow to load, as all that belongs to a fit
 
     robot, metrics = fit_report.robot, fit_report.metrics
@@ -71,7 +83,12 @@ def of_fit(
 
 
 def tolerance(millimetres: float | None, metrics: FitMetrics) -> str:
-    """Return a text on the condition for verdict pass, and on the deliverable to which it applies."""
+    """Return a text on the condition for the verdict pass, and on the deliverable that is judged.
+
+    Args:
+        millimetres: requested tolerance of the position [mm]; None or 0: no tolerance.
+        metrics: metrics of the fit.
+    """
     from calib.procedure.kinematic_stage.validation import ARM
 
     condition = "none given: pass means better than the nominal robot on unseen poses, or no improvement possible"
@@ -83,7 +100,13 @@ def tolerance(millimetres: float | None, metrics: FitMetrics) -> str:
 
 
 def measured_range(metrics: FitMetrics) -> str:
-    """Return a text on the joint range that the verdict on a fit is about; empty for fits of earlier versions."""
+    """Return a text on the measured range of each joint, in which the verdict is valid.
+
+    Empty for fits of earlier versions.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     joint_range = None if metrics.findings is None else metrics.findings.joint_range
     if joint_range is None:
         return ""
@@ -97,10 +120,10 @@ def measured_range(metrics: FitMetrics) -> str:
 
 
 def write_model(model_report: DynamicReport, drawn: Mapping[str, Picture], folder: Path) -> None:
-    """Write certificate and report of an identification into its folder.
+    """Write certificate and report of an identification into the folder of the identification.
 
     Args:
-        model_report: report of the identification.
+        model_report: stored results of the identification.
         drawn: the report's figures by name; empty: the certificate has no figures either.
         folder: folder of the identification.
     """
@@ -108,7 +131,13 @@ def write_model(model_report: DynamicReport, drawn: Mapping[str, Picture], folde
 
 
 def read_model(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
-    """Return certificate and report of the identification in a folder."""
+    """Return certificate and report of the identification in a folder.
+
+    Args:
+        folder: folder of the identification.
+        plots: whether to include figures.
+        details: certificate entries made by a person.
+    """
     from calib.procedure.report import dynamics_section
 
     model_report = dynamics_section.read(folder)
@@ -124,7 +153,13 @@ def read_model(folder: Path, plots: bool, details: CertificateSection) -> tuple[
 def of_model(
     model_report: DynamicReport, drawn: Mapping[str, Picture], details: CertificateSection = NO_DETAILS
 ) -> tuple[Certificate, Page]:
-    """Return certificate and report of an identification."""
+    """Return certificate and report of an identification.
+
+    Args:
+        model_report: stored results of the identification.
+        drawn: figures by name; empty: no figures.
+        details: certificate entries made by a person.
+    """
     from calib.procedure.report import dynamics_section
     from calib.procedure.report.certificate import dynamics_pages
 
@@ -146,13 +181,13 @@ def of_model(
 
 
 class SectionResult(Protocol):
-    """A result that is shown as a section of a report."""
+    """A result that can be shown as a section of a report."""
 
     def section(self) -> Section: ...
 
 
 def notebook(result: SectionResult) -> str:
-    """Return a result as HTML for a notebook: the first page of a fit's certificate, else its section of a report."""
+    """Return a result as HTML for a notebook: the certificate's first page for a fit, otherwise a report section."""
     from calib.procedure.kinematic_stage.fit import Outcome
     from calib.procedure.report import fit_report
 

@@ -1,4 +1,4 @@
-"""The classes of results in folders, by kind, and `open_result`, which opens the result at a path."""
+"""Classes of stored results by kind, and `open_result`, which opens the result at a path."""
 
 from __future__ import annotations
 
@@ -21,10 +21,13 @@ PICTURE_SUFFIX = ".png"
 
 
 class StoredMotion(Viewed):
-    """A designed or planned motion."""
+    """Folder of a designed or planned motion."""
 
     def motion(self) -> Path:
-        """Return the file to play: the whole run if there is one, else the motion."""
+        """Return the path of the motion's file to play.
+
+        It contains the whole run with the approach if the folder has such a file, otherwise only the motion.
+        """
         for name in (RUN, PLANNED, SAMPLES):
             path = self.path / name
             if path.is_file():
@@ -33,18 +36,24 @@ class StoredMotion(Viewed):
 
 
 class StoredFile(StoredResult):
-    """A result that is a file, possibly with accompanying files next to it."""
+    """A result that is a file, possibly with accompanying files in the same folder."""
 
     def beside(self) -> list[Path]:
-        """Return the files next to the file that belong to it."""
+        """Return the paths of the accompanying files."""
         return []
 
     def tables(self) -> dict[str, Table]:
-        """Return the table of a CSV file by its name; {} for other files."""
+        """Return the table in a CSV file, by the file's name; empty for other files."""
         return {self.path.stem: read_table(self.path)} if self.path.suffix == ".csv" else {}
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Copy the file, and its accompanying files under the new name; without figures if `plots` is False.
+        """Copy the file and the files that accompany it, and return the path of the copy.
+
+        Accompanying files are renamed after the copy.
+
+        Args:
+            out: path of the copy.
+            plots: whether figures are copied, too.
 
         Raises:
             UsageError: if a file with one of the names exists.
@@ -62,21 +71,28 @@ class StoredFile(StoredResult):
 
 
 class StoredSelection(StoredFile):
-    """Poses of `calib select`: a CSV with its prediction and figures beside it."""
+    """Poses selected by `calib select`: a CSV file, with prediction and figures next to it."""
 
     def beside(self) -> list[Path]:
-        """Return the files of prediction and figures next to the CSV."""
+        """Return the paths of prediction and figures, which are next to the CSV."""
         start = self.path.with_suffix("")
         return [Path(f"{start}{self.kind.companion}"), *sorted(start.parent.glob(f"{start.name}_*{PICTURE_SUFFIX}"))]
 
     def figures(self) -> dict[str, Picture]:
-        """Return the figures beside the list, by name."""
+        """Return the figures next to the CSV, by name."""
         start = f"{self.path.stem}_"
         paths = [path for path in self.beside() if path.suffix == PICTURE_SUFFIX]
         return {path.stem.removeprefix(start): Picture(path.read_bytes(), "") for path in paths}
 
     def scene(self, robot: str | None = None) -> Scene:
-        """Return the poses to draw; the robot has to be named."""
+        """Return the scene with the selected poses for the viewer.
+
+        Args:
+            robot: name or file of the robot to draw; it is required, since the CSV does not contain it.
+
+        Raises:
+            UsageError: without a robot.
+        """
         from calib.results import scene_files
 
         return scene_files.read(self.path, robot)
@@ -100,10 +116,10 @@ def open_result(path: str | Path, verb: str = "result") -> StoredResult:
 
     Args:
         path: folder or file that a command wrote, or a session.
-        verb: name of the command that opens it, for the message (`calib.result_kinds.TAKES`).
+        verb: name of the command that opens the result (a key of `calib.result_kinds.TAKES`), for the error message.
 
     Raises:
-        UsageError: if there is no result.
+        UsageError: if there is no result at this path.
     """
     path = Path(path)
     kind = kind_of(path)

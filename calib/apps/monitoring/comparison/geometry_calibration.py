@@ -1,4 +1,4 @@
-"""A calibration of a robot's geometry, read from a fit's folder or a description, to be compared with another one."""
+"""A calibration of a robot's geometry, read from a fit's folder or a robot description, for comparison with another."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calib.apps.monitoring.comparison.places import Place, check_same_robot
+from calib.apps.monitoring.comparison.calibration_sources import Place, check_same_robot
 from calib.toolkit.chains import CalibratedChain, Chain, Deflection, load_calibrated, read_calibrated
 from calib.toolkit.installations import Installation, layout, read_installation
 from calib.toolkit.result_folders import ComparedRows, FitMetrics, read_covariance
@@ -15,20 +15,20 @@ from calib.toolkit.result_folders import ComparedRows, FitMetrics, read_covarian
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A calibration of a robot.
+    """A calibration of a robot's geometry.
 
     Attributes:
-        name: as the user gave it.
-        robot: the calibrated arm; of a description the nominal one.
-        cell: the arm in its cell, with joint corrections.
-        free, covariance: the fitted parameters in the cell's parameter vector, and the covariance of steps along them
-            (`calib.geometry.observation`); empty if nominal.
-        fitted_joints: (m, n) the fitted poses [rad or m]; None if nominal.
+        name: folder, file or name that the user gave.
+        robot: the calibrated arm; for a robot description, the nominal one.
+        cell: the arm with stations and tools, and with joint corrections.
+        free, covariance: indices of the fitted parameters in the cell's parameter vector, and the covariance of small
+            steps along them (`calib.geometry.observation`); empty if nominal.
+        fitted_joints: (m, n) joint values of the fitted poses [rad or m]; None if nominal.
         metrics: metrics of the fit; None if nominal.
-        judged: level and reason of the fit's verdict; within a session, of that on its held-out poses; empty if
+        judged: level and reason of the fit's verdict; within a session, of the verdict on held-out poses; empty if
             nominal.
-        rows: errors at held-out poses, else at the fitted ones; None if nominal.
-        tolerance: tolerance asked of the fit [m]; None without.
+        rows: errors at held-out poses, or at the fitted poses if none were held out; None if nominal.
+        tolerance: tolerance that was required of the fit [m]; None without one.
         serial: serial number of the robot, as its certificate states it; empty if unknown.
     """
 
@@ -46,19 +46,19 @@ class Calibration:
 
     @property
     def nominal(self) -> bool:
-        """Whether this is a robot's description, with nothing fitted."""
+        """Whether the robot is a description without any fitted parameter."""
         return self.metrics is None
 
     @property
     def chain(self) -> Chain:
-        """The geometry without joint corrections."""
+        """The arm's geometry without joint corrections."""
         return self.robot.chain
 
     @cached_property
     def rigid(self) -> tuple[Installation, np.ndarray]:
-        """The cell with the fitted geometry but without joint corrections, and the covariance (p, p) of its arm.
+        """The cell without joint corrections, and the covariance (p, p) of the arm's parameters.
 
-        The covariance is over the cell's whole parameter vector, zero for parameters that do not belong to the arm.
+        The covariance is over the cell's whole parameter vector; it is zero for stations and tools.
         """
         cell = replace(self.cell, chain=self.chain, deflection=Deflection())
         count = len(layout(cell).names)
@@ -70,7 +70,7 @@ class Calibration:
 
     @cached_property
     def with_corrections(self) -> tuple[Installation, np.ndarray]:
-        """The cell with all fitted parameters, and the covariance (p, p) of its whole parameter vector."""
+        """The cell with all fitted parameters, and the covariance (p, p) of the cell's whole parameter vector."""
         count = len(layout(self.cell).names)
         covariance = np.zeros((count, count))
         covariance[np.ix_(self.free, self.free)] = self.covariance
@@ -90,8 +90,11 @@ class Calibration:
 def read_fits(before: Place, after: Place) -> tuple[Calibration, Calibration]:
     """Return two calibrations of one robot, read from their folders; one of the two may be nominal.
 
+    Args:
+        before, after: sources of the earlier and of the later calibration.
+
     Raises:
-        RobotError: they are of different robots.
+        RobotError: the calibrations are of different robots.
     """
     earlier = later = None
     if before.fit:
@@ -108,7 +111,11 @@ def read_fits(before: Place, after: Place) -> tuple[Calibration, Calibration]:
 
 
 def read_fit(source: Place) -> Calibration:
-    """Return the calibration in the folder of a fit or a session."""
+    """Return the calibration in the folder of a fit or of a session.
+
+    Args:
+        source: the folder; its fit must exist.
+    """
     folder = source.fit
     assert folder is not None
     metrics = folder.metrics()
@@ -147,7 +154,12 @@ def read_fit(source: Place) -> Calibration:
 
 
 def _nominal(name: str, like: Chain) -> Calibration:
-    """Return the nominal robot `name`, between the links of the chain `like`, as a calibration without covariance."""
+    """Return the nominal robot `name` as a calibration without covariance.
+
+    Args:
+        name: file or name of the robot.
+        like: chain of the other calibration, whose base and tip links are used for this robot, too.
+    """
     base = tip = None
     if name.endswith(".urdf"):
         base = like.base

@@ -19,7 +19,7 @@ PREFIX = "q_"
 
 
 def motion_file(path: Path) -> Path:
-    """Return the file to play: for a motion's folder the motion in it, for a file that file.
+    """Return the path of a motion: of the motion in a result's folder, or `path` itself if it is a file.
 
     Raises:
         UsageError: a folder without a motion.
@@ -30,15 +30,19 @@ def motion_file(path: Path) -> Path:
 
 
 def is_motion(path: Path) -> bool:
-    """Return whether a CSV file holds a motion: whether it has a column t."""
+    """Return whether the CSV file `path` contains a motion, recognised by a column t."""
     return "t" in read_header(path)[0]
 
 
 def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]]:
-    """Return the setpoints (k, n) [rad] of a motion at a controller's cycle, and the joints' names.
+    """Return the setpoints (k, n) [rad] of a motion, interpolated at a controller's cycle, and the joints' names.
+
+    Args:
+        path: CSV file of the motion.
+        controller: the controller.
 
     Raises:
-        UsageError: a controller that takes no stream, or a file without positions.
+        UsageError: a controller that cannot stream setpoints, or a file without joint positions.
     """
     from scipy.interpolate import CubicSpline  # slow to load
 
@@ -61,7 +65,7 @@ def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]
 
 
 def stream_values(controller: Controller, q: np.ndarray) -> dict[str, object]:
-    """Return the values that the templates of streams print for setpoints q (k, n) [rad]."""
+    """Return the variables of a controller's stream template for setpoints q (k, n) [rad], by name."""
     controller_values = controller.shown(q)
     rows = formatted(controller_values, controller.decimals)
     relative = formatted(controller_values - controller_values[0], controller.decimals)

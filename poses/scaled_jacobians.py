@@ -1,4 +1,4 @@
-"""Jacobians of candidates, checked and scaled so that all parameters have equal weight."""
+"""Check and scaling of the candidates' Jacobians, so that all parameters have equal weight."""
 
 from dataclasses import dataclass
 
@@ -8,15 +8,15 @@ from scipy.linalg import solve_triangular
 
 from .errors import BadInput, NotIdentifiable, TooFewCandidates, require
 
-# smallest accepted ratio of singular values of the column-scaled candidates (our choice; Gram matrices see 1e-8)
+# smallest accepted ratio of singular values of the column-scaled candidates (our choice; Gram matrices resolve 1e-8)
 RANK_TOLERANCE = 1e-7
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Candidates in coordinates z = J T, in which their mean information is the unit matrix.
+    """Candidates in coordinates z = J T, in which their mean information is the identity matrix.
 
-    D-optimality does not change with T (log det shifts by a constant); numerical accuracy improves.
+    The D-optimal set does not depend on T (log det changes by a constant), but T improves the numerical accuracy.
 
     Attributes:
         z: (N, rows, p) transformed Jacobians.
@@ -36,10 +36,11 @@ def checked(jacobians: ArrayLike, name: str = "jacobians") -> np.ndarray:
 
     Args:
         jacobians: the array to check.
-        name: the argument's name for messages.
+        name: name of the argument, for messages.
 
     Raises:
-        BadInput: an array of another shape, or with values that are not finite; the message names the first such pose.
+        BadInput: an array of another shape, or with values that are not finite; the message names the first pose with
+            such values.
     """
     array = np.ascontiguousarray(jacobians, dtype=float)
     if array.ndim != 3 or 0 in array.shape[1:]:
@@ -56,12 +57,13 @@ def checked(jacobians: ArrayLike, name: str = "jacobians") -> np.ndarray:
 
 
 def prepared(jacobians: ArrayLike, m: int, existing: ArrayLike | None = None) -> Candidates:
-    """Return candidates in well-scaled coordinates, after checking that m poses can determine all parameters.
+    """Return the candidates in well-scaled coordinates, after checking that m poses can determine all parameters.
 
-    T = D⁻¹ R⁻¹ with D the root mean square of the columns and RᵀR the mean information after that scaling.
+    The coordinates are z = J T with T = D⁻¹ R⁻¹. D is the diagonal matrix of the columns' root mean squares, and RᵀR
+    the mean information after scaling by D.
 
     Args:
-        jacobians: (N, rows, p) whitened Jacobians of the candidates.
+        jacobians: (N, rows, p) Jacobians J of the candidates, each row divided by its standard deviation.
         m: number of poses to choose.
         existing: (k, rows, p) whitened Jacobians of poses already measured; None without such poses.
 
@@ -76,7 +78,7 @@ def prepared(jacobians: ArrayLike, m: int, existing: ArrayLike | None = None) ->
     if existing is not None:
         before = checked(existing, "existing")
     if before.shape[2] != p:
-        raise BadInput(f"existing: {before.shape[2]} parameters, the candidates have {p}")
+        raise BadInput(f"existing: {before.shape[2]} parameters, but the candidates have {p}: use the same columns")
     measured_rows = before.shape[0] * before.shape[1]
     _check_counts(count, rows, p, m, measured_rows)
     stacked = array.reshape(-1, p)
@@ -99,7 +101,7 @@ def prepared(jacobians: ArrayLike, m: int, existing: ArrayLike | None = None) ->
 
 
 def log_det(matrices: np.ndarray) -> np.ndarray:
-    """Return log det of symmetric matrices (..., p, p); −inf where not positive."""
+    """Return log det of symmetric matrices (..., p, p); −inf where the determinant is not positive."""
     sign, value = np.linalg.slogdet(matrices)
     return np.where(sign > 0, value, -np.inf)
 

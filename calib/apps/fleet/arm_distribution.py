@@ -4,10 +4,10 @@ With x_i the deviations of arm i's parameters from nominal, which its fit estima
 
     x̂_i ~ N(x_i, C_i),  x_i ~ N(μ, diag τ²)
 
-Mean and variance are the most probable ones by expectation maximisation (Dempster, Laird and Rubin 1977; parametric
-empirical Bayes, Morris 1983). Two choices are ours, for fleets of a few arms: the nominal counts as one more arm, and
-a parameter's τ² is drawn to that of its family (joint offsets, other angles, lengths) as if `FAMILY` more arms had
-it. The next arm is expected at μ ± τ √(1 + 1/n), n counting the nominal.
+Mean μ and variances τ² are the most probable ones, by expectation maximisation (Dempster, Laird and Rubin 1977;
+parametric empirical Bayes, Morris 1983). Two choices are ours, for fleets of a few arms. The nominal parameters count
+as one more arm. A parameter's τ² is regularised towards that of its family (joint offsets, other angles, lengths), as
+if `FAMILY` more arms had the family's τ². The next arm is expected at μ ± τ √(1 + 1/n), where n counts the nominal too.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ class ParameterSpread:
     Attributes:
         name, unit: name and unit of the parameter.
         arms: number of arms in which it was fitted.
-        mean, sigma: mean and σ over arms of its deviation from nominal, without the uncertainty of the fits.
+        mean, sigma: mean and σ, over the arms, of the parameter's deviation from nominal; the uncertainty of the fits
+            is not included in σ.
         width: standard deviation about ``nominal + mean`` that is expected for the next arm.
     """
 
@@ -56,11 +57,13 @@ class ParameterSpread:
 
 
 def spread(robots: Sequence[CalibratedChain]) -> tuple[ParameterSpread, ...]:
-    """Return the distribution of each parameter that was fitted in at least one arm; the arms have one nominal
-    description.
+    """Return the distribution of each parameter that was fitted in at least one arm.
+
+    Args:
+        robots: calibrated arms with one nominal description.
 
     Raises:
-        UsageError: no fit states its covariance.
+        UsageError: no fit has a covariance.
     """
     chain = nominal_of(robots[0])
     covariances = []
@@ -102,7 +105,13 @@ def spread(robots: Sequence[CalibratedChain]) -> tuple[ParameterSpread, ...]:
 def _most_probable(
     data: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], family: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return μ (k,) and τ (k,) by expectation maximisation from each arm's (fitted parameters, C⁻¹, C⁻¹ x̂)."""
+    """Return mean μ (k,) and standard deviation τ (k,) of k parameters over the arms, by expectation maximisation.
+
+    Args:
+        data: for each arm, whether each parameter was fitted (k,), and of the f fitted ones the inverse C⁻¹ (f, f) of
+            the covariance, and C⁻¹ x̂ (f,) with the fitted deviations x̂ from nominal.
+        family: (k,) number of each parameter's family (joint offsets, other angles, lengths).
+    """
     mean = np.zeros(len(family))
     variance = np.full(len(family), FIRST_VARIANCE)
     count = np.sum([fitted for fitted, _, _ in data], axis=0)
@@ -130,7 +139,12 @@ def _most_probable(
 
 
 def expected_arm(robots: Sequence[CalibratedChain], parameters: Sequence[ParameterSpread]) -> CalibratedChain:
-    """Return the arm expected next: the nominal description that `robots` share, moved by the mean deviations."""
+    """Return the arm expected next: the nominal description with the mean deviations added to its parameters.
+
+    Args:
+        robots: calibrated arms with one nominal description.
+        parameters: distribution of each fitted parameter over these arms.
+    """
     nominal = nominal_of(robots[0])
     means = {parameter.name: parameter.mean for parameter in parameters}
     values = nominal.values + np.array([means.get(name, 0.0) for name in nominal.names])
@@ -138,8 +152,14 @@ def expected_arm(robots: Sequence[CalibratedChain], parameters: Sequence[Paramet
 
 
 def write(folder: Path, robots: Sequence[CalibratedChain], parameters: Sequence[ParameterSpread]) -> Path:
-    """Write the prior for `calib fit` into a folder: ``robot.toml``, the expected arm, and options with the prior's
-    widths.
+    """Write the prior for `calib fit` into a folder, and return its path.
+
+    ``robot.toml`` is the expected arm; the options file contains the prior's standard deviations.
+
+    Args:
+        folder: the folder.
+        robots: calibrated arms with one nominal description.
+        parameters: distribution of each fitted parameter over these arms.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_calibrated(folder, expected_arm(robots, parameters), comment=f"mean of {len(robots)} arms")

@@ -1,4 +1,4 @@
-"""Readers of files that are converted to a URDF when read, chosen by their suffix."""
+"""Reader of robot descriptions that are converted to a URDF when read; the converter is chosen by the file's suffix."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -9,16 +9,19 @@ READERS = {".xacro": xacro_files.expand, ".xml": mjcf.convert, ".mjcf": mjcf.con
 
 
 def takes(path: str) -> bool:
-    """Return whether `urdf` converts this file, which exists."""
+    """Return whether `urdf` can convert the file at `path`, and the file exists."""
     file = Path(xacro_files.split(path)[0])
     return file.suffix in READERS and file.is_file()
 
 
 def urdf(path: str) -> str:
-    """Return the URDF text of a file, or of a xacro file with its arguments.
+    """Return the URDF text for the file at `path`; the path may be followed by arguments.
+
+    Args:
+        path: the file; for a xacro file or a ``calibration.conf``, arguments ``name:=value`` may follow.
 
     Raises:
-        RobotError: for a file that cannot be converted.
+        RobotError: a file that cannot be converted.
     """
     return _converted(path, Path(xacro_files.split(path)[0]).stat().st_mtime_ns)
 

@@ -1,6 +1,6 @@
-"""The demonstration's output: a line with one number for each step, the progress, and the paths of five files.
+"""The demonstration's console output: one number per step, the progress, and the paths of up to five files.
 
-Lines use characters that every terminal has, at most 60 of them.
+Lines have at most 60 characters, all of which every terminal can show.
 """
 
 import time
@@ -32,12 +32,18 @@ SECONDS = {
 
 
 def row(name: str, number: float, meaning: str) -> str:
-    """Return a line of the summary: name, number with three digits, its meaning."""
+    """Return a line of the summary.
+
+    Args:
+        name: name of the number.
+        number: the number, which is printed with three significant digits.
+        meaning: unit of the number and what it means.
+    """
     return f"{name:<11} {number:>6.3g} {meaning}"
 
 
 def _number(session: Session, step: str) -> tuple[float, str] | None:
-    """Return a step's number and its meaning, read from the session's folders; None for steps without a number."""
+    """Return a step's number and what it means, read from the session's folder; None for a step without a number."""
     settings = session.settings
     match step:
         case "describe":
@@ -73,11 +79,11 @@ def _number(session: Session, step: str) -> tuple[float, str] | None:
 
 @dataclass
 class Telling:
-    """Prints the progress of a session.
+    """Console output of a running session.
 
     Attributes:
         session: the session.
-        say, show: print a permanent line, and show a transient status.
+        say, show: functions that print a permanent line, and show a transient status.
         verbose: whether all messages of the session are printed too.
         began: time at which the session began [s], by `time.perf_counter`.
     """
@@ -92,7 +98,7 @@ class Telling:
     _entered: float = 0.0
 
     def said(self, *lines: str) -> None:
-        """Print a session's messages: for a finished step its summary line, once; if verbose, every message."""
+        """Print the summary line of each finished step, once; if verbose, also every message of the session."""
         for line in lines:
             step = line.partition(":")[0].rpartition(" ")[2]
             number = _number(self.session, step) if line[:1].isdigit() else None
@@ -105,10 +111,10 @@ class Telling:
                 self.say(f"    - {line.strip()}")
 
     def progress(self, text: str) -> None:
-        """Show the stage, the share done and the time left.
+        """Show the current step, the share of the session that is done, and the remaining time.
 
         Args:
-            text: the purpose of a step, which thereby begins, or what the present step does.
+            text: the purpose of a step that begins now, or what the current step is doing.
         """
         moment = time.perf_counter()
         steps = steps_of(self.session)
@@ -128,7 +134,10 @@ class Telling:
 
 
 def reasons(session: Session) -> Iterator[str]:
-    """Yield the meaning of each verdict other than pass, and the commands that explain its reasons."""
+    """Yield a line for each verdict of a session other than pass.
+
+    The line states what the verdict means, and the commands that explain its reasons.
+    """
     reports: dict[str, ValidationMetrics | UnseenReport] = {"geometry": session.validation.metrics()}
     if session.dynamic:
         reports["dynamics"] = session.identification.unseen.read()
@@ -141,7 +150,7 @@ def reasons(session: Session) -> Iterator[str]:
 
 
 def paths(session: Session) -> list[str]:
-    """Return lines with the paths of up to five files to look at."""
+    """Return lines with the paths of up to five existing result files of a session, most important first."""
     candidates = {
         "session": SETTINGS,
         "certificate": CERTIFICATE,

@@ -1,11 +1,11 @@
 """Constraints on a measurement pose: tool height, distance from the axis, orientation to an instrument, line of sight.
 
-These are the quantities of the LWR4+ study's Table 1, and the line of sight. No constraint knows a robot: each takes
-the caller's forward kinematics as a callable, ``tool(q: (m, n)) -> (rotation (m, 3, 3), position (m, 3))`` in the frame
-in which the limits are written, and, for exact gradients, ``tool_jacobian(q) -> (m, 6, n)``: velocity of the tool
-point,
-then angular velocity, both in that frame too. Every constraint is smooth unless its docstring says otherwise, and can
-be pickled if its callables can.
+All but the line of sight are the quantities in Table 1 of the study of the KUKA LWR4+ by Kolyubin, Shiriaev & Jubien
+(2019). The constraints use no robot class. Each takes the caller's forward kinematics as a callable ``tool(q: (m, n))
+-> (rotation (m, 3, 3), position (m, 3))`` in the frame in which the limits are given. For exact gradients each also
+takes ``tool_jacobian(q) -> (m, 6, n)``: velocity of the tool point, then angular velocity, both in the same frame.
+Without it the gradient is computed by central differences. Every constraint is smooth unless its docstring says
+otherwise. A constraint can be pickled if its callables can.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,13 @@ ToolJacobian = Callable[[np.ndarray], np.ndarray]
 
 
 def height(tool: Tool, lowest: float, highest: float = np.inf, jacobian: ToolJacobian | None = None) -> PoseConstraint:
-    """Return the constraint that the tool point's height is within lowest ≤ z ≤ highest [m]."""
+    """Return the constraint lowest ≤ z ≤ highest on the height z [m] of the tool point.
+
+    Args:
+        tool: forward kinematics, see the module's docstring.
+        lowest, highest: limits [m]; infinite for no limit.
+        jacobian: tool Jacobian for exact gradients; None uses central differences.
+    """
     limits = _finite_limits(lowest, highest)
     slope = None
     if jacobian is not None:
@@ -31,7 +37,11 @@ def height(tool: Tool, lowest: float, highest: float = np.inf, jacobian: ToolJac
 
 
 def _finite_limits(lower: float, upper: float) -> tuple[tuple[float, float], ...]:
-    """Return (sign, bound) of each finite limit; a value keeps the limit where sign · (value − bound) ≤ 0."""
+    """Return (sign, bound) of each finite limit; a value satisfies the limit where sign · (value − bound) ≤ 0.
+
+    Args:
+        lower, upper: limits of one value; an infinite limit is skipped. The sign is −1 for `lower` and 1 for `upper`.
+    """
     limits = []
     if np.isfinite(lower):
         limits.append((-1.0, lower))
@@ -41,7 +51,15 @@ def _finite_limits(lower: float, upper: float) -> tuple[tuple[float, float], ...
 
 
 def axis_distance(tool: Tool, min_distance: float, jacobian: ToolJacobian | None = None) -> PoseConstraint:
-    """Return the constraint d_xy = √(x² + y²) ≥ min_distance [m], in the smooth form min_distance² − x² − y² ≤ 0."""
+    """Return the constraint d_xy = √(x² + y²) ≥ min_distance [m] on the tool point's distance from the z axis.
+
+    The constraint is evaluated in the smooth form min_distance² − x² − y² ≤ 0.
+
+    Args:
+        tool: forward kinematics, see the module's docstring; x, y, z are the tool point's coordinates in its frame [m].
+        min_distance: least distance [m].
+        jacobian: tool Jacobian for exact gradients; None uses central differences.
+    """
     slope = None
     if jacobian is not None:
         slope = partial(_axis_gradient, tool, jacobian)
@@ -52,8 +70,15 @@ def axis_distance(tool: Tool, min_distance: float, jacobian: ToolJacobian | None
 def reach(
     tool: Tool, max_distance: float, centre: ArrayLike = (0, 0, 0), jacobian: ToolJacobian | None = None
 ) -> PoseConstraint:
-    """Return the constraint ‖x − c‖² − max_distance² ≤ 0: tool point x within `max_distance` [m] of `centre` c (3,)
-    [m].
+    """Return the constraint that the tool point x is within `max_distance` [m] of the point `centre` c (3,) [m].
+
+    The constraint is evaluated in the smooth form ‖x − c‖² − max_distance² ≤ 0.
+
+    Args:
+        tool: forward kinematics, see the module's docstring.
+        max_distance: largest distance [m].
+        centre: c (3,) in the frame of `tool` [m].
+        jacobian: tool Jacobian for exact gradients; None uses central differences.
     """
     point = np.asarray(centre, dtype=float)
     slope = None
@@ -68,7 +93,13 @@ def distance(
 ) -> PoseConstraint:
     """Return the constraint that the tool point is `min_distance` to `max_distance` [m] from an instrument at `centre`.
 
-    `centre` is a point (3,) [m]; the constraint is not smooth where the tool point coincides with it.
+    `centre` is a point (3,) [m]. The constraint is not smooth where the tool point coincides with `centre`.
+
+    Args:
+        tool: forward kinematics, see the module's docstring.
+        min_distance, max_distance: limits of the distance [m].
+        centre: (3,) position of the instrument in the frame of `tool` [m].
+        jacobian: tool Jacobian for exact gradients; None uses central differences.
     """
     point = np.asarray(centre, dtype=float)
     limits = _finite_limits(min_distance, max_distance)
@@ -88,14 +119,14 @@ def orientation(
 ) -> PoseConstraint:
     """Return the constraint that the tool's roll and pitch in the camera frame are within limits [rad].
 
-    R_camera^T R = Rot_z(yaw) Rot_y(pitch) Rot_x(roll). The convention is our reading of Table 1, which does not state
-    it. Not smooth where roll jumps by 2π, nor at a pitch of ±π/2.
+    R_camera^T R = Rot_z(yaw) Rot_y(pitch) Rot_x(roll). This convention is our reading of Table 1 of the study, which
+    does not state one. The constraint is not smooth where roll jumps by 2π, nor at a pitch of ±π/2.
 
     Args:
         tool: forward kinematics.
         camera: (3, 3) orientation of the camera in the tool's reference frame.
         roll, pitch: (lowest, highest) [rad].
-        jacobian: for the exact gradient.
+        jacobian: tool Jacobian for exact gradients; None uses central differences.
     """
     stand = np.asarray(camera, dtype=float)
     slope = None
@@ -108,15 +139,16 @@ def orientation(
 def line_of_sight(
     tool: Tool, instrument: ArrayLike, axis: ArrayLike, half_angle: float, jacobian: ToolJacobian | None = None
 ) -> PoseConstraint:
-    """Return the constraint that the instrument is in the target's acceptance cone: cos(half_angle) − (R a)·u ≤ 0,
-    u = (s − x)/‖s − x‖.
+    """Return the constraint that the instrument lies inside the cone of directions that the target accepts.
+
+    The constraint is cos(half_angle) − (R a)·u ≤ 0 with u = (s − x)/‖s − x‖.
 
     Args:
-        tool: forward kinematics of the target's centre x and orientation R.
-        instrument: (3,) s, where the tracker or camera stands [m].
-        axis: (3,) a, the direction the target faces, in the tool's frame.
-        half_angle: of the cone [rad] (a retroreflector accepts about 0.5 rad).
-        jacobian: for the exact gradient.
+        tool: forward kinematics of the target: its centre x (3,) [m] and orientation R (3, 3).
+        instrument: (3,) s, position of the tracker or camera [m].
+        axis: (3,) a, the direction in which the target faces, in the tool's frame.
+        half_angle: half opening angle of the cone [rad] (a retroreflector accepts about 0.5 rad).
+        jacobian: tool Jacobian for exact gradients; None uses central differences.
     """
     station = np.asarray(instrument, dtype=float)
     facing = np.asarray(axis, dtype=float)

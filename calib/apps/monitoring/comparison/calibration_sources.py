@@ -1,4 +1,4 @@
-"""Sources of two calibrations: folders of fits, of identifications, of sessions, or a robot's description."""
+"""Sources of two calibrations to compare: folders of fits, identifications or sessions, or a robot's description."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Place:
     """Source of one calibration.
 
     Attributes:
-        name: as the user gave it.
+        name: folder, file or name that the user gave.
         session: the session; None where the source is not a session's folder.
         fit, identification: folders of the results; None where there is no such result.
     """
@@ -34,7 +34,7 @@ class Place:
 
     @property
     def nominal(self) -> bool:
-        """Whether the source is a robot's description, not a folder."""
+        """Whether the source is a robot's description rather than a folder with results."""
         return not (self.session or self.fit or self.identification)
 
     @property
@@ -46,15 +46,15 @@ class Place:
 
     @property
     def words(self) -> str:
-        """The contents of the source, in a clause."""
+        """Clause that lists what the source contains, for messages."""
         contents = []
         if self.fit:
             contents.append("geometry")
         if self.identification:
             contents.append("dynamics")
         if self.session and not contents:
-            return f"{self.name} holds no result yet ({command_line('next', self.name)})"
-        return f"{self.name} holds {' and '.join(contents) or 'the nominal robot'}"
+            return f"{self.name} has no result yet ({command_line('next', self.name)})"
+        return f"{self.name} contains {' and '.join(contents) or 'the nominal robot'}"
 
 
 def place_of(source: str | Path, verb: str = "diff") -> Place:
@@ -62,10 +62,10 @@ def place_of(source: str | Path, verb: str = "diff") -> Place:
 
     Args:
         source: folder, file or name.
-        verb: the command, for messages.
+        verb: name of the command, for messages.
 
     Raises:
-        UsageError: a folder of another kind.
+        UsageError: a folder without a fit, an identification or a session.
     """
     path = Path(source)
     name = str(source)
@@ -79,7 +79,7 @@ def place_of(source: str | Path, verb: str = "diff") -> Place:
 
 
 def check_same_robot(names: tuple[str, str], robots: tuple[CalibratedChain, CalibratedChain]) -> None:
-    """Raise `RobotError` for two calibrations whose nominal descriptions differ."""
+    """Raise RobotError if the nominal descriptions of two calibrations differ; `names` are used in the message."""
     first = robots[0].nominal or robots[0].chain
     second = robots[1].nominal or robots[1].chain
     beginning = f"{names[0]} and {names[1]} are of different robots"

@@ -1,6 +1,4 @@
-"""Report of a fleet: arms that drift, tools that are bent or loose, the distribution of parameters over arms of one
-type.
-"""
+"""Report of a fleet: arms that drift, bent or loose tools, and how parameters vary over arms of one type."""
 
 from __future__ import annotations
 
@@ -13,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from calib import files, folders
-from calib.apps.fleet import prior
-from calib.apps.fleet.prior import ParameterSpread
+from calib.apps.fleet import arm_distribution
+from calib.apps.fleet.arm_distribution import ParameterSpread
 from calib.apps.fleet.tools import MIN_ARMS, MIN_TIMES, ToolUse, tools
 from calib.apps.fleet.visits import visits
-from calib.apps.monitoring.comparison.calibrations import Calibration
+from calib.apps.monitoring.comparison.calibration_sources import check_same_robot
+from calib.apps.monitoring.comparison.geometry_calibration import Calibration
 from calib.apps.monitoring.comparison.geometry_change import ToolMotion
-from calib.apps.monitoring.comparison.places import check_same_robot
 from calib.apps.monitoring.comparison.robot_change import RobotChange, diff
 from calib.arguments import checked
 from calib.errors import Finding, RobotError, counted, finding
@@ -39,15 +37,15 @@ OURS = (PAGE, folders.METRICS, ARMS)
 
 @dataclass(frozen=True, eq=False)
 class ArmType:
-    """Arms of one nominal description, each by its latest calibration.
+    """Arms of one nominal description, each with its latest calibration.
 
     Attributes:
-        name: name of the description, with a number where several descriptions have one name.
-        arms: their calibrations.
-        failed: names of arms whose fit's verdict is fail; they do not enter `parameters`.
-        odd: names of other arms whose geometry is not plausible for this type; they do not enter `parameters` either.
-        parameters: distribution of each parameter over the other arms.
-        tools: the tools of all arms.
+        name: name of the description, with a number appended where several descriptions have one name.
+        arms: the latest calibration of each arm.
+        failed: names of arms whose fit has the verdict fail; not used for `parameters`.
+        odd: names of further arms whose geometry is not plausible for this type; not used for `parameters`.
+        parameters: distribution of each parameter over all other arms.
+        tools: comparison of the tools that all arms carry.
     """
 
     name: str
@@ -59,7 +57,7 @@ class ArmType:
 
     @property
     def plausible(self) -> list[Calibration]:
-        """The arms from which `parameters` were computed."""
+        """Calibrations of the arms that were used for `parameters`: neither failed nor odd."""
         return [arm for arm in self.arms if arm.name not in (*self.failed, *self.odd)]
 
 
@@ -83,13 +81,13 @@ class FleetReport(ReportedResult):
     verdict: Verdict
 
     def section(self) -> Section:
-        """Return the report's section."""
+        """Return the report's section with tables of drifts, tools and parameters."""
         drift = [
             RecordColumn("arm", "{0[0]}", number=False),
             RecordColumn("from", _earlier_folder, False),
             RecordColumn("to", _later_folder, False),
             RecordColumn("tool moved, mm rms", _moved_mm),
-            RecordColumn("σ of that", _expected_mm),
+            RecordColumn("expected from σ", _expected_mm),
             RecordColumn("p", "{0[1].geometry.probability:.1g}"),
             RecordColumn("", "{0[1].verdict.level}", number=False),
         ]
@@ -103,10 +101,14 @@ class FleetReport(ReportedResult):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write a folder with report.html, fleet.csv (a row per arm), metrics.json; and for each type a prior. Return
-        the folder.
+        """Write the report into a folder and return its path.
 
-        The prior is for the fit of the type's next arm.
+        The folder contains report.html, fleet.csv (a row per arm) and metrics.json, and for each type a prior for the
+        fit of the type's next arm.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
         """
         out = Path(out)
         folders.check_target(out, OURS, (folders.METRICS,), "fleet report")
@@ -114,7 +116,7 @@ class FleetReport(ReportedResult):
         for arm_type in self.types:
             if arm_type.parameters:
                 robots = [arm.robot for arm in arm_type.plausible]
-                prior.write(out / PRIOR / arm_type.name, robots, arm_type.parameters)
+                arm_distribution.write(out / PRIOR / arm_type.name, robots, arm_type.parameters)
         return out
 
     def _write(self, folder: Path) -> None:
@@ -133,7 +135,7 @@ class FleetReport(ReportedResult):
         files.write_json(folder / folders.METRICS, self.to_dict())
 
     def to_dict(self) -> dict[str, object]:
-        """Return the numbers as in ``metrics.json`` [SI]."""
+        """Return the report's numbers as ``metrics.json`` contains them [SI]."""
         types = {}
         for arm_type in self.types:
             types[arm_type.name] = {
@@ -176,9 +178,9 @@ def _tables(arm_type: ArmType) -> list[Block]:
     parameters = [
         RecordColumn("parameter", "{0.name}", number=False),
         RecordColumn("arms", "{0.arms}"),
-        RecordColumn("mean", lambda row: small(row.mean, row.unit, 3)),
-        RecordColumn("sigma", lambda row: small(row.sigma, row.unit, 3)),
-        RecordColumn("width", lambda row: small(row.width, row.unit, 3)),
+        RecordColumn("mean", _mean),
+        RecordColumn("sigma", _sigma),
+        RecordColumn("width", _width),
     ]
     tool_columns = [
         RecordColumn("tool", "{0.tool}", number=False),
@@ -203,6 +205,18 @@ def _tables(arm_type: ArmType) -> list[Block]:
     ]
 
 
+def _mean(row: ParameterSpread) -> str:
+    return small(row.mean, row.unit, 3)
+
+
+def _sigma(row: ParameterSpread) -> str:
+    return small(row.sigma, row.unit, 3)
+
+
+def _width(row: ParameterSpread) -> str:
+    return small(row.width, row.unit, 3)
+
+
 def _arm_count(row: ToolUse) -> str:
     return f"{len(row.arms)}"
 
@@ -213,7 +227,13 @@ def _displacement_mm(row: ToolUse) -> str:
 
 
 def _error_sigmas(row: ToolUse) -> str:
-    """Return as text how many σ a tool's error is above that of other tools; empty where it is not larger."""
+    """Return as text how many σ the errors with a tool exceed those with other tools.
+
+    Empty if they do not exceed them.
+
+    Args:
+        row: comparison of arms with the tool against arms with other tools.
+    """
     assert row.times is not None
     if row.times > MIN_TIMES:
         return f"{row.times_sigmas:.1f}"
@@ -233,14 +253,15 @@ def report_fleet(calibrations: str | Path | Sequence[str | Path]) -> FleetReport
     """Compare the calibrations of many arms.
 
     Args:
-        calibrations: folders of fits or sessions. Sessions that state one serial number belong to one arm, in order of
-            their dates; a fit states none and counts as a separate arm. Sessions without a verdict are left out.
+        calibrations: folders of fits or sessions. Sessions with one serial number are calibrations of one arm, in order
+            of their dates; a fit has no serial number and counts as a separate arm. Sessions without a verdict are left
+            out.
 
     Returns:
         The report: ``types`` with the distribution of each parameter, ``changes``, ``noticed``, `save`.
 
     Raises:
-        UsageError: a folder that holds no fit or is given twice, or fewer than two calibrations that are finished.
+        UsageError: a folder without a fit or given twice, or fewer than two finished calibrations.
     """
     fleet_visits = visits(calibrations)
     changes: list[tuple[str, RobotChange]] = []
@@ -275,8 +296,13 @@ def report_fleet(calibrations: str | Path | Sequence[str | Path]) -> FleetReport
 
 
 def _arms_of_type(types: list[list[Calibration]], calibration: Calibration) -> list[Calibration]:
-    """Return the list in `types` of the arms with this nominal description; a new list, appended, where there is none
-    yet.
+    """Return the list in `types` of the arms with this arm's nominal description.
+
+    Where there is no such list, an empty one is appended to `types` and returned.
+
+    Args:
+        types: lists of calibrations, each of arms with one nominal description.
+        calibration: calibration of the arm.
     """
     for arms in types:
         with suppress(RobotError):
@@ -291,7 +317,12 @@ def _failed(calibration: Calibration) -> bool:
 
 
 def _failure(calibration: Calibration, share: float) -> Finding:
-    """Return the finding that an arm's fit failed; `share` is the share of arms of its type whose fits failed."""
+    """Return the finding that an arm's fit failed.
+
+    Args:
+        calibration: the arm's calibration.
+        share: share of the arms of its type whose fits failed, from 0 to 1.
+    """
     return finding("arm-failed", arm=calibration.name, reason=calibration.judged[1], share=share)
 
 
@@ -310,12 +341,18 @@ def _arm_type(name: str, arms: Sequence[Calibration]) -> ArmType:
             robots.append(arm.robot)
     parameters: tuple[ParameterSpread, ...] = ()
     if robots:
-        parameters = prior.spread(robots)
+        parameters = arm_distribution.spread(robots)
     return ArmType(name, tuple(arms), tuple(failed), tuple(odd), parameters, tuple(tools(tool_uses)))
 
 
 def _farthest(calibration: Calibration) -> tuple[str, float]:
-    """Return the parameter farthest from nominal, and its deviation in units of the plausible one (`PLAUSIBLE`)."""
+    """Return the name of the parameter that is farthest from nominal, and its deviation.
+
+    The deviation is divided by the plausible one for the parameter's unit (`PLAUSIBLE`).
+
+    Args:
+        calibration: calibration of the arm.
+    """
     nominal = calibration.robot.nominal or calibration.chain
     plausible = [PLAUSIBLE[unit] for unit in nominal.units]
     sizes = np.abs(calibration.chain.values - nominal.values) / plausible

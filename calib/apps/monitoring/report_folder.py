@@ -1,4 +1,4 @@
-"""Folder of a comparison, a drift or a log: report.html with its figures, tables, metrics.json."""
+"""Folder of a comparison, a drift study or a log: report.html with figures, tables, metrics.json."""
 
 from __future__ import annotations
 
@@ -18,7 +18,14 @@ PICTURE = "plot_{}.png"
 
 
 class ResultPart(NamedTuple):
-    """A section of the page with its charts, their captions, and a table on disk (name, header, rows)."""
+    """A section of the report page.
+
+    Attributes:
+        section: the section.
+        charts: figures by name.
+        captions: captions of the figures.
+        table: name, header and rows of a table that is written as a file.
+    """
 
     section: Section
     charts: Mapping[str, Chart]
@@ -35,10 +42,19 @@ def save(
     numbers: object,
     tables: Sequence[str],
 ) -> Path:
-    """Write the folder `out` and return its path; `tables`: names of all tables that this `kind` of result may write.
+    """Write a result into the folder `out` and return its path.
+
+    Args:
+        out: the folder.
+        kind: kind of the result, for messages.
+        title: title of the report page.
+        setup: name to text of the facts at the head of the page.
+        parts: sections of the page.
+        numbers: content of ``metrics.json``.
+        tables: names of all tables that this kind of result may write.
 
     Raises:
-        UsageError: for a folder that holds something else.
+        UsageError: the folder contains files that are not of such a result.
     """
     file_names = (*tables, PAGE, folders.METRICS, PICTURE.format("*"))
     folders.check_target(out, file_names, (folders.METRICS, PAGE), kind)

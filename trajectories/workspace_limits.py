@@ -1,7 +1,7 @@
-"""Constraints on positions of the tool and of named points, and on distances between bodies.
+"""Constraints on positions of the tool and of named points, and on distances between bodies of robot and surroundings.
 
-Positions and distances come from callables with derivative products; see `calib.trajectories.constraints` for the
-interface of a constraint.
+Positions and distances are computed by callables with derivative products. The interface of a constraint is
+`calib.trajectories.constraints.MotionConstraint`.
 """
 
 from collections.abc import Callable
@@ -11,21 +11,22 @@ import numpy as np
 
 from .basis import SampledMotion
 
-# [m] by which a limit on the distance from the axis is divided at least
+# smallest radius by which the limit on the distance from the axis is divided [m]
 MIN_RADIUS = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """Limits on points' distance from the base's z axis and on their height: d_xy ≥ radius, lowest ≤ z ≤ highest.
+    """Limits on points' distance d_xy from the base's z axis and on their height: d_xy ≥ radius, lowest ≤ z ≤ highest.
 
-    The first is written (radius² - x² - y²) / (2 · radius) ≤ 0: smooth on the axis too, and a length near the limit.
+    The limit on the distance is evaluated as (radius² - x² - y²) / (2 · radius) ≤ 0. This value is smooth on the axis
+    too, and near the limit equals the missing distance [m].
 
     Attributes:
         points: q (N, n) -> (N, k, 3) positions in the base frame [m].
-        product: (q, G (N, k, 3)) -> (N, n), the slopes of Σ G · points.
+        product: (q, G (N, k, 3)) -> (N, n), the gradient of Σ G · points by q.
         names: (k,) names of the points.
-        radius, lowest, highest: limits [m]; None: no such limit.
+        radius, lowest, highest: limits [m]; None for no limit.
     """
 
     points: Callable[[np.ndarray], np.ndarray]
@@ -95,11 +96,11 @@ class Workspace:
 
 @dataclass(frozen=True, eq=False)
 class Clearance:
-    """Minimum distance `least` [m] between bodies.
+    """Constraint on the smallest distance between two bodies: at least `least` [m] for every given pair.
 
     Attributes:
-        distances: q (N, n) -> (N, k) distances of the pairs [m], negative where bodies overlap.
-        gradients: q (N, n) -> (N, k, n), the derivatives of the distances.
+        distances: q (N, n) -> (N, k) distances of the k pairs [m], negative where bodies overlap.
+        gradients: q (N, n) -> (N, k, n), the derivatives of the distances by q.
         labels: (k,) names of the pairs.
     """
 
