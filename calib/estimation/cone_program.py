@@ -85,8 +85,13 @@ def minimise(
     weight = np.where(i == j, 1.0, np.sqrt(2.0))
     flat = (matrices[:, i, j] * weight[:, None]).reshape(-1, p)
     bounds = -np.outer(np.broadcast_to(least, size), i == j).ravel()
-    set_rows = [convex.matrix for convex in sets]
-    set_sides = [convex.sides for convex in sets]
+    set_rows: list[np.ndarray] = []
+    set_sides: list[np.ndarray] = []
+    set_unknowns: list[np.ndarray] = []
+    for convex in sets:
+        set_rows.append(convex.matrix)
+        set_sides.append(convex.sides)
+        set_unknowns.append(convex.further)
     system = np.vstack([upper, equality_rows, -rows, -flat, *set_rows])
     right = np.concatenate([target, equality_values, offset, bounds, *set_sides])
     ends = np.cumsum([m, len(equality_rows), len(rows), len(flat), *map(len, set_sides)]).tolist()
@@ -100,7 +105,6 @@ def minimise(
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
-    set_unknowns: list[np.ndarray] = [convex.further for convex in sets]
     further = np.asarray(scipy.linalg.block_diag(np.zeros((end_of_matrices, 0)), *set_unknowns))
     further_count = further.shape[1]
     cost = sparse.diags(np.repeat([0.0, 1.0, 0.0], [p, m, further_count])).tocsc()
@@ -128,7 +132,9 @@ def minimise(
     matrix_multipliers = np.zeros((size, n, n))
     matrix_multipliers[:, i, j] = dual[end_of_rows:end_of_matrices].reshape(size, len(i)) / weight
     matrix_multipliers[:, j, i] = matrix_multipliers[:, i, j]
-    set_multipliers = [dual[start:end] for start, end in pairwise(ends[3:])]
+    set_multipliers: list[np.ndarray] = []
+    for start, end in pairwise(ends[3:]):
+        set_multipliers.append(dual[start:end])
     return ConeOptimum(
         values=values,
         rows=dual[end_of_equalities:end_of_rows],

@@ -109,8 +109,12 @@ class BodyCone(Frozen):
         limits = np.repeat([1.0, 0.0], [count, positive_count])
         offset = np.concatenate([limits, -edges])
         conditions = np.vstack([*rows, sides @ columns])
-        scaled_sets = [convex.of(np.diag(size / unit)) for convex in sets]
-        sets_of_unknowns = [convex.of(columns) for convex in scaled_sets]
+        scaled_sets: list[ConvexSet] = []
+        sets_of_unknowns: list[ConvexSet] = []
+        for convex in sets:
+            scaled = convex.of(np.diag(size / unit))
+            scaled_sets.append(scaled)
+            sets_of_unknowns.append(scaled.of(columns))
         solution = minimise(R @ columns, z, conditions, offset, bodies, sets=sets_of_unknowns)
         b = columns @ solution.values
         # of the gradient, from which on the cone or a set holds the optimum
