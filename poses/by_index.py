@@ -118,9 +118,9 @@ def kicked_by_index(
     spent = 0
     while largest > 0 and spent < trials and time.process_time() < deadline:
         size = int(generator.integers(min(2, largest), largest, endpoint=True))
-        free = np.setdiff1d(all_candidates, best.members)
+        nonmembers = np.setdiff1d(all_candidates, best.members)
         staying = generator.choice(best.members, count - size, replace=False)
-        coming = generator.choice(free, size, replace=False)
+        coming = generator.choice(nonmembers, size, replace=False)
         kicked = tuple(np.concatenate([staying, coming]).astype(int).tolist())
         trial = exchanged_by_index(jacobians, known_information, kicked, index, screen=screen)
         spent += max(1, trial.trials)

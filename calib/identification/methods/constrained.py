@@ -304,9 +304,7 @@ class _Planes:
         rows = self.scaled
         edges = self.edges
         small = Definite(matrices.matrices * self.unit, matrices.least)
-        small_sets: list[ConvexSet] = []
-        for convex in sets:
-            small_sets.append(convex.of(np.diag(self.unit)))
+        small_sets = [convex.of(np.diag(self.unit)) for convex in sets]
         if matrices.likely is None:
             active = np.zeros(0, dtype=int)
         else:

@@ -83,9 +83,7 @@ class Parameters:
         if not isinstance(listed, tuple) or not listed or not all(isinstance(name, str) for name in listed):
             refuse_option(WHERE, f'beta[{names!r}]: expected names of parameters: beta["M3"], beta["MX2", "MY2"]')
         if names not in self._variables:
-            rows: list[np.ndarray] = []
-            for name in listed:
-                rows.append(self._row_of({name: 1.0}))
+            rows = [self._row_of({name: 1.0}) for name in listed]
             if isinstance(names, str):
                 variable = cvxpy.Variable(name=names)
             else:

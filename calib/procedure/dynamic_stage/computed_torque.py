@@ -28,6 +28,10 @@ class TorqueTest(NamedTuple):
     rms: float
     tolerance: float
 
+    def __str__(self) -> str:
+        """Return row, error and tolerance as text."""
+        return f"{self.row} {self.rms:.3g} (tolerance {self.tolerance:g})"
+
     @property
     def passed(self) -> bool | None:
         """Whether the error is within the tolerance; None for a joint that did not move, which is not tested."""

@@ -297,9 +297,11 @@ def _picked(
     factor = stored.period / problem.family.period
     same_period = shortest * (1.0 - PERIOD_ROUNDING) <= factor <= longest * (1.0 + PERIOD_ROUNDING)
     if not same_period or (stored.kind, stored.rate) != (settings.family, settings.rate):
-        made = f"{stored.kind}, {stored.period:g} s at {stored.rate:g} Hz"
-        asked = f"{settings.family}, {settings.period:g} s at {settings.rate:g} Hz"
-        raise UsageError(f"the front's motions are {made}, the settings say {asked}; give the same, or design it again")
+        of_front = f"{stored.kind}, {stored.period:g} s at {stored.rate:g} Hz"
+        of_settings = f"{settings.family}, {settings.period:g} s at {settings.rate:g} Hz"
+        raise UsageError(
+            f"the front's motions are {of_front}, the settings say {of_settings}; give the same, or design it again"
+        )
     motion = as_search_result(front.designed, problem.family)
     if goals:
         problem = replace(problem, goals=tuple(goals))

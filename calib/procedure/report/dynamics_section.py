@@ -261,12 +261,12 @@ def _test_table(unseen: UnseenReport, tolerances: Sequence[float], joint_count: 
         tolerances: tolerance of each joint, or one for all [N m or N].
         joint_count: number of joints.
     """
-    words = {True: "yes", False: "no", None: "not tested"}
+    answers = {True: "yes", False: "no", None: "not tested"}
     units = dict(zip(unseen.rows, unseen.units))
     rows = []
     for test in torque_tests(tolerances, unseen.proofs, unseen.rows, joint_count):
         rms = "–" if test.passed is None else f"{test.rms:.3g} {units[test.row]}"
-        rows.append([test.row, rms, f"{test.tolerance:g} {units[test.row]}", words[test.passed], test.recording])
+        rows.append([test.row, rms, f"{test.tolerance:g} {units[test.row]}", answers[test.passed], test.recording])
     header = ("torque", "rms error", "tolerance", "within", "recording")
     return page.ReportTable("Computed-torque test on unseen motion", header, rows, numbers=[1, 2])
 

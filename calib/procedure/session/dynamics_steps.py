@@ -90,8 +90,8 @@ def _labels_in(name: str, labels: Iterable[str]) -> tuple[str, ...]:
         name: file name of the recording.
         labels: labels of all payloads.
     """
-    whole = _spans(name, labels, r"(?![^\W_])")
-    return whole or _spans(name, labels, "")
+    as_words = _spans(name, labels, r"(?![^\W_])")
+    return as_words or _spans(name, labels, "")
 
 
 def _spans(name: str, labels: Iterable[str], end: str) -> tuple[str, ...]:
@@ -108,15 +108,14 @@ def _spans(name: str, labels: Iterable[str], end: str) -> tuple[str, ...]:
         match = re.search(rf"(?<![^\W_]){re.escape(label)}{number}{end}", name, re.IGNORECASE)
         if match is not None:
             matches[label] = match.span()
-    kept = []
+    longest = []
     for label, (start, stop) in matches.items():
-        longer = False
-        for other, (other_start, other_stop) in matches.items():
-            inside = other_start <= start and stop <= other_stop
-            longer = longer or (inside and len(other) > len(label))
-        if not longer:
-            kept.append(label)
-    return tuple(kept)
+        is_part = False
+        for rival, (first, last) in matches.items():
+            is_part = is_part or (first <= start and stop <= last and len(rival) > len(label))
+        if not is_part:
+            longest.append(label)
+    return tuple(longest)
 
 
 def unrecorded_payloads(session: Session) -> list[str]:
@@ -272,9 +271,9 @@ def _design(
             choose = command_line("next", session.folder, "--pick", "N")
             table = session.path("6-excitation/training") / stored_front.TABLE
             notes.append(Note(f"{name}: {count} motions to choose from ({table}): {choose}", is_warning=True))
-        remarks = [*designed.inputs.limits.bounds.lines()]
-        remarks += [note for note in designed.notes if note not in designed.doubts]
-        notes += [f"{name}: {remark}" for remark in remarks]
+        for remark in (*designed.inputs.limits.bounds.lines(), *designed.notes):
+            if remark not in designed.doubts:
+                notes.append(f"{name}: {remark}")
     return notes
 
 
@@ -605,10 +604,9 @@ def _as_delivered(session: Session, gathered: inputs.IdentificationInputs, asses
         )
     rows = gathered.options.settings.torque_rows.titles(gathered.chain.joint_names)
     tests = torque_tests(section.tolerance_torque, assessment.proofs, rows, len(gathered.chain.joints))
-    failed = [test for test in tests if test.passed is False]
+    failed = ", ".join(str(test) for test in tests if test.passed is False)
     if failed:
-        errors_above = ", ".join(f"{test.row} {test.rms:.3g} (tolerance {test.tolerance:g})" for test in failed)
-        excesses.append(f"rms torque errors [N m or N] of the identified model above tolerance: {errors_above}")
+        excesses.append(f"rms torque errors [N m or N] of the identified model above tolerance: {failed}")
     if not excesses:
         return verdict
     return Verdict("fail", "; ".join([verdict.reason, *excesses]))

@@ -12,6 +12,7 @@ motion does not help, since the remaining error is an effect that is not modelle
 """
 
 from dataclasses import replace
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -146,7 +147,7 @@ def _short_joints(session: Session, tolerance: float) -> list[_ShortParameter]:
     report = session.identification.unseen.read()
     recordings = (report.proofs or report.fit).values()
     errors_in_motion = [recording.counted(recording.floor_dominates) for recording in recordings]
-    worst = max(errors_in_motion, key=lambda errors: errors.total)
+    worst = max(errors_in_motion, key=attrgetter("total"))
     if not tolerance or worst.total <= tolerance:
         return []
     n = session.identification.dynamics().model.n
