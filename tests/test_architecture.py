@@ -53,7 +53,7 @@ HOMES = {
     "toppra": ["calib.trajectories."],
     "ruckig": ["calib.trajectories."],
     "clarabel": ["calib.estimation."],
-    "cvxpy": [],  # the tests' independent solver
+    "cvxpy": ["calib.identification.methods.convex"],  # users' constraints; in the tests an independent solver
     "matplotlib": ["calib.procedure.", "calib.api.", "calib.apps."],
     "jinja2": ["calib.procedure.report.templates", "calib.apps.controller_programs.program"],
     "typst": ["calib.procedure.report.certificate.rendering"],

@@ -26,7 +26,7 @@ from calib.identification.methods.least_squares import LeastSquares
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
-from calib.identification.registry import METHODS, method_named
+from calib.identification.registry import METHODS, TAKING_FUNCTIONS, method_named, under_constraints
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
 from calib.identification.standstill import (
@@ -172,6 +172,8 @@ def identify_model(
     require(cases, "no recording to identify the model from: give at least one", UsageError)
     method = method_named(settings.method)
     settings = require_usable(settings, method)
+    method, constraints = under_constraints(method, settings.constraints)
+    settings = replace(settings, constraints=constraints)
     _require_constrainable(method, settings)
     _require_motion(cases)
     noise = _repeats_noise(cases, settings)
@@ -671,6 +673,8 @@ def _require_constrainable(method: Method, settings: IdentificationSettings) -> 
     advice = f"methods that support them: {', '.join(supporting)}"
     if constrained in supporting:
         advice = f"use '{constrained}'"
+    if settings.constraints.by_function:
+        advice = f"methods that do: {', '.join([*TAKING_FUNCTIONS, *supporting])}"
     raise UsageError(f"[constraints]: method '{method.name}' does not support them; {advice}")
 
 

@@ -97,7 +97,8 @@ class Choices:
         deflections: whether joint corrections of the fit (compliance, gears, encoders) move the links; never where the
             closed loop is simulated.
         loop: the closed loop in which recordings were made, for instrumental variables.
-        constraints: constraints on parameters for the methods pc-*; None: their defaults.
+        constraints: constraints on parameters for the methods pc-*; None: their defaults. By a function of parameters,
+            or a file of it, also for ols, wls and iv.
     """
 
     passive: Text = ""
@@ -117,7 +118,7 @@ class Choices:
     folds: Annotated[int, Whole(2, 50)] = 6
     deflections: Flag = True
     loop: Annotated[LoopSettings, Checked(check_loop)] | None = None
-    constraints: ConstraintSettings | None = None
+    constraints: Annotated[ConstraintSettings | None, Checked(ConstraintSettings.of)] = None
 
 
 @dataclass(frozen=True)
