@@ -26,11 +26,11 @@ def exchanged_by_index(
     result is a local optimum among the exchanges tried only.
 
     Args:
-        jacobians: (N, rows, p) whitened Jacobians of the candidates.
-        known_information: (p, p) information of the poses already measured.
+        jacobians: (N, rows, p) Jacobians J_i of the N candidates, each row divided by its standard deviation.
+        known_information: (p, p) information Σ J_iᵀJ_i of the poses already measured; zeros for no such poses.
         members: indices of the candidates to start from.
-        index: "O1" ... "O5", "cond".
-        report: called with every improved set and its merit; None for no report.
+        index: observability index O to improve, "O1" ... "O5" or "cond" (`calib.poses.indices`).
+        report: called with the indices of every improved set and its merit; None for no report.
         sweeps: largest number of passes over all members.
         screen: number of candidates tried per member from each of the two groups.
 
@@ -45,6 +45,9 @@ def exchanged_by_index(
         for position in range(len(chosen)):
             thinned = matrix - _gram(jacobians[chosen[position]][None])
             trials = _screened(jacobians, matrix, chosen, index, screen)
+            # every candidate is a member
+            if not len(trials):
+                continue
             candidate_rows = jacobians[trials]
             trial_information = thinned + candidate_rows.transpose(0, 2, 1) @ candidate_rows
             trial_merits = merits(trial_information, index)
@@ -64,6 +67,10 @@ def merits(matrices: np.ndarray, index: Index) -> np.ndarray:
 
     Columns may have very different units, so the results are accurate only while the ratio of the smallest to the
     largest singular value is well above 1e-7.
+
+    Args:
+        matrices: (K, p, p) information matrices WᵀW of K sets of poses.
+        index: observability index O, "O1" ... "O5" or "cond"; O1 without its factor 1/√m.
     """
     values = np.linalg.eigvalsh(matrices)[:, ::-1]
     regular = values[:, -1] > 1e-14 * values[:, 0]

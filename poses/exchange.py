@@ -15,7 +15,14 @@ TOLERANCE = 1e-9
 
 
 def greedy(pool: Pool, m: int) -> Design:
-    """Return the design of m candidates added one after another, each time the candidate that raises det M most."""
+    """Return the design of m candidates added one after another, each time the candidate that raises det M most.
+
+    M (p, p) is the information of the chosen candidates and of the poses measured before.
+
+    Args:
+        pool: the candidates and the information of the poses measured before.
+        m: number of candidates to choose.
+    """
     design = design_of(pool, ())
     for _ in range(m):
         candidate, _ = best_addition(pool, design)
@@ -147,6 +154,13 @@ def _excursion(
     """Return the design at the end of one DETMAX excursion, and the sets of members passed on the way.
 
     The design is None if the excursion exceeds m ± `longest` poses.
+
+    Args:
+        pool: the candidates.
+        start: design of m poses from which the excursion starts.
+        upwards: True adds poses first, False removes poses first.
+        longest: largest number of poses by which the excursion may differ from m.
+        failed: failure list: sets of members passed on earlier excursions without gain.
     """
     m = len(start.members)
     passed = set[frozenset[int]]()

@@ -56,6 +56,10 @@ class ExcitationDesign(ChartedResult, WithoutVerdict, design.Designed):
         """Write the result folder, with the same files as `calib excite --out`, and return its path.
 
         The files are trajectory.csv, ROS 2 messages, metrics and figures.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
         """
         from calib.procedure.report import motion_figures
 
@@ -99,7 +103,12 @@ class MotionPlan(ChartedResult, WithoutVerdict, planning.Planned):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the result folder, with the same files as `calib plan --out`, and return its path."""
+        """Write the result folder, with the same files as `calib plan --out`, and return its path.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
+        """
         from calib.procedure.report import motion_figures
 
         write_figures = motion_figures.write_plan if plots else None
@@ -156,7 +165,8 @@ def design_excitation(
         options: settings of the later identification, as in `calib.identify_dynamics`. The motion is designed for the
             torque rows, drive terms, couplings and payloads in them. None takes the defaults.
         after: identified dynamics to be improved by a further motion, given instead of `model`. The motion that reduces
-            the σ of their parameters most is designed, and the reduction is predicted.
+            the σ of their parameters most is designed, and the reduction is predicted. None: the design does not refer
+            to an earlier identification.
         pick: folder of a design with a Pareto front, made with the same settings, and the number of a motion on that
             front. This motion is returned instead of a new search; None searches.
         workers: number of local processes, or the address of a Dask scheduler.

@@ -120,9 +120,9 @@ def minimise(
 
 
 def _solved(solver: "clarabel.DefaultSolver") -> "clarabel.DefaultSolution | None":
-    """Return Clarabel's solution; None if Clarabel panics because an eigenvalue computation of LAPACK fails.
+    """Return the solution found by Clarabel's `solver`; None if Clarabel panics as an eigenvalue computation fails.
 
-    Whether such a failure happens depends on the processor, since LAPACK's kernels differ.
+    Whether LAPACK's eigenvalue computation fails depends on the processor, since LAPACK's kernels differ.
     """
     try:
         return solver.solve()
@@ -163,7 +163,7 @@ def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
     is far from Clarabel's), Clarabel's solution is returned.
 
     Args:
-        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] with R of full rank.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of a least-squares problem, with R of full rank; ρ is not used.
         rows: A (c, p); a row with a single non-zero entry is satisfied exactly.
 
     Raises:

@@ -45,7 +45,8 @@ class LinearFit(Frozen):
 def ols(data: Triangles, inflation: np.ndarray | None = None) -> LinearFit:
     """Estimate x = argmin ‖y - W x‖² with covariance σ² (WᵀW)⁻¹, σ² = ‖ρ‖² / (r - p), by ordinary least squares.
 
-    This covariance is correct if all groups of rows have the same noise; otherwise use `wls`.
+    This covariance is correct if the noise of y has the same standard deviation in all groups of rows; otherwise use
+    `wls`.
 
     Args:
         data: R factors of [W y].
@@ -115,6 +116,10 @@ def subsystem_std(data: Triangles) -> np.ndarray:
 
     Kolyubin et al. (2019), after eq. 22.
 
+    Args:
+        data: R factors of [W y], one group g with r_g rows per standard deviation; ρ_g are the group's residuals in
+            units of y.
+
     Raises:
         CalibError: for a group with no more rows than independent columns.
     """
@@ -169,7 +174,7 @@ def _fit(data: Triangles, std: np.ndarray, inflation: np.ndarray | None, stated:
 
     Args:
         data: R factors of [W y].
-        std: (g,) standard deviations of the groups.
+        std: (g,) noise standard deviations of the groups of rows, in units of y.
         inflation: (g,) variance inflation of each group; None: 1.
         stated: whether `std` is the noise itself; if not, only its proportions are used and the residuals give the
             scale of the covariance.
@@ -204,7 +209,7 @@ def _pack(
     Args:
         data: R factors of [W y].
         values, covariance: (p,) estimate and its (p, p) covariance.
-        std, tau: (g,) standard deviations and variance inflation of the groups.
+        std, tau: (g,) noise standard deviation (in units of y) and variance inflation of each group of rows.
         inverse: (p, p) R⁻¹ of the weighted W.
         conditions: condition numbers of the weighted W, as it is and with unit-norm columns.
 
@@ -239,7 +244,7 @@ def leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarra
 
     Args:
         data: R factors of [W y].
-        std: (g,) standard deviations σ_g.
+        std: (g,) standard deviations σ_g of the groups, in units of y.
         inverse: (p, p) R⁻¹ of the weighted W.
     """
     whitened = data.factors[:, :, :-1] @ inverse

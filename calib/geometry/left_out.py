@@ -68,7 +68,11 @@ Profile = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
 def unevenness(profile: Profile, q: np.ndarray) -> np.ndarray:
     """Return the factor s (m,) by which the error variance at poses q (m, n) is larger than on average.
 
-    1 for an empty profile. q is in rad or m.
+    1 for an empty profile.
+
+    Args:
+        profile: log s as one function per joint; s is the exponential of their sum.
+        q: (m, n) joint values [rad or m].
     """
     log_factor = np.zeros(len(q))
     for joint, (knots, values) in enumerate(profile):
@@ -123,7 +127,11 @@ class Unevenness:
         return tuple(result)
 
     def _values(self, data: Gram) -> list[np.ndarray]:
-        """Return E f + var f / 2 at the knots of each joint that moves."""
+        """Return E f + var f / 2 at the knots of each joint that moves, f being the joint's function in log s.
+
+        Args:
+            data: statistics of the squared errors for the values of all functions at their knots.
+        """
         data = replace(data, total=data.total + MIN_VARIANCE * data.rows)
         sizes = np.full(len(self.groups), FIRST_SIZE)
         estimate = relevance(data, self.groups, sizes, SEARCH_ROUNDS, SETTLED)
@@ -189,7 +197,11 @@ class LeftOut:
         )
 
     def without(self, poses: np.ndarray) -> LeftOut:
-        """Return the errors without the rows of the given poses."""
+        """Return the errors without the rows of the given poses.
+
+        Args:
+            poses: numbers of the poses.
+        """
         rows = ~np.isin(self.pose, poses)
         return LeftOut(
             squares=self.squares[rows],
@@ -241,13 +253,16 @@ class LeftOut:
         return weights.tolist(), self.quantiles(sizes)
 
     def _variances(self, weights: np.ndarray | Sequence[float]) -> np.ndarray:
-        """Return the expected variance (m,) [m²] of each error for the weights κ, v_0, v_1, v_2."""
+        """Return the expected variance (m,) [m²] of each error, for weights κ, v_0, v_1, v_2 of the `shapes`."""
         return np.maximum(self.shapes @ np.asarray(weights), SMALLEST_VARIANCE)
 
     def quantiles(self, sizes: np.ndarray) -> tuple[float, float]:
         """Return the bounds below which 95 % of future errors lie, for near and far rows, from error magnitudes (m,).
 
         They are conformal quantiles, as in the module's docstring.
+
+        Args:
+            sizes: (m,) error magnitudes, divided by the standard deviations expected for them.
         """
         poses = len(np.unique(self.pose))
         level = min(1.0, COVERED * (poses + 1) / poses)

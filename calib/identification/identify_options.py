@@ -223,7 +223,11 @@ class IdentifyOptions:
     source: str = ""
 
     def file_settings(self, path: str | Path) -> FileSettings:
-        """Return the settings of a recording (or a cut of one), including which torques its rows need."""
+        """Return the settings of a recording (or a cut of one), including which torques its rows need.
+
+        Args:
+            path: the recording, as the user stated it.
+        """
         settings = own_table(self.files, parse_cut(str(path))[0]) or self.every
         rows = self.settings.torque_rows
         samples = settings.recording.samples or USED

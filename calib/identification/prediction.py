@@ -181,13 +181,13 @@ class Score:
 
 
 def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray) -> float:
-    """Return the standard error of 100 ‖τ - τ̂‖ / ‖τ‖ [%], by a jackknife over blocks of time.
+    """Return the standard error of 100 ‖τ - τ̂‖ / ‖τ‖ [%] (measured τ, predicted τ̂), by a jackknife over time blocks.
 
     Blocks are used because residuals are autocorrelated (Efron and Tibshirani 1993, eq. 11.5, with blocks instead of
     samples: Künsch 1989); ten blocks are our choice.
 
     Args:
-        measured, predicted: (rows, N) torques.
+        measured, predicted: (rows, N) torques τ and τ̂, in one unit.
 
     Returns:
         the standard error; NaN if there are fewer than two samples for each block, or no torque.
@@ -214,10 +214,10 @@ def score(
 
     Args:
         case: the recording.
-        predicted: (N, rows) torques.
+        predicted: (N, rows) predicted torques, in the unit of the recorded ones.
         slow: share of a joint's peak speed below which the joint counts as at rest, or one speed per joint [rad/s or
             m/s]; None: the default of `calib.data.signals.motion.moving`.
-        apart: rows in a different unit, excluded from totals.
+        apart: indices of rows in a different unit, excluded from totals.
     """
     motion = case.motion
     moves = moving(motion) if slow is None else moving(motion, slow)
@@ -315,7 +315,13 @@ def _score_row(
 
 
 def _sums(target: np.ndarray, residual: np.ndarray, selected: np.ndarray) -> tuple[float, float, float]:
-    """Return Σ (τ - τ̂)², Σ τ² and the number of samples, over the selected samples."""
+    """Return Σ (τ - τ̂)², Σ τ² and the number of samples, over the selected samples.
+
+    Args:
+        target: torques τ of all samples.
+        residual: their prediction errors τ - τ̂.
+        selected: mask of the samples to count.
+    """
     residual_square = float(np.sum(residual[selected] ** 2))
     target_square = float(np.sum(target[selected] ** 2))
     return residual_square, target_square, float(selected.sum())
@@ -325,6 +331,10 @@ def _prediction_errors(sums: np.ndarray, apart: Sequence[int]) -> PredictionErro
     """Return prediction errors from sums (rows, 3) of the torque rows: Σ (τ - τ̂)², Σ τ² and number of samples.
 
     The total excludes the rows `apart`.
+
+    Args:
+        sums: one row per torque row.
+        apart: indices of rows in a different unit.
     """
     square, size, count = np.array(sums).T
     same_unit = ~np.isin(np.arange(len(square)), apart)
@@ -342,6 +352,10 @@ def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | N
     """Return the whiteness test of each row of decimated residuals (M, rows), in the longest segment.
 
     The test is None for a row with too few samples or without variation.
+
+    Args:
+        residual: residuals τ - τ̂ at the decimated samples.
+        segment: (M,) number of the gap-free segment of each sample.
     """
     tests: list[Whiteness | None] = []
     for column in residual[longest(segment)].T:
@@ -382,7 +396,11 @@ class Dynamics(Frozen, Generic[Model]):
 def predict(dynamics: Dynamics[RegressorModel], case: Case) -> np.ndarray:
     """Return the predicted torques (N, rows) of a case at the full rate [N m or N]: W(q, v, a) · values.
 
-    W is not computed.
+    The regressor W is not computed.
+
+    Args:
+        dynamics: the model with its parameter values.
+        case: the recording.
     """
     model, motion = dynamics.model, case.motion
     states = segmented_states(model.columns, case)

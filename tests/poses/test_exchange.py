@@ -221,3 +221,10 @@ def test_bound_is_tight_with_few_candidates(spare):
     if spare <= 2:
         best = max(combinations(range(17 + spare), 17), key=lambda s: log_det_of(few[list(s)]))
         assert tuple(chosen.indices) == best
+
+
+@pytest.mark.parametrize("index", ["cond", "O3"])
+def test_as_many_poses_as_candidates_are_all_of_them(index):
+    """Where every candidate is chosen there is nothing to exchange."""
+    chosen = select_poses(ARM[:20], 20, SearchSettings(index))
+    assert chosen.indices.tolist() == list(range(20))

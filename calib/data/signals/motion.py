@@ -53,6 +53,7 @@ ROWS = (
     "q_link",
     "q_ref",
     "tau_ff",
+    "q_measured",
     "v_measured",
 )
 
@@ -110,8 +111,8 @@ class Motion:
         velocity_cutoff: (n,) cut-off f_v of the positions from which v is computed [Hz].
         decimator: the filter of the parallel decimation to `band`.
         joint_names, kind, file, drive_gain, effort_variance: those of the recording.
-        tau_link, tau_motor, q_link, q_ref, tau_ff, v_measured: (N, n) further series of the recording on the grid, not
-            filtered; None if not recorded.
+        tau_link, tau_motor, q_link, q_ref, tau_ff, q_measured, v_measured: (N, n) further series of the recording on
+            the grid, not filtered; None if not recorded.
         sampling, cutoffs: reports of resampling and of the choice of cut-offs.
         notes: remarks for the user.
         jumps, faults: those of the recording.
@@ -141,6 +142,7 @@ class Motion:
     q_link: np.ndarray | None = None
     q_ref: np.ndarray | None = None
     tau_ff: np.ndarray | None = None
+    q_measured: np.ndarray | None = None
     v_measured: np.ndarray | None = None
     drive_gain: np.ndarray | None = None
     effort_variance: np.ndarray | None = None
@@ -248,8 +250,8 @@ def make_motion(
     rows = _span(mask)
     series: FieldValues = {}
     for name, values in sampled.series.items():
-        if name != "q":
-            series["v_measured" if name == "v" else name] = read_only(values[rows])
+        field = f"{name}_measured" if name in ("q", "v") else name
+        series[field] = read_only(values[rows])
     return Motion(
         t=read_only(sampled.t[rows]),
         q=read_only(q[rows]),
@@ -342,7 +344,7 @@ def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: 
     Args:
         cutoffs: proposed cut-offs, with the position noise.
         cutoff: (n,) cut-off f_q of the positions [Hz].
-        a: (N, n) accelerations.
+        a: (N, n) accelerations [rad/s² or m/s²].
         rate: sampling rate [Hz].
     """
     rms = np.sqrt(np.mean(a**2, axis=0))
@@ -354,7 +356,13 @@ def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: 
 
 
 def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
-    """Return the positions (N, n) low-pass filtered at each joint's cut-off (n,) [Hz], segment by segment."""
+    """Return the positions (N, n) low-pass filtered at each joint's cut-off (n,) [Hz], segment by segment.
+
+    Args:
+        sampled: the resampled recording.
+        cutoff: (n,) cut-offs f_q [Hz].
+        order: order of the Butterworth filter in one pass.
+    """
     # By joints, as all that follows reads them.
     result = np.array(sampled.series["q"], order="F")
     for rows in filtering.segments(sampled.segment):
@@ -380,6 +388,12 @@ def _differences(
 
 def _unaffected(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file: str) -> np.ndarray:
     """Return the samples that the ends of the filters do not affect, (N,) bool.
+
+    Args:
+        sampled: the resampled recording.
+        cutoff: (n,) cut-offs of the positions [Hz].
+        options: options of filtering, with the time to remove at the ends.
+        file: name of the recording, for messages.
 
     Raises:
         MeasurementError: there are no such samples.
@@ -431,7 +445,12 @@ def _per_joint(cutoff: float | tuple[float, ...], recording: Recording) -> np.nd
 
 
 def _reasons(cutoffs: Cutoffs, options: FilterOptions) -> tuple[str, ...]:
-    """Return sentences that explain how the cut-offs were chosen."""
+    """Return sentences that explain how the cut-offs were chosen.
+
+    Args:
+        cutoffs: the proposed cut-offs.
+        options: options of filtering, which may state others.
+    """
     lines = []
     for name, option in (("cutoff", options.cutoff), ("band", options.band)):
         if option is not None:

@@ -6,10 +6,8 @@
 uncorrelated with the noise that the feedback brings into W. The iteration starts from a regular robot: inertia diag(J),
 no gravity, no friction. DIDIM (Gautier, Janot & Vandanjon 2013) estimates from the simulated W alone, x_{k+1} = W_s⁺ y.
 
-If the noise of the measured speed exceeds the smoothing of a Coulomb sign, the error of this column is not additive
-noise, and instruments do not help. Its column of W is then replaced by the simulated sign or, if the simulation does
-not follow the motion (e.g. because of a wrong controller), by the sign of the measured speed filtered to half the
-bandwidth (our choice).
+Noise shifts the mean of the column of a Coulomb sign, and instruments do not remove such a bias. It is removed by
+`sign_noise`, which simulates the noise in the loop or in the log alone, wherever the torques show it to be.
 
 With constraints on base parameters, every round minimises ½ ‖P_Z (y - W x)‖² under them; this is PC-IDIM-IV
 (`calib.identification.methods.parameter_constraints`). Constraints do not remove a bias.
@@ -20,12 +18,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property, partial
 
 import numpy as np
 
-from calib.data.signals.filtering import Decimator, low_pass, slope
-from calib.data.signals.motion import Motion
+from calib.data.signals.filtering import Decimator
 from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
@@ -37,6 +34,7 @@ from calib.estimation.whiteness import inflation
 from calib.identification.closed_loop import instrumental_variables
 from calib.identification.closed_loop.instrumental_variables import Instruments, InstrumentStrength
 from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
+from calib.identification.closed_loop.sign_noise import PositionNoise, mean_signs, position_noise
 from calib.identification.closed_loop.simulated_runs import (
     MAX_GAIN_RATIO,
     MAX_RETREATS,
@@ -57,8 +55,6 @@ from calib.records import frozen
 
 # iterations; 3 to 6 are usual
 MAX_ROUNDS = 10
-# times the speed's noise, by which the simulated motion may be off the measured one (our choice)
-MAX_FOLLOWING = 1.25
 
 
 @dataclass(frozen=True)
@@ -116,6 +112,7 @@ class Instrumental:
         problem: R factors of [Z W y], one group per torque row.
         estimator: estimator used in each iteration.
         rows: for each recording, the case whose motion W describes, its rows, and its instruments Z.
+        noise: for each recording, its position noise in the loop and in the log alone.
     """
 
     fit: LinearFit
@@ -132,6 +129,7 @@ class Instrumental:
     problem: Instruments
     estimator: _RoundEstimator
     rows: tuple[tuple[Case, ObservationRows, np.ndarray], ...]
+    noise: tuple[PositionNoise, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -227,6 +225,7 @@ def identify_instrumental(
     constraints: Constraints | None = None,
     terms: Sequence[DriveTerm] = (),
     limit: int = MAX_ROUNDS,
+    say: Callable[[str], None] | None = None,
 ) -> Instrumental:
     """Return the estimate of the base parameters with instruments from simulation.
 
@@ -244,6 +243,7 @@ def identify_instrumental(
         terms: additional friction terms, estimated after the base parameters; the loads on which they depend are
             computed by least squares.
         limit: largest number of iterations.
+        say: called with a short text after each iteration; None: not called.
 
     Raises:
         UsageError: for an unknown method, or torque rows that cannot be simulated.
@@ -265,7 +265,6 @@ def identify_instrumental(
         settings = ConstraintSettings(signs=False, inertia=0, bounds=bounds)
         constraints = make_constraints(settings, model, base, base.names, [None] * base.b)
     estimator = ROUNDS[method]
-    task = _Fixed(model, base, cases, decimator, observed, estimator, constraints, friction)
     ordinary = wls(data, settled_std(data, 1e-3))
     loop = cases[0][1]
     plant = regular_plant(model, friction.terms, loop, inertia)
@@ -274,18 +273,23 @@ def identify_instrumental(
     rounds: list[Round] = []
     try:
         runs = simulated_runs(plant, cases)
+        noise = [position_noise(plant, case, loop) for case, loop in cases]
         retreats = 0
         tau = 1.0
     except NotConverged as error:
         raise CannotSimulate(str(error), error.last) from error
+    task = _Fixed(model, base, cases, decimator, observed, estimator, constraints, friction, noise)
     # of the last step, and how often it was halved afterwards
     start, returns = plant, 0
     while True:
-        estimate = _estimate_round(task, runs, std, tau)
+        estimate = _estimate_round(task, plant, runs, std, tau)
         task = task.after(estimate)
         residual_std = estimate.fit.estimate.residual_std
         iteration = Round(_change(before, estimate.fit), residual_std, retreats)
         rounds.append(iteration)
+        if say is not None:
+            change = f": parameters change by {100 * iteration.change:.3g} %" if before is not None else ""
+            say(f"{method}, round {len(rounds)}{change}")
         if before is not None and retreats == 0 and instrumental_variables.settled(before, estimate.fit):
             return _result(task, estimate, ordinary, task.plant(plant, estimate), rounds, std, runs)
         try:
@@ -360,10 +364,13 @@ class _Friction:
         """Return the rows of a case with one more column for each term."""
         if self.loads is None:
             return rows
+        return rows.extend(self.terms, self.columns(case))
+
+    def columns(self, case: Case) -> np.ndarray:
+        """Return the columns (M, rows, k) of the terms on a case's motion."""
         motion = case.motion
         load = self.model.transmitted(self.loads, motion.q, motion.v, motion.a, case.carried)
-        columns = observe_terms(self.terms, case, self.decimator, load, self.model.torque_rows)
-        return rows.extend(self.terms, columns)
+        return observe_terms(self.terms, case, self.decimator, load, self.model.torque_rows)
 
 
 @dataclass(frozen=True, eq=False)
@@ -388,6 +395,16 @@ class _Fixed:
     estimator: _RoundEstimator
     constraints: Constraints | None
     friction: _Friction
+    noise: Sequence[PositionNoise]
+
+    @cached_property
+    def signs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Masks of base columns (b,) and of richer terms (k,) whose value jumps with the sign of the speed."""
+        base_signs = np.zeros(len(self.base.kept), dtype=bool)
+        for position, k in enumerate(self.base.kept - self.model.inertial):
+            base_signs[position] = k >= 0 and self.model.columns[k].form.undecided_at_rest
+        richer_signs = [term.form.undecided_at_rest for term in self.friction.terms]
+        return base_signs, np.array(richer_signs, dtype=bool)
 
     def after(self, estimate: _Found) -> _Fixed:
         """Return the settings of the next iteration; its constraints start with the postures binding in `estimate`."""
@@ -430,85 +447,46 @@ class _Found:
     bound: Held | None
 
 
-def _estimate_round(task: _Fixed, runs: Runs, std: np.ndarray, tau: float) -> _Found:
+def _estimate_round(task: _Fixed, plant: Plant, runs: Runs, std: np.ndarray, tau: float) -> _Found:
     """Return the estimate with instruments from simulated runs.
 
     Args:
         task: data and settings of all iterations.
-        runs: simulated motions of all recordings.
+        plant: the simulated robot.
+        runs: its simulated motions of all recordings.
         std: (rows,) standard deviations of the torque rows.
         tau: variance inflation of the last iteration.
     """
     columns = task.base.kept
     observed: list[ObservationRows] = []
     simulated: list[np.ndarray] = []
-    for ((case, loop), run), rows, (recorded_case, _) in zip(runs, task.observed, task.cases):
+    for ((case, loop), run), rows, noise in zip(runs, task.observed, task.noise):
         replayed = simulated_case(case, run, loop)
         simulated_rows = observe(task.model, columns, replayed, task.decimator)
         matrix = task.friction.added(simulated_rows, replayed).matrix
+        signs = np.concatenate(task.signs)
+        if signs.any():
+            true, recorded = mean_signs(partial(_sign_columns, task), plant, case, loop, run, noise)
+            corrected = rows.matrix.copy()
+            corrected[:, :, signs] += true - recorded
+            rows = replace(rows, matrix=corrected)
+            if not task.estimator.measured:
+                matrix = matrix.copy()
+                matrix[:, :, signs] = true
         simulated.append(matrix)
-        observed.append(_with_signs(task, columns, rows, matrix, recorded_case, replayed))
+        observed.append(rows)
     problem = _stack(observed, simulated, task.estimator.measured)
     fit, bound = _held_fit(task, problem, std, tau)
     return _Found(observed, simulated, problem, fit, _inflation(observed, fit), bound)
 
 
-def _with_signs(
-    task: _Fixed, columns: np.ndarray, rows: ObservationRows, simulated: np.ndarray, case: Case, simulated_case: Case
-) -> ObservationRows:
-    """Return the rows with columns of Coulomb signs replaced where the velocity noise exceeds their smoothing.
-
-    Args:
-        task: data and settings of all iterations.
-        columns: indices of the model's base columns.
-        rows: rows of the recording.
-        simulated: (M, rows, p) columns of `simulated_case`.
-        case: the recording.
-        simulated_case: the recording with its motion replaced by the simulated motion.
-    """
-    signs = _drowned_signs(task.model, columns, case)
-    drowned = np.append(signs, np.zeros(len(task.friction.terms), dtype=bool))
-    if not drowned.any():
-        return rows
-    motion = case.motion
-    band = 0.5 * case.motion.band
-    values = low_pass(case.motion.q, motion.rate, band)
-    measured = slope(values, motion.rate)
-    expected = slope(low_pass(simulated_case.motion.q, motion.rate, band), motion.rate)
-    away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
-    followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
-    if not followed.all():
-        speed = np.where(followed | np.isnan(measured), simulated_case.motion.v, measured)
-        case_at_speed = replace(case, motion=replace(motion, v=speed))
-        sign_rows = observe(task.model, columns[signs], case_at_speed, task.decimator)
-        simulated = simulated.copy()
-        simulated[:, :, drowned] = sign_rows.matrix
-    matrix = np.where(drowned, simulated, rows.matrix)
-    return replace(rows, matrix=matrix)
-
-
-def sign_noise(model: Any, motion: Motion) -> np.ndarray:
-    """Return the velocity noise (n,) of all joints on which a model's drive terms act, including passive joints."""
-    noise = motion.velocity_noise()
-    if hasattr(model, "joint_noise"):
-        return model.joint_noise(noise)
-    return noise
-
-
-def _drowned_signs(model: IdentificationModel, columns: np.ndarray, case: Case) -> np.ndarray:
-    """Return the mask (p,) of Coulomb columns of joints whose velocity noise exceeds the smoothing of the sign."""
-    noise = sign_noise(model, case.motion)
-    drowned = np.zeros(len(columns), dtype=bool)
-    for position, k in enumerate(columns - model.inertial):
-        if k < 0 or model.columns[k].shape != "sign":
-            continue
-        term = model.columns[k]
-        speeds = []
-        for _, motion in term.acts:
-            joint_noise = [weight * noise[joint] for joint, weight in motion]
-            speeds.append(float(np.hypot.reduce(joint_noise)))
-        drowned[position] = max(speeds) > term.settings[0]
-    return drowned
+def _sign_columns(task: _Fixed, case: Case) -> np.ndarray:
+    """Return the columns (M, rows, k) of a case's drive terms whose value jumps with the sign of the speed."""
+    base_signs, richer_signs = task.signs
+    matrix = observe(task.model, task.base.kept[base_signs], case, task.decimator).matrix
+    if not richer_signs.any():
+        return matrix
+    return np.concatenate([matrix, task.friction.columns(case)[:, :, richer_signs]], axis=2)
 
 
 def _result(
@@ -554,6 +532,7 @@ def _result(
         problem,
         task.estimator,
         tuple(rows),
+        tuple(task.noise),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from calib.dynamics.drives import DriveTerm
 from calib.errors import CalibError, Finding, UsageError, finding
 from calib.estimation.triangles import Triangles
-from calib.identification.closed_loop.instrumental import Instrumental, identify_instrumental, sign_noise
+from calib.identification.closed_loop.instrumental import Instrumental, identify_instrumental
 from calib.identification.closed_loop.loop_recordings import ClosedLoops, close_loops
 from calib.identification.closed_loop.simulation import simulable
 from calib.identification.loop import LoopDisagreement, LoopMetrics, LoopResults
@@ -49,7 +49,14 @@ class LoopEstimate(MethodEstimate):
 def attempted_in_loop(
     method: str, problem: IdentificationProblem, loops: ClosedLoops, run: Callable[[], MethodEstimate]
 ) -> LoopEstimate:
-    """Return the result of `run` with the loops and its computing time; an estimation's failure becomes a status."""
+    """Return the result of `run` with the loops and its computing time; an estimation's failure becomes a status.
+
+    Args:
+        method: name of the method.
+        problem: data and settings, with which a failure is recorded.
+        loops: closed loops that `run` simulates.
+        run: function that makes the estimate.
+    """
     estimate = attempted(method, problem, run)
     if isinstance(estimate, LoopEstimate):
         return estimate
@@ -124,6 +131,7 @@ class _Simulated(Method):
                 positive=loop.positive,
                 terms=terms,
                 constraints=constraints,
+                say=problem.say,
             )
             simulations = 0
             for iteration in identification.rounds:
@@ -207,13 +215,17 @@ class LoopTest:
             return [finding("loop-test-failed", why=self.failure)]
         causes = _distance(self.found) or _gains(self.found) or _torques(self.found)
         noticed = [*_weakness(self.found), *causes]
-        return noticed + (_blurred(self.found, self.loops) if is_estimate else _biased(self.found))
+        return noticed if is_estimate else noticed + _biased(self.found)
 
 
 def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
     """Return the test of an estimate by instrumental variables (IV), with the closed loop of the problem.
 
     An IV estimate is its own comparison. For an estimate of another method, a failure of IV is part of the result.
+
+    Args:
+        problem: data and settings, with the closed loop.
+        estimate: the user's estimate.
     """
     loop_estimate = None
     if isinstance(estimate, LoopEstimate) and estimate.instrumental is not None:
@@ -248,7 +260,11 @@ def _distance(identification: Instrumental) -> list[Finding]:
 
 
 def _gains(identification: Instrumental) -> list[Finding]:
-    """Return the finding on joints whose stated gains differ from the gains during the recording."""
+    """Return the finding on joints whose stated gains differ from the gains during the recording.
+
+    Args:
+        identification: estimate by instrumental variables, with the gains that the simulation suggests.
+    """
     joints = [f"{identification.stray[j]:.2g} times at joint {j + 1}" for j in identification.off]
     if joints:
         return [finding("loop-gains-off", joints=joints)]
@@ -256,7 +272,11 @@ def _gains(identification: Instrumental) -> list[Finding]:
 
 
 def _torques(identification: Instrumental) -> list[Finding]:
-    """Return the finding on torque rows that are explained by the measured motion but not by the simulated motion."""
+    """Return the finding on torque rows that are explained by the measured motion but not by the simulated motion.
+
+    Args:
+        identification: estimate by instrumental variables, with the simulation's errors.
+    """
     case = identification.rows[0][0]
     direct = identification.direct
     iv_torques = identification.own
@@ -268,7 +288,11 @@ def _torques(identification: Instrumental) -> list[Finding]:
 
 
 def _biased(identification: Instrumental) -> list[Finding]:
-    """Return the finding that least squares is biased; none if the bias is small or the simulation fits poorly."""
+    """Return the finding that least squares is biased; none if the bias is small or the simulation fits poorly.
+
+    Args:
+        identification: estimate by instrumental variables, with its test of least squares.
+    """
     # standard deviations of a shift that is worth a word (our choice)
     shift = identification.shift
     min_shift = 1.0
@@ -281,24 +305,6 @@ def _biased(identification: Instrumental) -> list[Finding]:
         return []
     names = [f"{identification.names[k]} by {shift[k]:.2g} σ" for k in np.argsort(-shift)[:5]]
     return [finding("least-squares-biased", p=identification.verdict.p, names=names)]
-
-
-def _blurred(identification: Instrumental, loops: ClosedLoops) -> list[Finding]:
-    """Return the finding that a joint's Coulomb sign is mainly velocity noise, which instruments cannot correct."""
-    if not identification.estimator.measured:
-        return []
-    # widths of the sign (our choice)
-    noise = sign_noise(identification.plant, loops.pairs[0][0].motion)
-    max_blur = 3.0
-    signs = [term for term in identification.plant.terms if term.shape == "sign"]
-    blurred = {}
-    for sign in signs:
-        joint = sign.acts[0][0]
-        blurred[sign.name] = noise[joint] / sign.settings[-1]
-    joints = [f"{size:.2g} at {name}" for name, size in blurred.items() if size > max_blur]
-    if joints:
-        return [finding("noisy-signs", joints=joints)]
-    return []
 
 
 # of both together, by which a parameter differs surely (our choice)
@@ -349,7 +355,12 @@ def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test:
 
 
 def _factors(problem: IdentificationProblem, estimate: np.ndarray, reference: np.ndarray) -> tuple[float, ...]:
-    """Return for each torque row the ratio of two estimates' torques (regression slope)."""
+    """Return for each torque row the ratio of two estimates' torques (regression slope).
+
+    Args:
+        problem: data and settings.
+        estimate, reference: (p,) parameters; the ratios are torques of `estimate` over those of `reference`.
+    """
     factors = problem.pooled.factors[:, :, :-1]
     own_values = factors @ estimate
     reference_values = factors @ reference
@@ -360,7 +371,12 @@ def _factors(problem: IdentificationProblem, estimate: np.ndarray, reference: np
 
 
 def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopResults:
-    """Return the results of simulating an estimate's loop, in the form that is stored and printed."""
+    """Return the results of simulating an estimate's loop, in the form that is stored and printed.
+
+    Args:
+        problem: data and settings; without a loop the results are empty.
+        estimate: the user's estimate.
+    """
     test = compare_with_loop(problem, estimate)
     is_estimate = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
     table: tuple[tuple[object, ...], ...] = ()
@@ -392,6 +408,13 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
             f"with the instruments of unbound parameters alone (Janot's form) the estimate is at most "
             f"{distance.max():.2g} σ away, at {identification.names[int(np.argmax(distance))]}",
         )
+    shares = np.array([noise.share for noise in identification.noise]).min(axis=0)
+    by_joint = ", ".join(f"{100 * share:.0f}" for share in shares)
+    notes = (
+        f"share of the position noise that the controller answers, by joint: {by_joint} %; Coulomb signs are averaged "
+        "over the noise, simulated in the loop by this share",
+        *notes,
+    )
     rounds = len(identification.rounds)
     largest_shift_sigma = float(identification.shift.max())
     least_partial_r2 = float(strength.partial_r2.min())
@@ -418,7 +441,11 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
 
 
 def _table(identification: Instrumental) -> tuple[tuple[object, ...], ...]:
-    """Return a table that compares IV and least-squares estimates of the standard model, one row per parameter."""
+    """Return a table that compares IV and least-squares estimates of the standard model, one row per parameter.
+
+    Args:
+        identification: estimate by instrumental variables, with the least-squares estimate.
+    """
     estimate = identification.fit.estimate
     ordinary = identification.ordinary.estimate.values
     explained = 100.0 * identification.strength.partial_r2

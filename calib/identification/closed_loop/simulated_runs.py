@@ -56,15 +56,16 @@ def regular_plant(
 
 def simulated_runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
     """Return noise-free simulations of the loops of all recordings."""
-    result: Runs = []
-    for case, loop in cases:
-        robot = plant.carrying(case.carried)
-        controller = loop.controller
-        if loop.design is not None:
-            controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
-        run = robot.run(controller, loop.reference, Sensing(every=loop.every))
-        result.append(((case, loop), run))
-    return result
+    return [((case, loop), simulated_run(plant, case, loop, Sensing(every=loop.every))) for case, loop in cases]
+
+
+def simulated_run(plant: Plant, case: Case, loop: Loop, sensing: Sensing, seed: int = 0) -> SimulatedRun:
+    """Return the simulation of a recording's loop with the recording's payloads."""
+    robot = plant.carrying(case.carried)
+    controller = loop.controller
+    if loop.design is not None:
+        controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
+    return robot.run(controller, loop.reference, sensing, seed)
 
 
 def between(start: Plant, end: Plant, share: float) -> Plant:
@@ -76,6 +77,10 @@ def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tupl
     """Return a robot between `start` and `end` that can be simulated, with its simulations.
 
     The robot is halfway, or nearer to `start` if that robot cannot be simulated.
+
+    Args:
+        start, end: robots with different parameters; `start` can be simulated.
+        cases: gap-free parts of recordings, each with its loop.
 
     Raises:
         CannotSimulate: if no robot near `start` can be simulated.
@@ -91,7 +96,11 @@ def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tupl
 
 
 def distance_percent(runs: Runs) -> np.ndarray:
-    """Return the rms difference of simulated and recorded positions (n,), relative to the motion's rms [%]."""
+    """Return the rms difference of simulated and recorded positions (n,), relative to the motion's rms [%].
+
+    Args:
+        runs: simulations of the recordings' loops.
+    """
     n = runs[0][0][0].motion.n
     away, size = np.zeros((2, n))
     for (case, loop), run in runs:
@@ -104,7 +113,11 @@ def distance_percent(runs: Runs) -> np.ndarray:
 
 
 def error_ratio(runs: Runs) -> np.ndarray:
-    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN if noise hides the ratio."""
+    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN if noise hides the ratio.
+
+    Args:
+        runs: simulations of the recordings' loops.
+    """
     measured_errors = []
     expected_errors = []
     for (case, loop), run in runs:

@@ -52,10 +52,12 @@ class BodyCone(Frozen):
     def touching(self, factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> _Plane | None:
         """Return the cone's tangent plane at argmin ½ ‖R β - z‖² under lower <= A β <= upper and the cone.
 
+        β (p,) are the parameters of the columns, base parameters first.
+
         The result is None if the cone is not binding.
 
         Args:
-            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ]; base columns first.
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem in β; base columns first.
             matrix: A (c, p).
             lower, upper: (c,) bounds, -inf and inf allowed.
 
@@ -118,7 +120,12 @@ class BodyCone(Frozen):
 
 
 def cone_of(model: RegressorModel, base: Base) -> BodyCone:
-    """Return the cone of physically consistent base parameters of a model."""
+    """Return the cone of physically consistent base parameters of a model.
+
+    Args:
+        model: model of standard parameters.
+        base: its base parameters.
+    """
     labels = tuple(name.removeprefix("XX") for name in model.names[: model.inertial : 10])
     positive = [column.nonnegative for column in model.columns]
     return BodyCone(np.asarray(base.transform), labels, np.array(positive, dtype=bool))

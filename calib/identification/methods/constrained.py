@@ -46,7 +46,11 @@ class Definite:
         return values[:, 0] - self.least, np.asarray(products[:, 0])
 
     def satisfied(self, sizes: np.ndarray) -> bool:
-        """Return whether the smallest eigenvalues, given minus `least` as `sizes` (K,), satisfy the constraint."""
+        """Return whether the smallest eigenvalues, given minus `least` as `sizes` (K,), satisfy the constraint.
+
+        Args:
+            sizes: smallest eigenvalue of each of the K matrices, minus `least`.
+        """
         # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
         max_violation = 1e-3
         return bool((sizes >= -max_violation * self.least).all())
@@ -87,7 +91,8 @@ def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> t
 def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Return the covariance P C Pᵀ of an estimate under A b = d, from the covariance C of the unconstrained estimate.
 
-    P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A with Q = RᵀR. C may also be a covariance for correlated residuals.
+    P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A with Q = RᵀR, R (p, p) the triangular factor of the observation matrix. C may also be a
+    covariance for correlated residuals.
 
     Args:
         covariance: C (p, p).
@@ -145,11 +150,12 @@ def within(
 ) -> Constrained:
     """Return the optimum of min ½ ‖R b - z‖² under lower <= A b <= upper and definite matrices.
 
-    Equal bounds are an equality; infinite bounds are ignored. Multipliers, slack, binding and normals have the order:
-    finite lower bounds, finite upper bounds, matrices, equalities. Multipliers of equalities have either sign.
+    R (p, p) and z (p,) are the data's triangle, b (p,) the unknowns. Equal bounds are an equality; infinite bounds are
+    ignored. Multipliers, slack, binding and normals have the order: finite lower bounds, finite upper bounds, matrices,
+    equalities. Multipliers of equalities have either sign.
 
     Args:
-        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ], R of full rank.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem in b, R of full rank.
         matrix: A (c, p); the identity for bounds on single parameters.
         lower, upper: (c,), -inf and inf allowed.
         matrices: matrices that must be positive definite; None: no matrices.
@@ -340,7 +346,14 @@ def _frozen(*parts: np.ndarray) -> Constrained:
 
 
 def _widened(solution: Constrained, position: int, normals: np.ndarray, slack: np.ndarray) -> Constrained:
-    """Return the optimum with further inequalities, which are not binding, inserted at index `position`."""
+    """Return the optimum with further inequalities, which are not binding, inserted at index `position`.
+
+    Args:
+        solution: the optimum without the further inequalities.
+        position: index of the first inserted inequality in the order of `within`.
+        normals: (k, p) their derivatives.
+        slack: (k,) their distances to the bounds.
+    """
     zero = np.zeros(len(slack))
     multipliers = np.insert(solution.multipliers, position, zero)
     all_slack = np.insert(solution.slack, position, slack)

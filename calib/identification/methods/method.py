@@ -59,13 +59,14 @@ class IdentificationProblem:
         rows: observation matrix and torques of each case; p columns, base columns first, then additional friction.
         terms: (p,) drive term of each column; None for parameters of bodies.
         groups: (p,) ridge group of each column of additional friction; -1 for base columns.
-        noise: (rows,) standard deviation of the torques, up to a common factor; None: from their residuals.
+        noise: (rows,) standard deviation of the torques' noise, up to a common factor; None: from the residuals.
         prior: prior of the base parameters; None without one.
         loop: the closed loop in which the recordings were made; None if not stated.
         cad: standard parameters of the bodies from the robot's description, for a loop that feeds them forward; None:
             unknown.
         constraints: constraints of the options, for methods that support them; None: the defaults.
         start: (p,) start values of methods that simulate; None: least squares, if that robot can be simulated.
+        progress: called with a short text at each round of a method that simulates; None: not called.
     """
 
     model: RegressorModel
@@ -81,9 +82,15 @@ class IdentificationProblem:
     cad: np.ndarray | None = None
     constraints: ConstraintSettings | None = None
     start: np.ndarray | None = None
+    progress: Callable[[str], None] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", frozen(self.groups, int))
+
+    def say(self, text: str) -> None:
+        """Call `progress`, if there is one, with a short text."""
+        if self.progress is not None:
+            self.progress(text)
 
     @cached_property
     def pooled(self) -> Triangles:
@@ -263,7 +270,13 @@ class Method(ABC):
 
 
 def attempted(method: str, problem: IdentificationProblem, run: Callable[[], MethodEstimate]) -> MethodEstimate:
-    """Return the result of `run` with its computing time; a failure of the estimation becomes a status."""
+    """Return the result of `run` with its computing time; a failure of the estimation becomes a status.
+
+    Args:
+        method: name of the method.
+        problem: data and settings, with which a failure is recorded.
+        run: function that makes the estimate.
+    """
     began = time.perf_counter()
     try:
         estimate = run()

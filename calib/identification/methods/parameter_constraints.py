@@ -69,7 +69,7 @@ class Constraints(Frozen):
         """Return argmin ½ ‖R β - z‖² under these constraints, computed by `constrained.within`.
 
         Args:
-            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ].
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem in the parameters β.
             free: (p,) unconstrained β, which gives the scale of M(q); None: the least-squares solution of the triangle.
 
         Raises:
@@ -90,7 +90,7 @@ class Constraints(Frozen):
         return "; ".join(self.names) or "them"
 
     def raised(self) -> Constraints | None:
-        """Return the constraints with a three times larger bound on M(q)'s smallest eigenvalue.
+        """Return the constraints with a three times larger bound on the inertia matrix M(q)'s smallest eigenvalue.
 
         The result is None if the bound would exceed `MAX_EIGENVALUE`. A robot may have a positive definite inertia
         matrix, but so little inertia in some direction that a sampled controller cannot stabilise it.
@@ -125,7 +125,11 @@ class Constraints(Frozen):
         return replace(self, cone=None, plane=label, names=names, matrix=matrix, lower=lower, upper=upper)
 
     def _flattened(self, factor: np.ndarray) -> Constraints:
-        """Return the constraints with the curved ones replaced by their tangent planes at the optimum."""
+        """Return the constraints with the curved ones replaced by their tangent planes at the optimum.
+
+        Args:
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ], which defines the optimum.
+        """
         linear = replace(self, curved=())
         m = len(self.curved)
         start = linear.solve(factor).values
@@ -134,7 +138,13 @@ class Constraints(Frozen):
         free = np.append(least_squares, np.zeros(m))
 
         def solve(triangle: np.ndarray, rows: np.ndarray, lower: np.ndarray) -> Constrained:
-            """Return the optimum of parameters and m further unknowns, under more inequalities rows · b >= lower."""
+            """Return the optimum of parameters and m further unknowns, under more inequalities rows · b >= lower.
+
+            Args:
+                triangle: (p + m + 1, p + m + 1) upper triangle of the problem.
+                rows: (k, p + m) rows of the further inequalities.
+                lower: (k,) their lower bounds.
+            """
             wider = np.pad(self.matrix, ((0, 0), (0, m)))
             names = ("",) * len(rows) + self.names
             matrix = np.vstack([rows, wider])
@@ -252,9 +262,9 @@ def hold(
 
     Args:
         fit: the unconstrained estimate.
-        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of its least-squares problem.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of its least-squares problem min ‖R β - z‖².
         data: R factors of the rows whose residuals give the noise, one group per torque row.
-        std: (g,) standard deviations of the groups.
+        std: (g,) noise standard deviations of the groups, in units of y.
         constraints: the constraints.
         stated_noise: whether `std` is the noise from which the covariance follows; otherwise σ² of the constrained
             estimate's residuals.
@@ -284,7 +294,13 @@ def hold(
 
 
 def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -> Held:
-    """Return the constraints, and which of them bind at a solution; the solution has the order of `within`."""
+    """Return the constraints, and which of them bind at a solution.
+
+    Args:
+        constraints: the constraints.
+        solution: the constrained optimum, in the order of `within`.
+        free: the unconstrained estimate.
+    """
     equal = constraints.lower == constraints.upper
     low = np.flatnonzero(np.isfinite(constraints.lower) & ~equal)
     high = np.flatnonzero(np.isfinite(constraints.upper) & ~equal)
@@ -345,6 +361,11 @@ def _words(name: str, low: float, high: float) -> str:
 def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.ndarray:
     """Return the row a (p,) of a weighted sum of columns and standard parameters, so that the sum is aᵀ β.
 
+    Args:
+        weights: name of a column or standard parameter to its weight.
+        base: base parameters of the model.
+        names: (p,) names of the columns.
+
     Raises:
         UsageError: if the torques do not identify the sum, or a name is unknown.
     """
@@ -372,7 +393,12 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
 
 
 def _without_effect(weights: Mapping[str, float], base: Base) -> str:
-    """Return the text why a weighted sum of standard parameters cannot be constrained."""
+    """Return the text why a weighted sum of standard parameters cannot be constrained.
+
+    Args:
+        weights: name of a standard parameter to its weight.
+        base: base parameters of the model.
+    """
     silent = [name for name in weights if name in base.without_effect]
     if silent:
         return f"{', '.join(silent)} has no effect on the torques of this robot: remove the bound"
@@ -386,6 +412,12 @@ def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p:
     """Return the tensor (K, n, n, p) of the inertia matrices at random postures, M(q_k) = tensor[k] β.
 
     K is 0 if the constraint is not requested, or the rows are not those of all joint torques.
+
+    Args:
+        settings: table [constraints], with the number K of postures.
+        model: the model.
+        base: its base parameters.
+        p: number of columns.
     """
     if not settings.inertia or not model.inertial or model.rows != model.n:
         return np.zeros((0, model.n, model.n, p))
@@ -406,6 +438,12 @@ def _definite(inertia: np.ndarray, free: np.ndarray, least: float, likely: np.nd
     """Return the constraint on the scaled inertia matrices S M(q) S; None without matrices.
 
     S scales the mean diagonal at the unconstrained estimate `free` (p,) to one.
+
+    Args:
+        inertia: (K, n, n, p) inertia matrices M(q_k) = inertia[k] β.
+        free: (p,) unconstrained estimate.
+        least: lower bound of the eigenvalues of S M(q) S.
+        likely: indices of matrices that were binding in a similar problem; None: unknown.
     """
     if not len(inertia):
         return None

@@ -3,7 +3,7 @@
     CLOE    min Σ_k ‖q_k - q_s,k(χ)‖²        the simulated robot moves as the real one
     CLIE    min Σ_k ‖tau_k - tau_s,k(χ)‖²    the simulated robot's controller requires the recorded torques
 
-q_s and tau_s are those of the loop simulated without noise (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau
+q_s and tau_s are those of the simulated loop (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau
 1979; Gautier, Janot & Vandanjon 2013), and each joint is weighted by its residuals. With joint torque sensors (rows
 link, both) both methods also compare the sensors' torques, which are outputs of the loop: simulated torques are those
 of the bodies and the link side along the simulated motion, filtered like the recorded motion (our choice).
@@ -14,9 +14,15 @@ redundant actuators are compared in the platform's coordinates, as in least squa
 noise in the loop and autocorrelated; the covariance H⁻¹ S H⁻¹ accounts for this, with S the covariance of the gradient
 (`score_covariance`).
 
+The source simulates without noise. If the torques show noise in the recording's loop (`sign_noise`), the mean of two
+runs with opposite noise is taken here, because an arm that shakes has less Coulomb friction in the mean (our choice).
+Robots without tangents are simulated without noise.
+
 The method that some slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is DIDIM in the survey and
 here.
 """
+
+from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
@@ -32,18 +38,22 @@ from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import condition_numbers, require_rank
 from calib.identification.closed_loop.loop_recordings import (
     ClosedLoops,
+    Loop,
     close_loops,
     followed,
     low_passed,
     simulated_samples,
 )
+from calib.identification.closed_loop.sign_noise import SEED, position_noise
 from calib.identification.closed_loop.simulated import attempted_in_loop
 from calib.identification.closed_loop.simulation import Plant, Sensing
+from calib.identification.loop import LoopController
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate
 from calib.identification.rows import Case, thinned
 from calib.identification.survey.score_covariance import scatter
 from calib.identification.survey.simulated_robot import BelievedRobot, Sensitivities, believed_robot, start_of
+from calib.records import field_values
 
 
 @dataclass(frozen=True)
@@ -87,13 +97,14 @@ class _OutputError(Method):
         task = _Comparison(problem, robot, loops, self.torques)
         return attempted_in_loop(self.name, problem, loops, lambda: self._estimate(problem, plain, task))
 
-    def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, task: "_Comparison") -> MethodEstimate:
+    def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, task: _Comparison) -> MethodEstimate:
         loops = task.loops
         with np.errstate(divide="ignore", invalid="ignore"):
             inertia = loops.controller.kd**2 / (2.0 * loops.controller.kp)
         inertia = np.where(np.isfinite(inertia) & (inertia > 0.0), inertia, 1.0)
         values = start_of(problem, plain.estimate.values, inertia, lambda x: task.simulated(task.whole(x, inertia)))
         values = task.whole(values, inertia)
+        task = task.with_noise(values)
         first, _ = task.linearised(values)
         std = task.spread(first, 0)
         count = 1
@@ -143,6 +154,7 @@ class _Comparison:
         loops: closed loops of the recordings.
         torques: whether motor torques are compared instead of positions.
         count: number of simulations so far, in a list of one entry.
+        noise: (N, n) noise of the measured positions in each loop [rad or m], drawn once; None for loops without.
     """
 
     problem: IdentificationProblem
@@ -150,6 +162,7 @@ class _Comparison:
     loops: ClosedLoops
     torques: bool
     count: list[int] = field(default_factory=lambda: [0])
+    noise: tuple[np.ndarray | None, ...] = ()
 
     @property
     def rows(self) -> TorqueRows:
@@ -173,6 +186,9 @@ class _Comparison:
     def simulated(self, values: np.ndarray) -> None:
         """Simulate all loops with parameters (p,), to check that this is possible.
 
+        Args:
+            values: (p,) parameters of the problem.
+
         Raises:
             CalibError: if a loop cannot be simulated.
         """
@@ -186,10 +202,14 @@ class _Comparison:
             plant.run(controller, loop.reference, Sensing(every=loop.every))
 
     def linearised(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (M, r), zero if not in use, and the Jacobian (M, r, p) of the simulated signals."""
+        """Return residuals (M, r), zero if not in use, and the Jacobian (M, r, p) of the simulated signals.
+
+        Args:
+            values: (p,) parameters, at which the signals are simulated.
+        """
         residuals = []
         slopes = []
-        for case, loop in self.loops.pairs:
+        for (case, loop), drawn in zip(self.loops.pairs, self.noise, strict=True):
             plant = self.robot.at(values, case)
             controller = loop.controller
             relative = None
@@ -197,8 +217,7 @@ class _Comparison:
                 diagonal = plant.inertia_diagonal(loop.reference.q[::200])
                 controller = controller.scaled(diagonal / loop.design)
                 relative = self._inertia_slopes(loop.reference.q[::200]) / diagonal[:, None]
-            self.count[0] += 1
-            run = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative)
+            run = self._mean_run(values, case, controller, loop, relative, drawn)
             index = simulated_samples(case, run.t, loop)
             motion = case.motion
             # Residuals and their slopes, in the order of the rows.
@@ -229,6 +248,36 @@ class _Comparison:
             residuals.append(np.where(in_use, residual, 0.0))
             slopes.append(np.where(in_use[:, :, None], slope, 0.0))
         return np.concatenate(residuals), np.concatenate(slopes)
+
+    def with_noise(self, values: np.ndarray) -> _Comparison:
+        """Return the comparison with the recordings' noise in the loop, as their torques answer it."""
+        if self.robot.steps is not None:
+            return replace(self, noise=(None,) * len(self.loops.pairs))
+        noise = []
+        for case, loop in self.loops.pairs:
+            sigma = position_noise(self.robot.at(values), case, loop).loop
+            drawn = np.random.default_rng(SEED).normal(size=loop.reference.q.shape) * sigma
+            noise.append(drawn if np.any(sigma) else None)
+        return replace(self, noise=tuple(noise))
+
+    def _mean_run(
+        self,
+        values: np.ndarray,
+        case: Case,
+        controller: LoopController,
+        loop: Loop,
+        relative: np.ndarray | None,
+        drawn: np.ndarray | None,
+    ) -> Sensitivities:
+        """Return the mean of runs with noise `drawn` in the loop and with its opposite; one run where there is none."""
+        self.count[0] += 1
+        first = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative, drawn)
+        if drawn is None:
+            return first
+        self.count[0] += 1
+        second = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative, -drawn)
+        means = {name: 0.5 * (value + getattr(second, name)) for name, value in field_values(first).items()}
+        return Sensitivities(**means)
 
     def _sensed(self, plant: Plant, case: Case, run: Sensitivities, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals (N, n) of the sensors' torques [N m or N], and the Jacobian (N, n, p) of simulated torques.
@@ -269,6 +318,10 @@ class _Comparison:
         """Return residuals (M r,) and Jacobian (M r, p), divided by std (r,).
 
         If the simulation fails, the residuals are huge and the Jacobian is zero.
+
+        Args:
+            values: (p,) parameters, at which the signals are simulated.
+            std: (r,) standard deviations of the residuals.
         """
         p = len(values)
         # residual of parameters that cannot be simulated: any step that can is better
@@ -281,7 +334,12 @@ class _Comparison:
         return (residual / std).ravel(), np.asfortranarray(scaled_slopes)
 
     def solved(self, values: np.ndarray, std: np.ndarray) -> nonlinear.Solution[np.ndarray]:
-        """Return the parameters that minimise the residuals divided by std (r,), with convergence."""
+        """Return the parameters that minimise the residuals divided by std (r,), with convergence.
+
+        Args:
+            values: (p,) first parameters.
+            std: (r,) standard deviations of the residuals.
+        """
         # at first
         first_damping = 1e-3
         # simulations with tangents per round
@@ -290,7 +348,11 @@ class _Comparison:
         step_tolerance = 0.05
 
         def linearise(x: np.ndarray) -> nonlinear.Reduced:
-            return nonlinear.triangle(*self.whitened(x, std))
+            residual, slopes = self.whitened(x, std)
+            rms = float(np.sqrt(np.mean(residual**2)))
+            compared = "torques" if self.torques else "positions"
+            self.problem.say(f"{compared} compared after {self.count[0]} simulations: residual {rms:.4g} σ")
+            return nonlinear.triangle(residual, slopes)
 
         def moved(x: np.ndarray, step: np.ndarray) -> np.ndarray:
             return x + step
@@ -315,7 +377,12 @@ class _Comparison:
 
 
 def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of the estimate for white residuals."""
+    """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of the estimate for white residuals.
+
+    Args:
+        residual: (M, r) residuals divided by their standard deviations.
+        slopes: (M, r, p) their Jacobian.
+    """
     p = slopes.shape[2]
     flat = slopes.reshape(-1, p)
     orthonormal, _ = np.linalg.qr(flat)
@@ -337,7 +404,7 @@ def _packed(
         plain: the least-squares estimate, for names and units.
         values: (p,) parameters.
         residual, slopes: (M, r) residuals and (M, r, p) Jacobian.
-        std: (r,) standard deviations.
+        std: (r,) standard deviations of the residuals [rad, m, N m or N].
 
     Raises:
         Unidentifiable: if the simulated motion does not distinguish parameters.

@@ -34,7 +34,7 @@ from calib.records import frozen, shaped
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """Simulated noise-free motion of M samples, and its derivatives by c parameters.
+    """Simulated motion of M samples, and its derivatives by c parameters.
 
     Attributes:
         t: (M,) times [s].
@@ -58,8 +58,9 @@ def simulate_tangents(
     columns: np.ndarray,
     every: float = 1,
     relative: np.ndarray | None = None,
+    noise: np.ndarray | None = None,
 ) -> Sensitivities:
-    """Return a noise-free simulated motion along a reference, with exact derivatives by the parameters.
+    """Return a simulated motion along a reference, with exact derivatives by the parameters.
 
     Args:
         plant: robot whose friction depends on position and velocity alone.
@@ -69,6 +70,7 @@ def simulate_tangents(
         every: control periods per sample.
         relative: (n, c) derivatives of the logarithm of all gains of a joint by the parameters, if the gains depend on
             them (`calib.identification.closed_loop.loop_recordings.Loop.design`); None: the gains are constant.
+        noise: (N, n) noise of the measured positions, on which the controller acts [rad or m]; None: none.
 
     Raises:
         CannotSimulate: if the inertia matrix is not positive definite, or friction too stiff.
@@ -106,6 +108,7 @@ def simulate_tangents(
         controller.rows,
         scale,
         reference.sampled(controller.ahead),
+        np.empty((0, n)) if noise is None else np.ascontiguousarray(shaped(noise, reference.q.shape, "noise")),
         reference.period,
         controller.smoothing(reference.period),
         controller.delay,
@@ -183,7 +186,7 @@ class Stepper:
         Args:
             parameters: (K, p) parameters of the robot for each state.
             q, v: (K, n) states.
-            tau: (n,) torque, held for the period.
+            tau: (n,) drive torques [N m or N], held for the period.
             period: duration [s].
 
         Raises:
@@ -209,7 +212,7 @@ class Stepper:
         Args:
             parameters: (p,) parameters of the robot.
             q, v: (n,) state.
-            tau: (n,) torque, held for the period.
+            tau: (n,) drive torques [N m or N], held for the period.
             period: duration [s].
             columns: number c of parameters in the Jacobian.
 
@@ -232,7 +235,12 @@ class Stepper:
 
 
 def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
-    """Return a robot prepared for single time steps, with derivatives by the parameters of indices `columns` (c,)."""
+    """Return a robot prepared for single time steps, with derivatives by the parameters of indices `columns` (c,).
+
+    Args:
+        plant: the robot.
+        columns: (c,) indices of the parameters.
+    """
     find = np.full(len(plant.parameters), -1)
     numbers = 2 * plant.bodies.n + np.arange(len(columns))
     find[np.asarray(columns, dtype=int)] = numbers
@@ -263,7 +271,12 @@ class BelievedRobot:
     steps: np.ndarray | None = None
 
     def at(self, values: np.ndarray, case: Case | None = None) -> Any:
-        """Return the simulated robot with parameters (p,) and the payloads of a case; None: all payloads."""
+        """Return the simulated robot with parameters (p,) and the payloads of a case; None: all payloads.
+
+        Args:
+            values: (p,) parameters of the problem.
+            case: recording with its payloads; None: all payloads are attached.
+        """
         parameters = np.zeros(len(self.plant.parameters))
         parameters[self.columns] = values
         plant = self.plant.with_parameters(parameters)
@@ -279,6 +292,7 @@ class BelievedRobot:
         reference: Reference,
         every: float,
         relative: np.ndarray | None = None,
+        noise: np.ndarray | None = None,
     ) -> Sensitivities:
         """Return the simulated motion with parameters (p,) and its derivatives by them.
 
@@ -291,11 +305,12 @@ class BelievedRobot:
             reference: reference sampled at the controller's rate.
             every: control periods per sample.
             relative: (n, p) derivatives of the logarithm of the gains by the parameters; None: the gains are constant.
+            noise: (N, n) noise of the measured positions [rad or m]; ignored for a robot without tangents.
         """
         plant = self.at(values, case)
         if self.steps is not None:
             return simulate_differences(plant, controller, reference, self.columns, self.steps, every)
-        sensitivities = simulate_tangents(plant, controller, reference, self.columns, every, relative)
+        sensitivities = simulate_tangents(plant, controller, reference, self.columns, every, relative, noise)
         carried = self.carried(case)
         by_q = sensitivities.by_q * carried
         by_v = sensitivities.by_v * carried
@@ -310,6 +325,10 @@ class BelievedRobot:
 
 def serial_arm(problem: IdentificationProblem, method: Method) -> IdentificationModel:
     """Return the model of a problem, which must be a serial arm with torque rows that the method supports.
+
+    Args:
+        problem: data and settings.
+        method: the method that simulates.
 
     Raises:
         UsageError: for any other model.
@@ -363,7 +382,12 @@ def believed_robot(problem: IdentificationProblem, method: Method, steps: np.nda
 
 
 def with_friction(problem: IdentificationProblem, model: IdentificationModel) -> tuple[IdentificationModel, np.ndarray]:
-    """Return a problem's model with all friction terms, and the index (p,) of each of its parameters in this model."""
+    """Return a problem's model with all friction terms, and the index (p,) of each of its parameters in this model.
+
+    Args:
+        problem: data and settings, with p parameters.
+        model: the problem's model with standard friction.
+    """
     extra = [term for term in problem.terms[problem.base.b :] if term is not None]
     model = model.with_terms(*extra)
     extra_columns = range(model.p - len(extra), model.p)

@@ -59,10 +59,6 @@ class ParallelPlant:
         """Return the robot with these payloads on board."""
         return replace(self, carried=carried)
 
-    def joint_noise(self, noise: np.ndarray) -> np.ndarray:
-        """Return the velocity noise (n_t,) of all joints from that of the actuated ones; see `ParallelModel`."""
-        return self.model.joint_noise(noise)
-
     def inertia_diagonal(self, q: np.ndarray) -> np.ndarray:
         """Raise an error: gains proportional to inertia are not supported for parallel robots."""
         raise UsageError("[loop] design is for serial arms only; state the gains as they are")

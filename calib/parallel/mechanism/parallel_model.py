@@ -492,13 +492,6 @@ class ParallelModel:
         model = replace(self, terms=(*self.terms, *actuated_terms))
         return ParallelPlant(model, values)
 
-    def joint_noise(self, noise: np.ndarray) -> np.ndarray:
-        """Return the velocity noise (n_t,) of all joints at home from that of the actuated ones (n,)."""
-        at_home = loop_jacobians(self.mechanism, self.mechanism.home)
-        rate_by_reading = np.linalg.pinv(at_home.readings[0])
-        by_reading = at_home.joints[0] @ rate_by_reading
-        return np.sqrt(by_reading**2 @ noise**2)
-
     def load_cases(self) -> Loads:
         if self.payloads:
             return (None, ())

@@ -262,6 +262,8 @@ def _instrument(session: Session, metrics: FitMetrics) -> str:
         sigma = f"σ {1e6 * instrument.sigma_position:g} µm"
     if instrument.sigma_orientation:
         sigma += f", {1e3 * instrument.sigma_orientation:g} mrad"
+    if instrument.reference:
+        sigma += ", seen from a frame on the base that was measured with every row"
     return f"{instrument.name}, {measures}, {sigma}"
 
 

@@ -103,15 +103,21 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
             f"[deg] … {joints[-1]} [deg]; one row per image), board.toml (calib board makes boards), and camera.yaml "
             "if the lens is known (calib formats images)"
         )
+    base_frame = ""
+    if instrument.reference:
+        base_frame = " and, at the same time, the frame on the base"
     task = _numbered(
         f"Drive {poses}; at each let the arm settle.",
-        f"Measure the target's {instrument.measures} with the {instrument.name} and log the joint angles read back.",
+        f"Measure the target's {instrument.measures}{base_frame} with the {instrument.name} "
+        "and log the joint angles read back.",
         "At the end, measure the first three again to check for drift (optional, into drift.csv).",
     )
     columns = [f"{joint} [deg]" for joint in joints]
     columns += ["x [mm]", "y [mm]", "z [mm]"]
     if instrument.measures == "pose":
         columns += ["qx", "qy", "qz", "qw"]
+    if instrument.reference:
+        columns += ["base_x [mm]", "base_y [mm]", "base_z [mm]", "base_qx", "base_qy", "base_qz", "base_qw"]
     return task, (
         f"{' and '.join(files)}, one row per pose: {', '.join(columns)} (calib formats measurements), "
         "or joints and points apart, by calib join"
@@ -256,6 +262,7 @@ def new_session(
     seed: int = 0,
     program: str = "",
     tolerance_mm: float = 0.0,
+    reference: bool = False,
     certificate: Mapping[str, object] | None = None,
     **motion: object,
 ) -> Path:
@@ -274,6 +281,7 @@ def new_session(
         seed: seed of all random numbers.
         program: robot controller in whose language the poses are written, too (`calib program --list`); empty: none.
         tolerance_mm: largest accepted rms on held-out poses [mm]; 0: none.
+        reference: whether a frame on the robot's base is measured beside the target.
         certificate: keys of ``[certificate]``: entries of the certificate besides results; None: all are empty.
         motion: other keys of ``[dynamics]`` (``calib formats session``): torques, payloads, period …
 
@@ -290,6 +298,9 @@ def new_session(
     chain = load(robot, base or None, tip or None)
     if program:
         check_controller(program, chain.n)
+    of_instrument: dict[str, object] = asdict(device) | {"reference": reference}
+    if tool is not None:
+        of_instrument["tool"] = [*map(float, tool)]
     copied, named = _limits(limits, chain, source, dynamics)
     table = {
         "name": chain.name,
@@ -297,7 +308,7 @@ def new_session(
         "seed": seed,
         "fit": {"tolerance_mm": tolerance_mm},
         "robot": {"file": source.name, "given": str(robot), "base": base, "tip": tip, "controller": program},
-        "instrument": asdict(device) | ({} if tool is None else {"tool": [*map(float, tool)]}),
+        "instrument": of_instrument,
         "poses": {"fit": poses, "validation": validation, "constraints": named},
         "dynamics": {"wanted": dynamics, "limits": named, **motion},
         "certificate": dict(certificate or {}),

@@ -219,7 +219,7 @@ def _design(
     motion_folder.write_design(designed, session.path("6-excitation") / name, draw)
 
     condition, columns = designed.condition, len(designed.inputs.model.exact.names)
-    notes = [
+    notes: list[str | Note] = [
         f"{name}: {designed.period:g} s, condition number {condition.raw:.3g} raw, {condition.normalised:.3g} "
         f"normalised, {columns} columns; all limits are respected"
     ]

@@ -14,6 +14,7 @@ from calib.controllers.table import controller_named
 from calib.data.images.board import read_board
 from calib.data.images.lens import read_lens
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
+from calib.data.poses.measurements import Poses, Positions
 from calib.errors import CalibError, UsageError, one_of, refused_as, require
 from calib.procedure.answers import CAMERA, CELL, Answers, CertificateSection
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, checked_goal
@@ -100,6 +101,8 @@ class Question:
                 return not answers.cell
             case "cone" | "facing":
                 return "instrument" in cell_tables(instrument_at=answers.instrument_at)
+            case "reference":
+                return measures == Poses.kind
             case "mounting":
                 return camera
             case "lens" | "board" | "carried" | "stands":
@@ -126,6 +129,7 @@ def _questions() -> tuple[Question, ...]:
 DEFAULTS = {
     "robot": "",
     "instrument": "tracker",
+    "reference": "no",
     "tool": "0.05,0,0.05",
     "program": "none",
     "limits": "none",
@@ -177,7 +181,7 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
             value = int(text) if text.isdecimal() else text
         case "obstacles":
             value = [text]
-        case "dynamics" | "details":
+        case "dynamics" | "details" | "reference":
             value = {"y": True, "n": False}.get(text[:1].lower(), text)
     result = replace(answers, **{name: getattr(parse(Answers, {name: value}, ""), name)})
     if name == "program" and not is_empty:
@@ -208,6 +212,11 @@ def checked(answers: Answers) -> FieldValues:
         raise CalibError(
             f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}: leave it out"
         )
+    require(
+        not answers.reference or _measures(answers) in (Poses.kind, Positions.kind),
+        f"--reference applies to a target's pose or position; the instrument is {instrument}: leave it out",
+        UsageError,
+    )
     dynamics = answers.dynamics is not False
     for goal in answers.goals:
         checked_goal(goal)
@@ -236,6 +245,7 @@ def checked(answers: Answers) -> FieldValues:
     optional = {
         "payloads": stated_payloads(answers.payloads),
         "certificate": asdict(answers.certificate),
+        "reference": answers.reference,
         "tool": answers.tool,
         "program": answers.program,
         "torques": answers.torques,

@@ -17,6 +17,7 @@ from calib.config import described, parse, read_toml, strict
 from calib.config_types import Checked, Expect, Flag, Holdout, Name, NotNegative, OneOf, Seed, Text, Whole, shown
 from calib.data.poses import Loss, Model
 from calib.data.poses.fit_options import FitOptions, MetresOrZero, RadiansOrZero
+from calib.data.poses.measurements import Poses, Positions
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.registry import METHODS
@@ -114,6 +115,8 @@ class InstrumentSection:
         measures: pose (position and orientation), position or pixels; nothing: the geometry is not fitted
         sigma_position: standard deviation of one measurement, per axis [m]; 0: estimated from the residuals
         sigma_orientation: standard deviation of one measurement, per axis [rad]; 0: estimated from the residuals
+        reference: true: a frame on the robot's base is measured with every row (columns base_x …), and the target is
+            seen from there
         tool: approximate position of the target in the tip's frame; for pose selection only
     """
 
@@ -122,6 +125,13 @@ class InstrumentSection:
     sigma_position: MetresOrZero = 0.0
     sigma_orientation: RadiansOrZero = 0.0
     tool: Annotated[tuple[float, float, float], Expect("three numbers [m]")] = (0.05, 0.0, 0.05)
+    reference: Flag = False
+
+    def __post_init__(self) -> None:
+        if self.reference and self.measures not in (Poses.kind, Positions.kind):
+            raise ValueError(
+                f"reference = true applies to poses and positions; the instrument measures {self.measures}"
+            )
 
 
 @strict

@@ -94,11 +94,8 @@ def test_instruments_are_right_unlike_ols():
     assert all(result.verdict.biased() and result.valid for result in results)
 
 
-def test_drowned_sign_comes_from_simulation(monkeypatch):
-    """A velocity noise of many widths of the Coulomb sign shrinks its column of W: IV makes up by too much Fc.
-
-    Measured: Fc 26 and 38 % too large with the measured sign, 0.2 and 6 % with the simulated one.
-    """
+def test_mean_of_noisy_sign_is_restored(monkeypatch):
+    """A velocity noise of many widths of the Coulomb sign shrinks its column of W: IV makes up by too much Fc."""
     case = log(3e-3, 0, 0.02)
     place = [k for k, name in enumerate(arm(0.02)[2].names) if name.startswith("Fc")]
 
@@ -107,16 +104,16 @@ def test_drowned_sign_comes_from_simulation(monkeypatch):
         return float(np.abs(values / truth(0.02) - 1.0)[place].max())
 
     simulated, didim = wrong(), wrong(method="didim", limit=20)
-    monkeypatch.setattr(instrumental, "_drowned_signs", lambda model, columns, case: np.zeros(len(columns), bool))
+    monkeypatch.setattr(instrumental, "mean_signs", lambda columns, plant, case, *_: (columns(case), columns(case)))
     measured = wrong()
     assert didim < 0.01 and simulated < 0.08 and measured > 0.2
 
 
 @pytest.mark.slow
-def test_drowned_sign_where_simulation_lags(monkeypatch):
-    """With a fifth of the bandwidth the simulated reversals come late; with the right controller nothing changes.
+def test_noisy_sign_where_simulation_lags():
+    """With a fifth of the bandwidth the simulated reversals come late, and so does what is taken back of the noise.
 
-    Measured: 3 % off in place of 24, and 2.9 % with the right one.
+    Measured: 7.1 % off, and 0.8 % with the right one.
     """
     case, slow = log(1e-3, 1, 0.02), Loop(PD.slower(5.0), motion(), EVERY)
 
@@ -125,8 +122,7 @@ def test_drowned_sign_where_simulation_lags(monkeypatch):
         return float(np.linalg.norm((values - truth(0.02)) / np.abs(truth(0.02)).max()))
 
     here, there = wrong(), wrong(slow)
-    monkeypatch.setattr(instrumental, "MAX_FOLLOWING", np.inf)
-    assert wrong() == pytest.approx(here, rel=1e-3) and there < 0.3 * wrong(slow)
+    assert here < 0.02 and there < 0.1
 
 
 @pytest.mark.parametrize(("runs", "accused"), [(3, 0), pytest.param(12, 1, marks=pytest.mark.slow)])

@@ -1,0 +1,132 @@
+"""A planar arm of three joints in a closed loop, simulated by its textbook equations: no code of the toolkit.
+
+Absolute angles φ = cumsum(q), links of length l with mass m at c from the joint and inertia i about it:
+
+    μ_jk = Σ_i m_i a_ij a_ik,  a_ij = l_j (j < i), c_i (j = i);   M_jk = μ_jk cos(φ_j - φ_k) + δ_jk i_j
+    h_j = Σ_k μ_jk sin(φ_j - φ_k) φ̇_k² + g cos φ_j Σ_i m_i a_ij
+
+A PD controller at 1 kHz acts on measured positions and their backward difference, its torque is held over the period;
+classical Runge–Kutta steps of 0.25 ms.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+LENGTHS, CENTRES = np.array([0.5, 0.4, 0.2]), np.array([0.25, 0.18, 0.1])  # [m]
+MASSES, INERTIAS = np.array([5.0, 3.5, 1.5]), np.array([0.12, 0.06, 0.01])  # [kg], [kg m²]
+MOTORS, VISCOUS, COULOMB = np.array([1.2, 0.6, 0.15]), np.array([6.0, 4.0, 1.0]), np.array([8.0, 5.0, 1.5])
+WIDTH, GRAVITY, RATE, STEPS = 0.01, 9.81, 1000.0, 4  # of the sign [rad/s]; [m/s²]; [Hz]; per period
+FREQUENCY, SECONDS = 3.0, 20.0  # of the loop [Hz], of the motion [s]
+TORQUE_NOISE, SENSOR_NOISE = 0.05, 0.02  # [N m]
+
+
+@dataclass(frozen=True)
+class PlanarLog:
+    """Log at 1 kHz: t (N,) and reference, measured positions, torques of motors and sensors (N, 3)."""
+
+    t: np.ndarray
+    q_ref: np.ndarray
+    q: np.ndarray
+    tau: np.ndarray
+    tau_link: np.ndarray
+
+
+@njit(cache=True)
+def rigid(q, v, arm):
+    """Return the links' inertia matrix (3, 3), and the torques (3,) of their speeds and weights, by joints."""
+    lengths, centres, masses, inertias = arm
+    angle, rate = np.cumsum(q), np.cumsum(v)
+    reach = np.zeros((3, 3))
+    for i in range(3):
+        reach[i, :i], reach[i, i] = lengths[:i], centres[i]
+    matrix, torque = np.diag(inertias), np.zeros(3)
+    for j in range(3):
+        torque[j] = GRAVITY * np.cos(angle[j]) * np.sum(masses * reach[:, j])
+        for k in range(3):
+            product = np.sum(masses * reach[:, j] * reach[:, k])
+            matrix[j, k] += product * np.cos(angle[j] - angle[k])
+            torque[j] += product * np.sin(angle[j] - angle[k]) * rate[k] ** 2
+    turn = np.tril(np.ones((3, 3)))
+    return turn.T @ matrix @ turn, turn.T @ torque
+
+
+@njit(cache=True)
+def accelerations(q, v, tau, arm, drives):
+    """Return the joints' accelerations (3,) under motor torques."""
+    matrix, torque = rigid(q, v, arm)
+    motors, viscous, coulomb = drives
+    return np.linalg.solve(matrix + np.diag(motors), tau - torque - viscous * v - coulomb * np.tanh(v / WIDTH))
+
+
+@njit(cache=True)
+def run(q_ref, v_ref, kp, kd, noise, arm, drives):
+    """Return true positions, commanded torques and torques behind the drives, each (N, 3)."""
+    period = 1.0 / RATE
+    q, v, step = q_ref[0].copy(), v_ref[0].copy(), period / STEPS
+    before = q + noise[0] - period * v
+    out = np.zeros((3, len(q_ref), 3))
+    for k in range(len(q_ref)):
+        seen = q + noise[k]
+        tau = kp * (q_ref[k] - seen) + kd * (v_ref[k] - (seen - before) / period)
+        before = seen
+        matrix, torque = rigid(q, v, arm)
+        out[0, k], out[1, k] = q, tau
+        out[2, k] = matrix @ accelerations(q, v, tau, arm, drives) + torque
+        for _ in range(STEPS):
+            a1 = accelerations(q, v, tau, arm, drives)
+            v2 = v + 0.5 * step * a1
+            a2 = accelerations(q + 0.5 * step * v, v2, tau, arm, drives)
+            v3 = v + 0.5 * step * a2
+            a3 = accelerations(q + 0.5 * step * v2, v3, tau, arm, drives)
+            v4 = v + step * a3
+            a4 = accelerations(q + step * v3, v4, tau, arm, drives)
+            q = q + step / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
+            v = v + step / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+    return out
+
+
+def reference() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return t (N,), positions and velocities (N, 3): twenty harmonics, from rest, at most 1.5, 2 and 2.5 rad/s."""
+    rng = np.random.default_rng(3)
+    t = np.arange(int(SECONDS * RATE) + 1) / RATE
+    omega = 2.0 * np.pi / SECONDS * np.arange(1, 21)
+    q = np.zeros((len(t), 3))
+    for joint, speed in enumerate((1.5, 2.0, 2.5)):
+        a, b = rng.normal(size=(2, len(omega))) / np.sqrt(omega)
+        rates = np.cos(np.outer(t, omega)) @ a + np.sin(np.outer(t, omega)) @ b
+        waves = np.sin(np.outer(t, omega)) @ (a / omega) - np.cos(np.outer(t, omega)) @ (b / omega)
+        q[:, joint] = speed / np.abs(rates).max() * (1.0 - np.exp(-((t / 0.5) ** 3))) * waves
+    return t, q + np.array([0.8, -0.5, 0.3]), np.gradient(q, 1.0 / RATE, axis=0)
+
+
+def gains() -> tuple[np.ndarray, np.ndarray]:
+    """Return kp and kd (3,) by the mean inertia of the joints."""
+    postures = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 3))
+    arm = np.array([LENGTHS, CENTRES, MASSES, INERTIAS])
+    matrices = np.array([rigid(q, np.zeros(3), arm)[0] for q in postures])
+    inertia = np.einsum("kjj->j", matrices) / len(matrices) + MOTORS
+    omega = 2.0 * np.pi * FREQUENCY
+    return omega**2 * inertia, 1.4 * omega * inertia
+
+
+def planar_log(noise: float, in_loop: bool, seed: int) -> PlanarLog:
+    """Return a log with white noise of the positions [rad], which the controller sees or the log alone has."""
+    rng = np.random.default_rng([seed, 7])
+    t, q_ref, v_ref = reference()
+    error = noise * rng.normal(size=q_ref.shape)
+    arm, drives = np.array([LENGTHS, CENTRES, MASSES, INERTIAS]), np.array([MOTORS, VISCOUS, COULOMB])
+    q, tau, tau_link = run(q_ref, v_ref, *gains(), in_loop * error, arm, drives)
+    tau = tau + TORQUE_NOISE * rng.normal(size=tau.shape)
+    tau_link = tau_link + SENSOR_NOISE * rng.normal(size=tau.shape)
+    return PlanarLog(t, q_ref, q + error, tau, tau_link)
+
+
+def standard_parameters() -> np.ndarray:
+    """Return the links' parameters (30,): XX XY XZ YY YZ ZZ about the joint, MX MY MZ, M; XX and YY act on nothing."""
+    rows = []
+    for centre, mass, inertia in zip(CENTRES, MASSES, INERTIAS):
+        about_joint = inertia + mass * centre**2
+        rows.append([0.01, 0.0, 0.0, about_joint, 0.0, about_joint, mass * centre, 0.0, 0.0, mass])
+    return np.concatenate(rows)
