@@ -24,6 +24,8 @@ from calib.identification.rows import ObservationRows
 
 MIN_ROWS = 8
 """Rows in motion of a recording, below which it is not used."""
+MIN_FACTOR = 0.01
+"""Factor of the errors' variance on a motion without torque, at least: some noise is in every log (our choice)."""
 
 
 class ErrorGrowth(NamedTuple):
@@ -40,7 +42,7 @@ class ErrorGrowth(NamedTuple):
     def factor(self, torque_variance: np.ndarray) -> np.ndarray:
         """Return the factor (rows,) of the errors' variance on a motion whose torques have these variances (rows,)."""
         ratio = torque_variance / np.maximum(self.torque_variance, 1e-300)
-        return 1.0 - self.share + self.share * ratio
+        return np.maximum(1.0 - self.share + self.share * ratio, MIN_FACTOR)
 
 
 def error_growth(all_rows: Sequence[ObservationRows], values: np.ndarray) -> ErrorGrowth:
