@@ -96,9 +96,9 @@ def with_removed(pool: Pool, design: Design, i: int) -> Design:
 def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int = 48) -> tuple[int, float]:
     """Return the candidate outside the design that raises log det most, and that gain of log det.
 
-    The search is exact, though only few candidates are evaluated. By the arithmetic-geometric mean det(I + B) ≤ (1 +
-    tr(B)/r)^r for r rows; a candidate whose score by this bound cannot exceed the best gain so far (or `above`) is
-    skipped.
+    The search is exact, though only few candidates are evaluated. With B (r, r) = z C zᵀ of a candidate, by the
+    arithmetic-geometric mean det(I + B) ≤ (1 + tr(B)/r)^r for r rows; a candidate whose score by this bound cannot
+    exceed the best gain so far (or `above`) is skipped.
 
     Args:
         pool: the N candidates; an index refers to them.

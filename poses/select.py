@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .by_index import exchanged_by_index, merits
+from .by_index import exchanged_by_index, kicked_by_index, merits
 from .candidates import draw_candidates
 from .continuous.global_local import mlsl_search
 from .continuous.local import Improved, improved
@@ -26,6 +26,10 @@ from .whole_space import Ceiling, bound_over_space
 Method = Literal["detmax", "polish", "local", "multistart", "mlsl", "tabu"]
 Progress = Callable[[int, int, str], None]
 
+# trial sets of the restarts for other indices than O1, for each kick asked for (our choice): with ten kicks some 60
+# restarts of 7 poses among 18, 10 of 30 among 2000
+TRIALS_PER_KICK = 2000
+
 
 @dataclass(frozen=True)
 class SearchSettings:
@@ -37,7 +41,8 @@ class SearchSettings:
         method: see `select_poses`.
         count: candidates to generate if none are given.
         seed: of every random draw; the same seed gives the same selection.
-        kicks: random restarts of detmax around its best set; skipped if at most 0.5 % can be gained.
+        kicks: random restarts of detmax around its best set; skipped if at most 0.5 % can be gained. For other indices
+            than O1 as many restarts as 2000 trial sets for each kick last.
         starts: start sets of multistart.
         evaluations: largest number of evaluations of one local search.
         rule: settings of the tabu search.
@@ -335,17 +340,19 @@ def _exchange(task: _Request) -> _Chosen:
     rising = tuple((logdet + candidates.shift) / (2 * p) for _, logdet in best)
     chosen = _Chosen(best[-1][0], None, rising, len(best), interrupted)
     if task.index != "O1" and not interrupted:
-        chosen = _by_index(task, chosen.members or ())
+        elapsed = time.process_time() - began
+        chosen = _by_index(task, chosen.members or (), task.settings.seconds - elapsed)
     stage(5, "done")
     return chosen
 
 
-def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
+def _by_index(task: _Request, members: tuple[int, ...], seconds: float) -> _Chosen:
     """Return the D-optimal set `members` improved by exchanges for the requested index, where the index is not O1.
 
     Args:
         task: candidates and arguments of `select_poses`.
         members: indices of the set's candidates.
+        seconds: processor time [s] after which the exchange is not restarted any more.
     """
     p = task.jacobians.shape[2]
     past = np.zeros((0, p))
@@ -362,7 +369,12 @@ def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
 
     interrupted = False
     try:
-        exchanged_by_index(task.jacobians, known_information, members, task.index, keep)
+        information = task.jacobians, known_information
+        optimum = exchanged_by_index(*information, members, task.index, keep)
+        trials = TRIALS_PER_KICK * task.settings.kicks
+        optimum = kicked_by_index(*information, optimum, task.index, trials, task.seed, keep, seconds=seconds)
+        # the kicks tried fewer candidates
+        exchanged_by_index(*information, optimum.members, task.index, keep)
     except KeyboardInterrupt:
         interrupted = True
     rising = tuple(value for _, value in best)

@@ -14,7 +14,7 @@ from calib.api.rendering import ChartedResult, Progress, WithoutVerdict, optiona
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
-from calib.errors import TaskLost, as_ours
+from calib.errors import TaskLost, UsageError, as_ours, require
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
 from calib.procedure.excitation import design, folder, planning, stored_front
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
@@ -189,6 +189,7 @@ def design_excitation(
         previous_folder = None if after is None else stack.enter_context(saved(after))
         crew = stack.enter_context(opened(workers))
         if stage is not None:
+            require(pick is None, "pick: fronts of trade-offs are designed for serial arms only", UsageError)
             return stage.run(
                 settings,
                 model=model_folder,

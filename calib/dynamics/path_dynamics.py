@@ -58,10 +58,10 @@ class PathDynamics:
     def along(
         self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the coefficients A, B, Γ of the path dynamics, each (N, n), at N points of the path.
+        """Return the coefficients A, B, Γ of the torques A s̈ + B ṡ² + Γ, each (N, n), at N points of the path.
 
         Args:
-            q, slope, curvature: (N, n) Φ and its derivatives Φ', Φ'' with respect to s.
+            q, slope, curvature: (N, n) path q = Φ(s) and its derivatives Φ', Φ'' with respect to the path parameter s.
         """
         zero = np.zeros_like(q)
         gravity = self.rigid(q, zero, zero)

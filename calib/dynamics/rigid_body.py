@@ -54,10 +54,11 @@ def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
         ½ q̇ᵀ [Y(q, 0, q̇) - Y(q, 0, 0)] - [0, gᵀ R, gᵀ p],    R, p: pose of the body's frame in the base
 
-    (Gautier 1997, with the regressor Y of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi.)
+    Here g is the gravity vector and Y the regressor of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi
+    for the inertia matrix M and standard parameters chi (Gautier 1997).
 
     Args:
-        bodies: the robot's bodies.
+        bodies: the B bodies of the robot.
         q, v: (N, n) joint positions and velocities [rad or m, and per s].
     """
     zero = np.zeros_like(np.asarray(v, dtype=float))

@@ -141,7 +141,7 @@ def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, sides: 
     (Gouriéroux & Monfort 1995, section 10.3). For inequalities, A and d are the rows of the binding ones.
 
     Args:
-        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem min ‖R b - z‖².
         free: (p,) unconstrained estimate b_f.
         normals: A (k, p), of full rank.
         sides: d (k,).

@@ -49,7 +49,7 @@ def ols(data: Triangles, inflation: np.ndarray | None = None) -> LinearFit:
     `wls`.
 
     Args:
-        data: R factors of [W y].
+        data: R factors of [W y], W (r, p) the observation matrix and y (r,) the measured values; ρ are the residuals.
         inflation: (g,) variance inflation >= 1 of each group, explained in the module's docstring; None: every row is
             independent.
 
@@ -65,7 +65,8 @@ def wls(data: Triangles, std: np.ndarray | None = None, inflation: np.ndarray | 
     Kolyubin et al. (2019), eq. 22 and 25; the RSD of eq. 26 is ``fit.estimate.rsd``.
 
     Args:
-        data: R factors of [W y], one group of rows per standard deviation.
+        data: R factors of [W y], W (r, p) the observation matrix and y (r,) the measured values, with one group of rows
+            per standard deviation.
         std: (g,) noise standard deviation σ_g of each group in units of y; None: `settled_std`. Kolyubin et al. use
             `subsystem_std`.
         inflation: (g,) variance inflation >= 1 of each group, explained in the module's docstring; None: every row is
@@ -85,7 +86,7 @@ def ridge(data: Triangles, mean: np.ndarray, covariance: np.ndarray, std: np.nda
     The covariance of the result is that of the posterior; its condition numbers are those of data and prior together.
 
     Args:
-        data: R factors of [W y].
+        data: R factors of [W y], W (r, p) the observation matrix and y (r,) the measured values.
         mean: (p,) prior mean.
         covariance: (p, p) prior covariance; an infinite diagonal entry means no prior knowledge of that parameter.
         std: (g,) noise standard deviation of each group in units of y; None: `settled_std`, for which the data alone
@@ -117,8 +118,8 @@ def subsystem_std(data: Triangles) -> np.ndarray:
     Kolyubin et al. (2019), after eq. 22.
 
     Args:
-        data: R factors of [W y], one group g with r_g rows per standard deviation; ρ_g are the group's residuals in
-            units of y.
+        data: R factors of [W y] (observation matrix and measured values), one group g with r_g rows per standard
+            deviation; ρ_g are the group's residuals in units of y.
 
     Raises:
         CalibError: for a group with no more rows than independent columns.
@@ -145,7 +146,8 @@ def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> n
     estimate (Patterson & Thompson 1971). The iteration starts from `subsystem_std`.
 
     Args:
-        data: R factors of [W y].
+        data: R factors of [W y], W (r, p) the observation matrix and y (r,) the measured values; a group g has r_g
+            rows.
         tolerance: largest relative change of any σ_g at which the iteration ends.
         limit: largest number of iterations.
 
@@ -243,7 +245,7 @@ def leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarra
     """Return the leverage h_g = ‖W_g R⁻¹‖² / σ_g² (g,) of each group; the leverages of all groups sum to p.
 
     Args:
-        data: R factors of [W y].
+        data: R factors of [W y], W_g being the rows of group g of the observation matrix W.
         std: (g,) standard deviations σ_g of the groups, in units of y.
         inverse: (p, p) R⁻¹ of the weighted W.
     """

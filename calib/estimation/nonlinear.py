@@ -95,7 +95,10 @@ class Reduced:
         return replace(stacked, cost=cost, rows=self.rows + len(residual))
 
     def moved(self, change: np.ndarray) -> Reduced:
-        """Return the problem with the residual r + W dx instead of r, for `change` dx (p,) of the parameters."""
+        """Return the problem with the residual r + W dx instead of r, for `change` dx (p,) of the parameters.
+
+        W are the rows of the problem, the derivatives of the model by the parameters.
+        """
         target = self.target + self.factor @ change
         cost = self.cost + float(target @ target - self.target @ self.target)
         return replace(self, target=target, cost=cost)

@@ -198,10 +198,11 @@ def relevance(
 ) -> Relevance:
     """Return the estimate of x with a prior x_g ~ N(0, 1/λ_g) per group, with the most probable λ_g and noise.
 
-    MacKay's fixed point (1992; Tipping 2001, eq. 16–18) is λ_g = γ_g / ‖x_g‖² with γ_g = Σ_{i in g} (1 - λ_g Σ_ii), and
-    the noise precision is β = (N - Σ γ - p_free) / ‖y - W x‖², where p_free is the number of columns without a ridge. A
-    group is switched off (its parameters become zero) once its prior is `MAX_PRIOR_WEIGHT` times as precise as the
-    data. The ridges keep WᵀW well conditioned; columns without a ridge must be independent.
+    x_g are the parameters of group g, Σ is the posterior covariance. MacKay's fixed point (1992; Tipping 2001, eq.
+    16–18) is λ_g = γ_g / ‖x_g‖² with γ_g = Σ_{i in g} (1 - λ_g Σ_ii), and the noise precision is β = (N - Σ γ - p_free)
+    / ‖y - W x‖², where p_free is the number of columns without a ridge. A group is switched off (its parameters become
+    zero) once its prior is `MAX_PRIOR_WEIGHT` times as precise as the data. The ridges keep WᵀW well conditioned;
+    columns without a ridge must be independent.
 
     Args:
         data: sufficient statistics WᵀW, Wᵀy, yᵀy of all N rows.

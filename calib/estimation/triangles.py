@@ -137,8 +137,8 @@ def collect(
     """Return the R factors of a whole problem.
 
     Args:
-        matrix: (r, p) W.
-        target: (r,) y.
+        matrix: (r, p) W, the observation matrix.
+        target: (r,) y, the measured values.
         group: (r,) group index of each row; None: all rows form one group.
         names: names of the p columns; None: x1, x2, …
         units: units of the parameters; None: unknown.
@@ -211,7 +211,7 @@ def condition_numbers(factor: np.ndarray) -> tuple[float, float]:
     columns are zero.
 
     Args:
-        factor: W, or any R factor of W.
+        factor: W (rows, p), or any triangular factor of it.
     """
     norms = np.linalg.norm(factor, axis=0)
     excited = norms > 0.0
@@ -229,7 +229,7 @@ def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray
     The two condition numbers are those of W as it is and of W with unit-norm columns.
 
     Args:
-        factor: (p + 1, p + 1) R factor of [W y].
+        factor: (p + 1, p + 1) R factor of [W y], observation matrix and measured values.
         names: names of the p columns, for the error message.
 
     Raises:

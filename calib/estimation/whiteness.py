@@ -154,8 +154,8 @@ def inflation(residual: np.ndarray) -> float:
     Fewer than 8 residuals give τ = 1.
 
     Args:
-        residual: (N,) residuals, or (N, 1 + p) residuals with the columns W C^(1/2) appended (C the covariance of the
-            fit), which account for the part of the errors that the fit absorbed.
+        residual: (N,) residuals, or (N, 1 + p) residuals with the columns W C^(1/2) appended (W the fitted columns, C
+            the covariance of the fit), which account for the part of the errors that the fit absorbed.
     """
     x = np.asarray(residual, dtype=float)
     if len(x) < 8:

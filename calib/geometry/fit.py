@@ -74,9 +74,9 @@ def fit(
     The fit minimises Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / w)². No parameters of the arm are selected. Parameters
     that cannot be distinguished share the effect that the measurements determine, and undetermined parameters stay near
     nominal. There are three widths w of making: for joint offsets, for other angles and for lengths. They are chosen to
-    maximise the evidence (MacKay 1992). y are the measured and f(x) the predicted numbers, σ their standard deviations.
-    Placements of stations and tools have no prior: only their base parameters are fitted, and arm parameters that
-    merely displace base or tool stay at nominal. The identifiable parameters are computed afterwards
+    maximise the evidence (MacKay 1992). x are the parameters, y the measured and f(x) the predicted numbers, σ their
+    standard deviations. Placements of stations and tools have no prior: only their base parameters are fitted, and arm
+    parameters that merely displace base or tool stay at nominal. The identifiable parameters are computed afterwards
     (`GeometricFit.split`, `GeometricFit.base_sigma`).
 
     Args:
@@ -360,8 +360,8 @@ def fit_with_prior(
 ) -> GeometricFit:
     """Return the fit of exactly the parameters `free`, which minimises squared residuals and distances from nominal.
 
-    The minimised function is Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)², with y the measured and f(x) the
-    predicted numbers.
+    The minimised function is Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)², with x the parameters, y the
+    measured and f(x) the predicted numbers, σ their standard deviations.
 
     Sigmas that no file states are estimated, one per file and kind of residual (position, orientation …). The fit is
     repeated until sigmas and robust weights have converged. With thousands of poses the fit starts from the fit to a

@@ -225,7 +225,8 @@ def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray) -
     """Return the joint values (m, n) nearest to `start` that have the same tool poses as `q`, for a redundant arm.
 
     The function minimises |q - q_start| (radians and metres with equal weight) under e(q) = 0. Each pass steps by d +
-    J⁺ (e - J d) with d = q_start - q. The given `q` is kept for targets that the result would no longer reach.
+    J⁺ (e - J d) with d = q_start - q, J the Jacobian and e the pose error at q. The given `q` is kept for targets that
+    the result would no longer reach.
 
     Args:
         goal: the arm.
@@ -254,8 +255,9 @@ def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray) -
 def held_back(goal: Goal, targets: np.ndarray, start: np.ndarray, max_change: float) -> np.ndarray:
     """Return joint values (m, n) near the targets, with no joint more than `max_change` from `start`.
 
-    This is for targets near a singularity, where a small correction needs a large motion. The function minimises |e|² +
-    μ² |q - q_start|² with the smallest μ of `BACK` for which the change is at most `max_change` [rad or m].
+    This is for targets near a singularity, where a small correction needs a large motion. With e the pose error, the
+    function minimises |e|² + μ² |q - q_start|² with the smallest μ of `BACK` for which the change is at most
+    `max_change` [rad or m].
 
     Args:
         goal: the arm.

@@ -173,7 +173,10 @@ class LeftOut:
 
     @classmethod
     def of(cls, near: Sequence[np.ndarray], far: Sequence[np.ndarray], joints: Sequence[int]) -> LeftOut:
-        """Return the errors from one array (rows, 5) per fold: |e|², trace J Σ Jᵀ, two squared distances, pose number.
+        """Return the errors from one array (rows, 5) per fold, with the columns of `calib.geometry.error_model`.
+
+        The columns are |e|² [m²] of the position error e, its variance due to the parameters [m²], squared distances
+        from the fitted poses and from the joints' fitted ranges [m²], and the index of the pose.
 
         Args:
             near: arrays of the folds held out at random.
@@ -235,6 +238,9 @@ class LeftOut:
 
     def learnt(self, start: Sequence[float] = ()) -> tuple[list[float], tuple[float, float]]:
         """Return κ, v_0, v_1, v_2, estimated from |e|² ~ variance · χ²_3 / 3, and the near and far 95 % radii.
+
+        κ, v_0, v_1, v_2 are the weights of the columns of `shapes` in the variance of the error e; a radius is a number
+        of standard deviations.
 
         Args:
             start: values from which the search starts; empty for values from the errors' median.

@@ -26,7 +26,7 @@ CHUNK = 500
 
 
 def separable(measured: PoseMeasurements) -> bool:
-    """Return whether the rows are positions or poses without errors that all rows share."""
+    """Return whether the rows of `measured` are positions or poses without errors that all rows share."""
     return isinstance(measured, Positions) and measured.late is None
 
 

@@ -246,7 +246,7 @@ def base_columns(
         cell: the installation.
         blocks: prepared measurements.
         columns: (c,) indices of the candidate parameters.
-        tolerance: relative size below which a column is treated as dependent.
+        tolerance: norm of a column's independent part, relative to the column, below which it counts as dependent.
     """
     return split_columns(observation_matrix(cell, blocks, columns), _preference(cell, columns), tolerance)
 
@@ -297,13 +297,22 @@ class Observation:
         return np.sqrt(squares)
 
     def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the position of the first target (m, 3) [m] and its unwhitened Jacobian (m, 3, p)."""
+        """Return the position of the first target (m, 3) [m] and its unwhitened Jacobian (m, 3, p).
+
+        Args:
+            q: (m, n) joint values [rad or m].
+        """
         point = see(self.cell, q).point
         sigma = self._sigma(point)[:3]
         return point.T, self(q)[:, :3] * sigma.T[:, :, None]
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian J, in closed form."""
+        """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian J, in closed form.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+            G: (m, rows, p) weights of the entries of J.
+        """
         chain = self.cell.chain
         count = len(chain.elements)
         # element of each parameter; -1 for the station, behind the last element for tools

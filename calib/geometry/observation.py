@@ -386,7 +386,7 @@ def whitened(
 def target_jacobian(
     cell: Installation, seen: Seen, free: np.ndarray, station: int, tool: np.ndarray, bases: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return [v; ω] of the targets per unit of each fitted parameter, (f, 6, m).
+    """Return velocity and angular velocity [v; ω] of the targets per unit of each fitted parameter, (f, 6, m).
 
     Args:
         cell: the installation.
@@ -452,6 +452,8 @@ def pose_sigmas(
     tool: np.ndarray | int = 0,
 ) -> np.ndarray:
     """Return standard deviations (m, 2) of a tool's position [m] and orientation [rad]: sqrt(trace J Σ Jᵀ) of each.
+
+    J are the derivatives of position or orientation by the parameters.
 
     Args:
         cell: the fitted installation.

@@ -168,7 +168,7 @@ def parts(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[
     Args:
         measured: the block, m rows.
         seen: the predicted targets.
-        jacobian: (f, 6, m), [v; ω] of the targets per unit of each fitted parameter.
+        jacobian: (f, 6, m), velocity and angular velocity [v; ω] of the targets per unit of each fitted parameter.
 
     Raises:
         MeasurementError: no function is registered for the type.
@@ -366,8 +366,9 @@ def _project(rows: np.ndarray, nuisance: np.ndarray) -> np.ndarray:
 def inverse_right_jacobian(turn: np.ndarray, angular: np.ndarray) -> np.ndarray:
     """Return J_r⁻¹(r) ω for rotation vectors r (3, m) and angular velocities (f, 3, m).
 
-    J_r⁻¹(r) = I + [r]×/2 + (1/θ² - (1 + cos θ)/(2 θ sin θ)) [r]×²  (Chirikjian 2012, vol. 2, eq. 10.86). Since log(R_y
-    (exp(ω) R)ᵀ) = log(exp(r) exp(-ω)), a rotation ω of the prediction changes the residual by -J_r⁻¹(r) ω.
+    J_r⁻¹(r) = I + [r]×/2 + (1/θ² - (1 + cos θ)/(2 θ sin θ)) [r]×²  with θ = |r| (Chirikjian 2012, vol. 2, eq. 10.86).
+    Since log(R_y (exp(ω) R)ᵀ) = log(exp(r) exp(-ω)), a rotation ω of the prediction changes the residual by -J_r⁻¹(r)
+    ω.
 
     Args:
         turn: r (3, m), rotation vectors [rad].

@@ -239,7 +239,7 @@ class LoopController:
         return replace(self, kp=kp, kd=kd, ki=ki)
 
     def with_feedforward(self, ahead: np.ndarray) -> LoopController:
-        """Return the controller with the feedforward torques `ahead` (N, n), which replace earlier ones."""
+        """Return the controller with the feedforward torques `ahead` (N, n) [N m or N], which replace earlier ones."""
         return replace(self, ahead=frozen(ahead))
 
 
@@ -263,7 +263,11 @@ class ExogeneityTest:
         return self.biased()
 
     def biased(self, level: float = 0.01) -> bool:
-        """Return whether the test shows, at this significance level, that least squares is biased; use IV then."""
+        """Return whether the test shows, at this significance level, that least squares is biased; use IV then.
+
+        Args:
+            level: probability of this result if least squares is unbiased.
+        """
         return self.p < level
 
 

@@ -133,46 +133,43 @@ class Score:
     band: Number = np.nan
 
     @property
-    def noisy(self) -> bool:
-        """Whether noise would decide the verdict.
+    def floor_dominates(self) -> bool:
+        """Whether most of the squared error is above the identification band, where the motion predicts no torque."""
+        return 2.0 * self.floor_percent**2 > self.counted(in_band=False).total ** 2
 
-        The raw error does not pass, and most of its square is above the identification band, where the motion predicts
-        no torque.
-        """
-        return self.raw.total > PASSING_SHARE and 2.0 * self.floor_percent**2 > self.raw.total**2
+    @property
+    def noisy(self) -> bool:
+        """Whether noise would decide the verdict: the error does not pass, and most of it is above the band."""
+        return self.floor_dominates and self.counted(in_band=False).total > PASSING_SHARE
 
     @property
     def stands(self) -> bool:
         """Whether joints are at rest for a noticeable part of the recording, in addition to reversals."""
         return self.motion_share < 1.0 - REST_SHARE and self.moving.samples > 0
 
-    @property
-    def judged(self) -> PredictionErrors:
-        """Errors that the verdict uses: errors of moving joints, or all errors if no joint is at rest.
+    def counted(self, in_band: bool) -> PredictionErrors:
+        """Return the errors of moving joints, or all errors if no joint is at rest.
 
-        Friction at rest is undetermined, so that errors at rest do not count. In a `noisy` recording the errors in the
-        identification band count, since those above it say nothing about the model.
+        Friction at rest is undetermined, so that errors at rest do not count.
+
+        Args:
+            in_band: whether only errors in the identification band count.
         """
-        if not self.noisy:
+        if not in_band:
             return self.moving if self.stands else self.raw
         if self.stands and self.moving_in_band is not None:
             return self.moving_in_band
         return self.filtered
 
-    def without_floor(self, percent: float) -> float:
-        """Return an unexplained share of the raw torque [%] as this recording is judged: without `floor_percent`.
-
-        Args:
-            percent: unexplained share of the raw torque by another model, such as the exported robot's [%].
-        """
-        if not self.noisy:
-            return percent
-        return float(np.sqrt(max(percent**2 - self.floor_percent**2, 0.0)))
+    @property
+    def judged(self) -> PredictionErrors:
+        """Errors that the verdict uses: in a `noisy` recording those in the identification band."""
+        return self.counted(in_band=self.noisy)
 
     @property
     def above_band(self) -> str:
         """Text on the unexplained share of the torque with all frequencies; empty unless the recording is `noisy`."""
-        return f"{self.raw.total:.2f} %" if self.noisy else ""
+        return f"{self.counted(in_band=False).total:.2f} %" if self.noisy else ""
 
     @property
     def at_rest(self) -> str:

@@ -530,6 +530,8 @@ def tempered_prior(
 ) -> Prior:
     """Return the prior with the tempering that best predicts held-out ranges of motion.
 
+    Tempering is the prior's weight for the values, relative to its weight for their covariance.
+
     The criterion is the squared error of all rows, in units of their residuals, as geometric mean over the ranges, so
     that a range with large errors for every prior does not dominate. A stronger prior must be better by
     `MIN_TEMPERING_GAIN`.

@@ -306,7 +306,8 @@ class CalibratedChain:
     def jacobian(self, q: ArrayLike) -> np.ndarray:
         """Return the tip's Jacobian (m, 6, n) [v; ω] in the base frame at joint values q (m, n) [rad or m].
 
-        The derivatives of joint corrections are not included.
+        v is the velocity of the tip, ω its angular velocity, per unit joint velocity. The derivatives of joint
+        corrections are not included.
 
         Raises:
             CalibError: joint values of a wrong shape.

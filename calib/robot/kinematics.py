@@ -67,7 +67,7 @@ def _walk(
 
 
 def sweep(chain: Chain, q: np.ndarray, base: np.ndarray | None = None, extra: np.ndarray | None = None) -> Sweep:
-    """Return axes and origins of all elements and the flange poses, in one pass along the chain for all poses.
+    """Return axes and origins of all K elements and the flange poses, in one pass along the chain for all poses.
 
     Args:
         chain: the arm.
@@ -92,7 +92,7 @@ def forward(chain: Chain, q: np.ndarray, extra: np.ndarray | None = None) -> np.
     Args:
         chain: the arm.
         q: (m, n) joint values [rad or m].
-        extra: (K, m) displacements added to those of the elements (deflections) [m or rad]; None without.
+        extra: (K, m) displacements added to those of the chain's K elements (deflections) [m or rad]; None without.
     """
     return sweep(chain, q, extra=extra).poses()
 
@@ -130,6 +130,8 @@ def element_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, index: np.n
 def jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the tip's Jacobian [v; ω] with respect to the values of all elements (observation Jacobian), (m, 6, K).
 
+    v is the velocity of the tip, ω its angular velocity, both in the base frame and per unit of an element's value.
+
     Args:
         chain: the arm, with K elements.
         q: (m, n) joint values [rad or m].
@@ -156,8 +158,8 @@ def twist_product(
 ) -> np.ndarray:
     """Return Σ_k G_k · ∂J_k/∂q (n, m) for columns J_k = [v; ω] of a Jacobian of the arm.
 
-    Joint e rotates every column of a later element as a whole. For earlier elements (and for its own), it moves the
-    point:
+    v and ω are velocity and angular velocity of a point per unit of an element's value. Joint e rotates every column of
+    a later element as a whole. For earlier elements (and for its own), it moves the point:
 
         ∂J_k = [ω_e × v_k; ω_e × ω_k]  for k after e,   ∂J_k = [ω_k × v_e; 0]  otherwise
 
@@ -211,6 +213,8 @@ def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int |
 
 def tip_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the tip's Jacobian (m, 6, n) [v; ω] with respect to the joints, at joint values q (m, n).
+
+    v is the velocity of the tip, ω its angular velocity, both in the base frame and per unit joint velocity.
 
     Args:
         chain: the arm.

@@ -11,7 +11,6 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 
-import nlopt
 import numpy as np
 
 from ..continuous.local import FEASIBLE, SHARPNESS, Improved, improved, merit_of, restored
@@ -43,6 +42,8 @@ def mlsl_search(
         evaluations: largest number of evaluations of the index, in MLSL and local search together.
         seconds: limit of processor time [s], for MLSL and local search together.
     """
+    import nlopt
+
     began = time.process_time()
     spent = 0
     best = -np.inf

@@ -189,7 +189,7 @@ def test_command_carries_covariance_of_fit(tmp_path, capsys):
     torques = read_table(out / "torques_1.csv")
     measured, predicted, nominal = (torques.block(name) for name in ("measured", "predicted", "nominal"))
     errors = [np.sqrt(np.mean((measured - torque) ** 2)) for torque in (predicted, nominal)]
-    assert 0.0 < np.abs(nominal - predicted).max() and errors[1] == pytest.approx(errors[0], rel=0.5)
+    assert np.abs(nominal - predicted).max() > 0.0 and errors[1] == pytest.approx(errors[0], rel=0.5)
     assert "which geometric errors matter" in capsys.readouterr().out
     kept = calibrated.read(out).covariance
     assert kept is not None and kept[1, 1] == pytest.approx(1e-6), "the identified robot carries it on"

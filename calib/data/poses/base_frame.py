@@ -90,7 +90,11 @@ def _refuse_shorter(sheet: Sheet, layout: Layout, missing: np.ndarray) -> None:
 
 
 def _refuse_other_clock(sheet: Sheet) -> None:
-    """Raise MeasurementError if the times of base frames are nearer to the target's times of other rows."""
+    """Raise MeasurementError if the times of base frames are nearer to the target's times of other rows.
+
+    Args:
+        sheet: the table with its options.
+    """
     table = sheet.table
     times = [
         name for name in (*TARGET_TIMES, BASE_TIME) if name in table and table.cells[table.index(name)].dtype == float
@@ -202,7 +206,13 @@ def relative_to_base(
 
 
 def _stacked(sigma: np.ndarray | None, sigma_rotation: np.ndarray | None, rows: int) -> np.ndarray:
-    """Return the sigmas (m, 6) of position and orientation; NaN where not known."""
+    """Return the sigmas (m, 6) of position and orientation; NaN where not known.
+
+    Args:
+        sigma: (m, 3) standard deviations of the position [m]; None if not known.
+        sigma_rotation: (m, 3) standard deviations of the orientation [rad]; None if not known.
+        rows: number m of rows.
+    """
     unknown = np.full((rows, 3), np.nan)
     parts: Sequence[np.ndarray | None] = (sigma, sigma_rotation)
     return np.hstack([unknown if part is None else part for part in parts])

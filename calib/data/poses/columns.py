@@ -367,7 +367,11 @@ def _of_base(column: Column) -> list[str]:
 
 
 def _refuse_base_alone(sheet: Sheet) -> None:
-    """Raise MeasurementError for a file with base frames and without any target."""
+    """Raise MeasurementError for a file with base frames and without any target.
+
+    Args:
+        sheet: the table with its options.
+    """
     base = _of_base(POSITION)
     is_base = any(sheet.find(name) for name in base)
     if not is_base or any(sheet.find(label) for label in LABEL_OF.values()):
@@ -381,6 +385,10 @@ def _refuse_base_alone(sheet: Sheet) -> None:
 
 def _with_base(sheet: Sheet, layout: Layout) -> Layout:
     """Return a layout with the columns of the base frame, if the file has them and the options do not ignore them.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns that are read so far.
 
     Raises:
         MeasurementError: a base frame that is incomplete, or missing although the options require it.

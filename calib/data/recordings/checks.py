@@ -452,6 +452,9 @@ def _work_notes(recording: Recording) -> list[str]:
     """Return a note if the torques extract energy from the robot: over a closed path, friction requires ∫τᵀ dq > 0.
 
     There is no note if the motion does not return to a pose, since gravity does work between different poses.
+
+    Args:
+        recording: the recording of joint positions q and torques τ.
     """
     rows = _round_trip(recording.q) if recording.kind == "torque" else None
     if rows is None:

@@ -297,7 +297,8 @@ def slope(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
 def curvature(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
     """Return the second time derivative of `values` (N, ...) by central differences; NaN at the ends as in `slope`.
 
-    ẍ_k = rate² Σ_i d_i (x_{k+i} - 2 x_k + x_{k-i}). The relative error of width 1 is (ωΔ)²/12.
+    ẍ_k = rate² Σ_i d_i (x_{k+i} - 2 x_k + x_{k-i}). At the angular frequency ω and the sampling period Δ, the relative
+    error of width 1 is (ωΔ)²/12.
 
     Args:
         values: (N, ...) samples of a segment without gaps.

@@ -121,7 +121,11 @@ def spread_of(values: np.ndarray, sigma: np.ndarray) -> Spread:
 
 
 def _added_noise(block: Positions) -> float | None:
-    """Return the rms length [m] of the error that the base frame's stated σ cause at the target; None if not known."""
+    """Return the rms length [m] of the error that the base frame's stated σ cause at the target; None if not known.
+
+    Args:
+        block: measured positions, relative to the base frame.
+    """
     if block.base_sigma is None or not np.isfinite(block.base_sigma[:, :3]).all():
         return None
     squares = block.base_sigma**2

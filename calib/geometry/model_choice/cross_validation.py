@@ -173,8 +173,8 @@ class FoldStatistics:
         """Return the estimate of the coordinates `index`, with the most probable prior standard deviations.
 
         Args:
-            data: statistics of the rows.
-            index: numbers of the coordinates.
+            data: sufficient statistics of the rows, in all coordinates.
+            index: indices of the coordinates to estimate.
             start: initial prior standard deviations.
             iterations: largest number of iterations.
         """
@@ -419,7 +419,7 @@ class _FoldRows:
     def _observed_shares(
         self, number: int, rows: np.ndarray
     ) -> tuple[list[Share], list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
-        """Return the statistics of whitened rows; for rows in metres, return residual, W and weights of each part.
+        """Return the statistics of whitened rows, and for rows in metres residual, Jacobian and weights of each part.
 
         Args:
             number: index of the block.

@@ -55,12 +55,25 @@ def regular_plant(
 
 
 def simulated_runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
-    """Return noise-free simulations of the loops of all recordings."""
+    """Return noise-free simulations of the loops of all recordings.
+
+    Args:
+        plant: the simulated robot.
+        cases: gap-free parts of recordings, each with its loop.
+    """
     return [((case, loop), simulated_run(plant, case, loop, Sensing(every=loop.every))) for case, loop in cases]
 
 
 def simulated_run(plant: Plant, case: Case, loop: Loop, sensing: Sensing, seed: int = 0) -> SimulatedRun:
-    """Return the simulation of a recording's loop with the recording's payloads."""
+    """Return the simulation of a recording's loop with the recording's payloads.
+
+    Args:
+        plant: the simulated robot.
+        case: the recording, which has the payloads.
+        loop: its loop.
+        sensing: noise, resolution and sampling.
+        seed: seed of all noise.
+    """
     robot = plant.carrying(case.carried)
     controller = loop.controller
     if loop.design is not None:

@@ -102,7 +102,14 @@ class Plant:
         sensing: Sensing | None = None,
         seed: int | np.random.Generator = 0,
     ) -> SimulatedRun:
-        """Return the simulated motion of the robot that follows a reference, by `simulate`."""
+        """Return the simulated motion of the robot that follows a reference, by `simulate`.
+
+        Args:
+            controller: the controller.
+            reference: reference sampled at the controller's rate.
+            sensing: noise, resolution and sampling; None: no noise, one sample per control period.
+            seed: seed of all noise.
+        """
         return simulate(self, controller, reference, sensing, seed)
 
     def feed_forward(self, reference: Reference) -> np.ndarray:

@@ -120,7 +120,11 @@ def _weights(size: np.ndarray, joints: int, gated: bool = True) -> np.ndarray:
 
 @lru_cache
 def _quantiles(joints: int) -> np.ndarray:
-    """Return 4000 equally probable values of d² for `joints` joints, with which expectations are computed."""
+    """Return 4000 equally probable values of d², the squared Mahalanobis size of normal residuals.
+
+    Args:
+        joints: number of joints in a sample, the degrees of freedom of d².
+    """
     return np.asarray(chdtri(joints, 1.0 - (np.arange(4000) + 0.5) / 4000))
 
 

@@ -250,7 +250,11 @@ class _Comparison:
         return np.concatenate(residuals), np.concatenate(slopes)
 
     def with_noise(self, values: np.ndarray) -> _Comparison:
-        """Return the comparison with the recordings' noise in the loop, as their torques answer it."""
+        """Return the comparison with the recordings' noise in the loop, as their torques answer it.
+
+        Args:
+            values: (p,) parameters with which the loops are simulated.
+        """
         if self.robot.steps is not None:
             return replace(self, noise=(None,) * len(self.loops.pairs))
         noise = []
@@ -269,7 +273,16 @@ class _Comparison:
         relative: np.ndarray | None,
         drawn: np.ndarray | None,
     ) -> Sensitivities:
-        """Return the mean of runs with noise `drawn` in the loop and with its opposite; one run where there is none."""
+        """Return the mean of runs with noise `drawn` in the loop and with its opposite; one run where there is none.
+
+        Args:
+            values: (p,) parameters of the problem.
+            case: the recording, which has the payloads.
+            controller: controller of the robot.
+            loop: loop of the recording.
+            relative: (n, p) derivatives of the logarithm of the gains by the parameters; None: the gains are constant.
+            drawn: (N, n) noise of the measured positions [rad or m]; None for no noise.
+        """
         self.count[0] += 1
         first = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative, drawn)
         if drawn is None:

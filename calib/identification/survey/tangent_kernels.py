@@ -466,9 +466,24 @@ def closed_loop_tangent(
 ):
     """Write the motion of `loop_kernels.closed_loop` and its tangents; return a status and a period.
 
-    The period is the number of the last one reached. relative (n, c): derivatives of the logarithm of each joint's
-    gains by the parameters; zero for constant gains. `out` (3, M, n): q, v, torque every `every` periods. `dout` (3, M,
-    n, c): their tangents. encoder (N, n) or (0, n): noise of the measured positions, on which the controller acts.
+    The period is the index of the last one reached.
+
+    Args:
+        plant: arrays tree, body, linear, kinds, acts of `loop_kernels`.
+        layout: index arrays order, entries, shares, owners, find.
+        model: array `body` of the controller's model; 0 rows if there is none.
+        gains: (6, n) controller values, as in `loop_kernels.closed_loop`.
+        relative: (n, c) derivatives of the logarithm of each joint's gains by the parameters; zero for constant gains.
+        reference: (4, N, n) position, velocity, feedforward torque, feedforward acceleration.
+        encoder: (N, n) or (0, n), noise of the measured positions, on which the controller acts.
+        period: control period [s].
+        smoothing: weight of a new velocity sample in the controller's low-pass.
+        late: delay in control periods.
+        every: control periods per sample.
+        q, v: (n,) the state, which is overwritten.
+        count: number of control periods.
+        out: (3, M, n) q, v and torque at each sample.
+        dout: (3, M, n, c) their tangents, i.e. derivatives by the parameters.
     """
     tree, linear, kinds = plant[0], plant[2], plant[3]
     n, c = relative.shape

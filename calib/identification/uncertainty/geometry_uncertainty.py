@@ -607,8 +607,13 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
 
         dφ/dc = -(Wᵀ R⁻¹ W)⁻¹ Wᵀ R⁻¹ Σ_s ∂τ/∂s b_s,    s one of q, v, a of the joint, b_s the basis or its derivative
 
-    as in `sensitivity`, but without the part that is proportional to the residual. A model without bodies (rows
-    ``drive``) feels no deflection.
+    with W the observation matrix, R the variances of its rows, τ the torques; as in `sensitivity`, but without the part
+    that is proportional to the residual. A model without bodies (rows ``drive``) feels no deflection.
+
+    Args:
+        found: the identification.
+        robot: its robot, with joint corrections.
+        cases: training data of the identification, with the motion of the links.
     """
     terms = robot.deflection
     chain = robot.complete
@@ -655,8 +660,8 @@ def _torque_slopes(bodies: Bodies, values: np.ndarray, states: Sequence[np.ndarr
     Args:
         bodies: the robot's bodies.
         values: (10 B,) standard parameters.
-        states: q, v, a, (N, n) each.
-        joint: joint j.
+        states: q, v, a, (N, n) each [rad or m, and per s, per s²].
+        joint: index of joint j, from 0.
     """
     result = np.zeros((3, *states[0].shape))
     for order in range(3):

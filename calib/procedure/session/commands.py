@@ -21,6 +21,7 @@ from calib.data.poses import IMAGES
 from calib.errors import UsageError, command_line, require
 from calib.folders import CERTIFICATE, PAGES, SESSION
 from calib.geometry.observability import targets_of
+from calib.procedure.dynamic_stage.computed_torque import check_tolerances
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import CORRECTED_URDF, TERMS, URDF
@@ -29,7 +30,7 @@ from calib.procedure.measuring.pose_limits import read_limits, tables_of
 from calib.procedure.report import page
 from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import steps
-from calib.procedure.session.dynamics_steps import pick_motion, unrecorded_payloads
+from calib.procedure.session.dynamics_steps import pick_motion, picked_front, unrecorded_payloads
 from calib.procedure.session.folder import POSES, UNSEEN, WAYS, Say, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
@@ -301,6 +302,9 @@ def new_session(
     of_instrument: dict[str, object] = asdict(device) | {"reference": reference}
     if tool is not None:
         of_instrument["tool"] = [*map(float, tool)]
+    tolerances = motion.get("tolerance_torque", ())
+    if isinstance(tolerances, Sequence):
+        check_tolerances(tolerances, chain.n)
     copied, named = _limits(limits, chain, source, dynamics)
     table = {
         "name": chain.name,
@@ -368,7 +372,8 @@ def go_on(
     with locked(session, say):
         if pick:
             step = steps.find(session, "excite")
-            steps.run_instead(session, step, partial(pick_motion, pick), say, progress, command)
+            make = partial(pick_motion, picked_front(session, pick))
+            steps.run_instead(session, step, make, say, progress, command)
         if again:
             steps.forget(session, steps.find(session, again))
         state = steps.run_next(session, say, progress, command)

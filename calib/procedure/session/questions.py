@@ -19,7 +19,7 @@ from calib.errors import CalibError, UsageError, one_of, refused_as, require
 from calib.procedure.answers import CAMERA, CELL, Answers, CertificateSection
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, checked_goal
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
-from calib.procedure.session.settings import NOTHING, InstrumentSection
+from calib.procedure.session.settings import NOTHING, InstrumentSection, check_labels
 from calib.records import FieldValues
 from calib.robot.library import resolve
 from calib.transforms import pose, to_xyz_rpy
@@ -176,7 +176,8 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
         case "goals":
             value = [] if is_empty else text.split()
         case "period":
-            value = Real(quantity="1").read(text)
+            with refused_as(UsageError, ValueError, f"--period {text}: expected a number of seconds"):
+                value = Real(quantity="1").read(text)
         case "front":
             value = int(text) if text.isdecimal() else text
         case "obstacles":
@@ -226,6 +227,8 @@ def checked(answers: Answers) -> FieldValues:
         "goal": answers.goals,
         "period": answers.period,
         "front": answers.front,
+        "tolerance-percent": answers.tolerance_percent,
+        "tolerance-torque": answers.tolerance_torque,
     }
     for option, answer in of_dynamics.items():
         require(
@@ -276,6 +279,8 @@ def stated_payloads(texts: Sequence[str]) -> dict[str, dict[str, object]]:
             label not in payloads, f"--payload {text}: '{label}' is stated twice; give each payload a label", UsageError
         )
         payloads[label] = payload
+    with refused_as(UsageError, ValueError, "--payload: {}"):
+        check_labels(payloads)
     return payloads
 
 

@@ -251,7 +251,7 @@ class DynamicsSection:
     payloads: Mapping[str, Annotated[Payload, Checked(mass_as_payload)]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_labels(self.payloads)
+        check_labels(self.payloads)
         if self.repeats > MAX_SAMPLES / max(self.period * self.rate, 1e-300):  # a quotient: repeats may be huge
             raise ValueError(
                 f"period {self.period:g} s at rate {self.rate:g} Hz, repeated {self.repeats} times, is more than "
@@ -259,7 +259,7 @@ class DynamicsSection:
             )
 
 
-def _check_labels(labels: Iterable[str]) -> None:
+def check_labels(labels: Iterable[str]) -> None:
     """Raise a ValueError if a label occurs in the names of all recordings, which labels assign to payloads."""
     for label in labels:
         if label.lower() in RECORDING_WORDS:

@@ -29,7 +29,7 @@ def mjcf_text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: n
 
     Args:
         chain: the arm.
-        bodies: (B, 10) standard parameters of the body after each moving element.
+        bodies: (B, 10) standard parameters of the body after each of B moving elements.
         armature, damping, friction: (n,) motor inertia, viscous and Coulomb friction of each joint [kg m², N m s/rad, N
             m, or kg, N s/m, N].
     """

@@ -448,7 +448,8 @@ def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
 def transform_body(body: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Return standard parameters (10,) transformed to another frame.
 
-    With R, p of the pose and mc = (MX, MY, MZ): mc' = R mc + M p, and I' = R I R' + S(p)'S(R mc) + S(R mc)'S(p) + M
+    With R, p of the pose, M the mass, mc = (MX, MY, MZ), I the inertia about the frame's origin, S(·) the skew matrix
+    of a vector, and a prime for the other frame: mc' = R mc + M p, and I' = R I R' + S(p)'S(R mc) + S(R mc)'S(p) + M
     S(p)'S(p)  (Khalil and Dombre, 2002, eq. 9.25, signs of the matrix).
 
     Args:
