@@ -33,7 +33,8 @@ essential), ``condition_number`` (raw, and with columns of unit norm), ``frictio
 ``loop``, ``tracking`` by file (or ``tracking_failure``), ``filters`` by file, ``geometry``, ``warnings`` and the
 findings behind them, ``noticed`` (code, values; `calib explain CODE`), ``verdict``, its ``reason``, and ``code`` and
 ``advice`` of the finding that decided it, ``error_density`` of each row (variance of its errors over the independent
-rows per second), ``seed``, ``schema`` (3; files without one are of earlier versions and are
+rows per second), ``error_growth`` (share of this variance that grows with the variance of the row's torque,
+``torque_variance``, on another motion), ``seed``, ``schema`` (3; files without one are of earlier versions and are
 read, too). No number: null.
 
 Figures: those of the report, as ``plot_torque_N.png`` of every unseen recording in the order given, of those to learn

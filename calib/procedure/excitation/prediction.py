@@ -66,12 +66,14 @@ class MotionPrediction:
         rows_per_joint: number of independent rows per joint.
         torque_sigma: (n,) rms over the typical task of the σ of the predicted torque [N m or N].
         torque_sigma_share: rms over the joints of `torque_sigma`, as a share of the torque limits.
+        error_growth: largest factor of a torque error's σ compared with that of the earlier motions; 1 without these.
     """
 
     seconds: float
     rows_per_joint: float
     torque_sigma: Array
     torque_sigma_share: float
+    error_growth: float = 1.0
 
 
 class PredictedSigma(NamedTuple):
@@ -357,10 +359,12 @@ def _prediction(
     rows = 2.0 * _band(motion, period) * period * repeat
 
     regressor = exact.regressor(motion.q, motion.v, motion.a)
+    growth = np.ones(regressor.shape[1])
     # rows are weighted by the stated density of the torques' errors, else by the noise of each independent row
     sigmas = inputs.columns.sigmas
     if sigmas is not None and inputs.errors_known:
-        sigmas = sigmas * _growth(inputs, regressor)
+        growth = _growth(inputs, regressor)
+        sigmas = sigmas * growth
         weight = period * repeat / PERIOD_SAMPLES
         earlier = _information_root(inputs)
     else:
@@ -377,7 +381,8 @@ def _prediction(
     information_shifts = earlier.T @ (earlier @ _shifts_before(inputs)) - Y.T @ geometry_torques
     shifts = root @ (root.T @ information_shifts)
     torque_sigma, share = _torque_sigma(inputs, task, root, shifts)
-    return MotionPrediction(period * repeat, rows, torque_sigma, share), root, shifts
+    prediction = MotionPrediction(period * repeat, rows, torque_sigma, share, float(growth.max()))
+    return prediction, root, shifts
 
 
 def _growth(inputs: ExcitationInputs, regressor: np.ndarray) -> np.ndarray:
@@ -470,8 +475,9 @@ def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> l
     rows = [row for row in predicted if row.sigma_before]
     rows.sort(key=lambda row: row.sigma / (row.sigma_before or np.inf))
     gains = [f"{row.name} from ± {row.sigma_before:.3g} to ± {row.sigma:.3g} {row.unit}" for row in rows[:NAMED_GAINS]]
+    assumed = f"; torque errors assumed up to {outlook.own.error_growth:.2g} times those so far"
     return [
-        f"{head}{100 * outlook.before:.2g} % so far, with this motion {designed}{by_period}",
+        f"{head}{100 * outlook.before:.2g} % so far, with this motion {designed}{by_period}{assumed}",
         "most improved: " + "; ".join(gains),
     ]
 
