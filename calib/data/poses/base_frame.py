@@ -65,9 +65,9 @@ def _refuse_longer(sheet: Sheet, layout: Layout, missing: np.ndarray) -> None:
         missing: (m,) rows without a base frame.
     """
     joints = np.column_stack(sheet.table.check(layout.joints, layout.joints))
-    alone = np.isnan(joints).all(axis=1) & ~missing
+    without_joints = np.isnan(joints).all(axis=1) & ~missing
     message = f"has a base frame and no joint values: {OTHER_ROWS}"
-    refuse(sheet.table, alone, layout.base, lambda row, k: message)
+    refuse(sheet.table, without_joints, layout.base, lambda row, k: message)
 
 
 def _refuse_shorter(sheet: Sheet, layout: Layout, missing: np.ndarray) -> None:
@@ -100,7 +100,7 @@ def _refuse_other_clock(sheet: Sheet) -> None:
     t = table.numbers(times[0], TIME.dimension)
     base_t = table.numbers(BASE_TIME, TIME.dimension, gaps=True)
     interval = float(np.median(np.abs(np.diff(t))))
-    apart = np.abs(base_t - t)
+    difference = np.abs(base_t - t)
 
     def says(row: int, column: int) -> str:
         return (
@@ -109,7 +109,7 @@ def _refuse_other_clock(sheet: Sheet) -> None:
             f"by one clock (calib join --by time); if they were read together, remove {BASE_TIME}"
         )
 
-    refuse(table, apart > 0.5 * interval, (BASE_TIME,), says)
+    refuse(table, difference > 0.5 * interval, (BASE_TIME,), says)
 
 
 def seen_from_base(sheet: Sheet, layout: Layout, block: Positions, row: np.ndarray) -> Positions:
