@@ -61,7 +61,7 @@ def true_error(block: Positions) -> float:
     points = see(found.cell, unseen).point.T
     truth = true_poses(cell, unseen)[:, :3, 3]
     points, truth = points - points.mean(axis=0), truth - truth.mean(axis=0)
-    turn, _ = Rotation.align_vectors(truth, points)
+    turn = Rotation.align_vectors(truth, points)[0]
     return float(1e3 * np.sqrt(np.mean(np.sum((turn.apply(points) - truth) ** 2, axis=1))))
 
 
@@ -154,7 +154,7 @@ def test_predicted_sigma_counts_both_frames(tmp_path):
     instrument = SimulatedInstrument()
     target = lwr4plus.tool(lwr4plus.table_2()[0])[:3, 3]
     sigmas = instrument.position_sigma, instrument.orientation_sigma or 0.0
-    seen = observation(targets_of(ARM, [target]), "pose", sigmas, reference=True)
+    seen = observation(targets_of(ARM, [target.tolist()]), "pose", sigmas, reference=True)
     prediction = predicted(seen, seen(q), unseen)
     cell = lwr4plus_cell(SimulatedInstrument(base_frame=np.eye(4)), hidden=0.0)
     truth = (invert(cell.truth.stations[0]) @ true_poses(cell, unseen))[:, :3, 3]
