@@ -16,13 +16,15 @@ from calib.geometry.checks.base_motion import base_motion, spread_of
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import see
+from calib.geometry.observability import observation, targets_of
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import level_of, sentence
+from calib.procedure.measuring.prediction import predicted
 from calib.robot.chain import random_joints
 from calib.simulation import lwr4plus
-from calib.simulation.cell import Cell, SimulatedInstrument, measure_frames, true_poses, write_measured
+from calib.simulation.cell import Cell, SimulatedInstrument, measure, measure_frames, true_poses, write_measured
 from calib.simulation.virtual_cells import lwr4plus_cell
-from calib.transforms import pose
+from calib.transforms import invert, pose
 
 ARM = lwr4plus.nominal_chain()
 LEDS = pose(None, [0.25, 0.0, 0.1])
@@ -59,7 +61,7 @@ def true_error(block: Positions) -> float:
     points = see(found.cell, unseen).point.T
     truth = true_poses(cell, unseen)[:, :3, 3]
     points, truth = points - points.mean(axis=0), truth - truth.mean(axis=0)
-    turn, _ = Rotation.align_vectors(truth, points)
+    turn = Rotation.align_vectors(truth, points)[0]
     return float(1e3 * np.sqrt(np.mean(np.sum((turn.apply(points) - truth) ** 2, axis=1))))
 
 
@@ -143,3 +145,23 @@ def test_base_frame_that_measures_nothing_is_named(tmp_path):
 
 def test_blocks_without_base_frame_are_silent(tmp_path):
     assert not base_motion([measured(tmp_path, 1e-3, 0, "ignored")])
+
+
+def test_predicted_sigma_counts_both_frames(tmp_path):
+    """Errors from the base frame at unseen poses are as large as the pose plan predicts."""
+    q = study_poses(40, 5)
+    unseen = study_poses(200, 99)
+    instrument = SimulatedInstrument()
+    target = lwr4plus.tool(lwr4plus.table_2()[0])[:3, 3]
+    sigmas = instrument.position_sigma, instrument.orientation_sigma or 0.0
+    seen = observation(targets_of(ARM, [target.tolist()]), "pose", sigmas, reference=True)
+    prediction = predicted(seen, seen(q), unseen)
+    cell = lwr4plus_cell(SimulatedInstrument(base_frame=np.eye(4)), hidden=0.0)
+    truth = (invert(cell.truth.stations[0]) @ true_poses(cell, unseen))[:, :3, 3]
+    squares = []
+    for seed in range(8):
+        block = measure(cell, q, seed)
+        start = polish_frames(install(cell.nominal, [block]), [block]).cell
+        found = fit(start, [block], settings=Settings(passes=1))
+        squares.append(np.mean(np.sum((see(found.cell, unseen).point.T - truth) ** 2, axis=1)))
+    assert np.sqrt(np.mean(squares)) / prediction.rms == pytest.approx(1.0, abs=0.2)

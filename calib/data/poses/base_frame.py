@@ -19,9 +19,7 @@ from calib.data.schema import refuse
 TARGET_TIMES = (*TIME.names, "t")
 # number of last rows without a base frame, all others having one, that are a column of another length (our choice)
 MIN_SHORTER = 2
-OTHER_ROWS = (
-    "were base frames recorded at other rows? Put each one into the row of its target (calib join by name or time)"
-)
+OTHER_ROWS = "were base frames recorded at other rows? Put into each row the base frame that was read with its target"
 
 
 def rows_with_base(sheet: Sheet, layout: Layout) -> tuple[Sheet, tuple[str, ...]]:
@@ -39,7 +37,7 @@ def rows_with_base(sheet: Sheet, layout: Layout) -> tuple[Sheet, tuple[str, ...]
     table = sheet.table
     columns = np.column_stack(table.check(layout.base, layout.base))
     empty = np.isnan(columns)
-    missing = empty.all(axis=1)
+    missing = np.asarray(empty.all(axis=1))
     partial = empty & ~missing[:, None]
     message = "is empty, unlike others of the base frame: leave all of them empty where it was not measured"
     refuse(table, partial, layout.base, lambda row, k: message)
@@ -65,9 +63,9 @@ def _refuse_longer(sheet: Sheet, layout: Layout, missing: np.ndarray) -> None:
         missing: (m,) rows without a base frame.
     """
     joints = np.column_stack(sheet.table.check(layout.joints, layout.joints))
-    alone = np.isnan(joints).all(axis=1) & ~missing
+    without_joints = np.isnan(joints).all(axis=1) & ~missing
     message = f"has a base frame and no joint values: {OTHER_ROWS}"
-    refuse(sheet.table, alone, layout.base, lambda row, k: message)
+    refuse(sheet.table, without_joints, layout.base, lambda row, k: message)
 
 
 def _refuse_shorter(sheet: Sheet, layout: Layout, missing: np.ndarray) -> None:
@@ -104,16 +102,16 @@ def _refuse_other_clock(sheet: Sheet) -> None:
     t = table.numbers(times[0], TIME.dimension)
     base_t = table.numbers(BASE_TIME, TIME.dimension, gaps=True)
     interval = float(np.median(np.abs(np.diff(t))))
-    apart = np.abs(base_t - t)
+    difference = np.abs(base_t - t)
 
     def says(row: int, column: int) -> str:
         return (
             f"the base frame was measured at {base_t[row]:.6g} s, the target at {t[row]:.6g} s, further apart than "
-            f"half the {interval:.3g} s between rows: was it recorded with another clock, or at other rows? Join both "
-            f"by one clock (calib join --by time); if they were read together, remove {BASE_TIME}"
+            f"half the {interval:.3g} s between rows: was it recorded with another clock, or at other rows? Put "
+            f"into each row the base frame of its target's time; if they were read together, remove {BASE_TIME}"
         )
 
-    refuse(table, apart > 0.5 * interval, (BASE_TIME,), says)
+    refuse(table, difference > 0.5 * interval, (BASE_TIME,), says)
 
 
 def seen_from_base(sheet: Sheet, layout: Layout, block: Positions, row: np.ndarray) -> Positions:

@@ -379,7 +379,7 @@ def _refuse_base_alone(sheet: Sheet) -> None:
     if not _find_targets(sheet)[0]:
         sheet.fail(
             f"contains base frames ({', '.join(base)} …) and no target: a base frame is of use in the row of the "
-            "target that was measured with it; put both into the same rows, or join both by name or time (calib join)"
+            "target that was measured with it; put both into the same rows"
         )
 
 

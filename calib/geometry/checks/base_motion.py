@@ -36,14 +36,14 @@ class Spread:
     Attributes:
         rms, largest: lengths of the deviations from the mean.
         noise: rms that noise explains: the smaller one of its two figures.
-        stated: rms that the stated σ explain; 0 if not known.
+        from_sigma: rms that the stated σ explain; 0 if not known.
         exceeds: whether the rms is larger than noise explains.
     """
 
     rms: float
     largest: float
     noise: float
-    stated: float
+    from_sigma: float
     exceeds: bool
 
 
@@ -81,11 +81,13 @@ def _judged(file: str, block: Positions, base: np.ndarray, sigma: np.ndarray) ->
     vectors = (turns * turns.mean().inv()).as_rotvec()
     shift = spread_of(base[:, :3], sigma[:, :3])
     turn = spread_of(vectors, sigma[:, 3:])
-    if shift.rms < MIN_SPREAD * shift.stated:
-        return finding("base-frame-quiet", file=file, rows=len(base), rms=shift.rms, noise=shift.stated)
-    moved = shift.exceeds or turn.exceeds
+    if shift.rms < MIN_SPREAD * shift.from_sigma:
+        return finding("base-frame-quiet", file=file, rms=shift.rms, noise=shift.from_sigma)
+    code = "base-frame-still"
+    if shift.exceeds or turn.exceeds:
+        code = "base-frame-moved"
     return finding(
-        "base-frame-moved" if moved else "base-frame-still",
+        code,
         file=file,
         rows=len(base),
         rms=shift.rms,
@@ -111,13 +113,13 @@ def spread_of(values: np.ndarray, sigma: np.ndarray) -> Spread:
     share = 1.0 - 1.0 / count
     steps = np.diff(values, axis=0)
     noise = np.sqrt(share * np.mean(np.sum(steps**2, axis=1)) / 2.0)
-    stated = 0.0
+    from_sigma = 0.0
     if np.isfinite(sigma).all():
-        stated = np.sqrt(share * np.mean(np.sum(sigma**2, axis=1)))
-        noise = min(noise, stated)
+        from_sigma = np.sqrt(share * np.mean(np.sum(sigma**2, axis=1)))
+        noise = min(noise, from_sigma)
     dof = 3 * (count - 1)
     exceeds = rms > (1.0 + MIN_SIGMAS / np.sqrt(2.0 * dof)) * noise
-    return Spread(float(rms), float(lengths.max()), float(noise), float(stated), bool(exceeds))
+    return Spread(float(rms), float(lengths.max()), float(noise), float(from_sigma), bool(exceeds))
 
 
 def _added_noise(block: Positions) -> float | None:

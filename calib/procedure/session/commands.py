@@ -299,7 +299,7 @@ def new_session(
     chain = load(robot, base or None, tip or None)
     if program:
         check_controller(program, chain.n)
-    of_instrument: dict[str, object] = asdict(device) | {"reference": reference}
+    of_instrument: dict[str, object] = {**asdict(device), "reference": reference}
     if tool is not None:
         of_instrument["tool"] = [*map(float, tool)]
     tolerances = motion.get("tolerance_torque", ())

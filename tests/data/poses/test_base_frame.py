@@ -80,8 +80,9 @@ def save(path, head: list[str], rows: list[list[str]]):
     return path
 
 
-def read(path, **options):
+def read(path, **options) -> Poses:
     (block,) = read_measurements(path, ("a", "b"), FileOptions(**options))
+    assert isinstance(block, Poses)
     return block
 
 
@@ -174,11 +175,11 @@ def without_orientation(head, rows):
 @pytest.mark.parametrize(
     ("spoil", "row", "words"),
     [
-        (shorter, 9, "ends 4 rows before the target: were base frames recorded at other rows.*calib join"),
+        (shorter, 9, "ends 4 rows before the target: were base frames recorded at other rows.*read with its target"),
         (longer, 13, "has a base frame and no joint values: were base frames recorded at other rows"),
         (partly, 5, "is empty, unlike others of the base frame"),
         (absent, None, "the base frame was measured in no row"),
-        (another_clock, 6, "was measured at 57 s, the target at 50 s.*another clock.*calib join --by time"),
+        (another_clock, 6, "was measured at 57 s, the target at 50 s.*another clock.*its target's time"),
         (millimetres, 1, r"if it is in mm, name the column 'base_x \[mm\]'"),
         (apart, None, "contains base frames .* and no target.*into the same rows"),
         (without_orientation, None, "the base frame is incomplete: it needs base_x"),
