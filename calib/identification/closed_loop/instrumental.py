@@ -270,10 +270,12 @@ def identify_instrumental(
     plant = regular_plant(model, friction.terms, loop, inertia)
     std = ordinary.group_std
     before: LinearFit | None = None
+    noise: list[PositionNoise] = []
     rounds: list[Round] = []
     try:
         runs = simulated_runs(plant, cases)
-        noise = [position_noise(plant, case, loop) for case, loop in cases]
+        for case, recording_loop in cases:
+            noise.append(position_noise(plant, case, recording_loop))
         retreats = 0
         tau = 1.0
     except NotConverged as error:
@@ -288,8 +290,7 @@ def identify_instrumental(
         iteration = Round(_change(before, estimate.fit), residual_std, retreats)
         rounds.append(iteration)
         if say is not None:
-            change = f": parameters change by {100 * iteration.change:.3g} %" if before is not None else ""
-            say(f"{method}, round {len(rounds)}{change}")
+            say(f"{method}, round {len(rounds)}: parameters change by {100 * min(iteration.change, 1.0):.3g} %")
         if before is not None and retreats == 0 and instrumental_variables.settled(before, estimate.fit):
             return _result(task, estimate, ordinary, task.plant(plant, estimate), rounds, std, runs)
         try:
@@ -403,8 +404,10 @@ class _Fixed:
         base_signs = np.zeros(len(self.base.kept), dtype=bool)
         for position, k in enumerate(self.base.kept - self.model.inertial):
             base_signs[position] = k >= 0 and self.model.columns[k].form.undecided_at_rest
-        richer_signs = [term.form.undecided_at_rest for term in self.friction.terms]
-        return base_signs, np.array(richer_signs, dtype=bool)
+        richer_signs = np.zeros(len(self.friction.terms), dtype=bool)
+        for position, term in enumerate(self.friction.terms):
+            richer_signs[position] = term.form.undecided_at_rest
+        return base_signs, richer_signs
 
     def after(self, estimate: _Found) -> _Fixed:
         """Return the settings of the next iteration; its constraints start with the postures binding in `estimate`."""

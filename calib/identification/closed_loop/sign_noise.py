@@ -83,7 +83,11 @@ def position_noise(plant: Plant, case: Case, loop: Loop) -> PositionNoise:
         fast_q = q - low_pass(q, motion.rate, cutoff)
         fast_tau = tau - low_pass(tau, motion.rate, cutoff)
         count = len(q) - lags
-        return np.array([np.mean(fast_q[:count] * fast_tau[lag : lag + count], axis=0) for lag in range(lags + 1)])
+        covariances = []
+        for lag in range(lags + 1):
+            products = fast_q[:count] * fast_tau[lag : lag + count]
+            covariances.append(products.mean(axis=0))
+        return np.array(covariances)
 
     expected = answered(run.measured[samples], run.tau[samples])
     recorded = answered(motion.q_measured, torque)
@@ -138,6 +142,8 @@ def _in_loop(
         q = noisy.q[nearest]
     else:
         q = CubicSpline(np.arange(len(noisy.t)), noisy.q)(places)
-    last = len(noisy.t) - 1
-    speeds = [noisy.v[np.minimum(nearest + step, last)] for step in range(3)]
+    speeds = []
+    for step in range(len(SIMPSON)):
+        instants = np.minimum(nearest + step, len(noisy.t) - 1)
+        speeds.append(noisy.v[instants])
     return q + error, speeds

@@ -246,11 +246,14 @@ class _Comparison:
         """Return the comparison with the recordings' noise in the loop, as their torques answer it."""
         if self.robot.steps is not None:
             return replace(self, noise=(None,) * len(self.loops.pairs))
-        noise = []
+        noise: list[np.ndarray | None] = []
         for case, loop in self.loops.pairs:
             sigma = position_noise(self.robot.at(values), case, loop).loop
             drawn = np.random.default_rng(SEED).normal(size=loop.reference.q.shape) * sigma
-            noise.append(drawn if np.any(sigma) else None)
+            if np.any(sigma):
+                noise.append(drawn)
+            else:
+                noise.append(None)
         return replace(self, noise=tuple(noise))
 
     def _mean_run(
@@ -269,7 +272,9 @@ class _Comparison:
             return first
         self.count[0] += 1
         second = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative, -drawn)
-        means = {name: 0.5 * (value + getattr(second, name)) for name, value in field_values(first).items()}
+        means = {}
+        for name, value in field_values(first).items():
+            means[name] = 0.5 * (value + getattr(second, name))
         return Sensitivities(**means)
 
     def _sensed(self, plant: Plant, case: Case, run: Sensitivities, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
