@@ -34,7 +34,7 @@ from calib.estimation.whiteness import inflation
 from calib.identification.closed_loop import instrumental_variables
 from calib.identification.closed_loop.instrumental_variables import Instruments, InstrumentStrength
 from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
-from calib.identification.closed_loop.sign_noise import PositionNoise, mean_signs, position_noise
+from calib.identification.closed_loop.sign_noise import PositionNoise, mean_signs, position_noise, with_quiet_speed
 from calib.identification.closed_loop.simulated_runs import (
     MAX_GAIN_RATIO,
     MAX_RETREATS,
@@ -409,6 +409,15 @@ class _Fixed:
             richer_signs[position] = term.form.undecided_at_rest
         return base_signs, richer_signs
 
+    @cached_property
+    def width(self) -> float:
+        """The least width of a smoothed sign [rad/s or m/s]."""
+        widths = [np.inf]
+        for term in (*self.model.columns, *self.friction.terms):
+            settings = dict(zip(term.form.settings, term.settings))
+            widths.append(settings.get("v0", np.inf))
+        return min(widths)
+
     def after(self, estimate: _Found) -> _Fixed:
         """Return the settings of the next iteration; its constraints start with the postures binding in `estimate`."""
         if self.constraints is None or estimate.bound is None:
@@ -469,9 +478,10 @@ def _estimate_round(task: _Fixed, plant: Plant, runs: Runs, std: np.ndarray, tau
         matrix = task.friction.added(simulated_rows, replayed).matrix
         signs = np.concatenate(task.signs)
         if signs.any():
-            true, recorded = mean_signs(partial(_sign_columns, task), plant, case, loop, run, noise)
+            sign_columns = partial(_sign_columns, task)
+            true, recorded = mean_signs(sign_columns, plant, case, loop, run, noise, task.width)
             corrected = rows.matrix.copy()
-            corrected[:, :, signs] += true - recorded
+            corrected[:, :, signs] = sign_columns(with_quiet_speed(case, task.width)) + true - recorded
             rows = replace(rows, matrix=corrected)
             if not task.estimator.measured:
                 matrix = matrix.copy()

@@ -154,7 +154,8 @@ class _Comparison:
         loops: closed loops of the recordings.
         torques: whether motor torques are compared instead of positions.
         count: number of simulations so far, in a list of one entry.
-        noise: (N, n) noise of the measured positions in each loop [rad or m], drawn once; None for loops without.
+        noise: (N, n) noise of the measured positions in each loop [rad or m], drawn once; None for loops without,
+            no entries for none.
     """
 
     problem: IdentificationProblem
@@ -202,7 +203,8 @@ class _Comparison:
         """Return residuals (M, r), zero if not in use, and the Jacobian (M, r, p) of the simulated signals."""
         residuals = []
         slopes = []
-        for (case, loop), drawn in zip(self.loops.pairs, self.noise, strict=True):
+        noise = self.noise or (None,) * len(self.loops.pairs)
+        for (case, loop), drawn in zip(self.loops.pairs, noise, strict=True):
             plant = self.robot.at(values, case)
             controller = loop.controller
             relative = None
