@@ -6,7 +6,7 @@ Absolute angles φ = cumsum(q), links of length l with mass m at c from the join
     h_j = Σ_k μ_jk sin(φ_j - φ_k) φ̇_k² + g cos φ_j Σ_i m_i a_ij
 
 A PD controller at 1 kHz acts on measured positions and their backward difference, its torque is held over the period;
-classical Runge–Kutta steps of 0.25 ms.
+classical Runge–Kutta steps of 0.25 ms. Sensors read the mean of what is before and after the torque's step.
 """
 
 from dataclasses import dataclass
@@ -66,6 +66,7 @@ def run(q_ref, v_ref, kp, kd, noise, arm, drives):
     period = 1.0 / RATE
     q, v, step = q_ref[0].copy(), v_ref[0].copy(), period / STEPS
     before = q + noise[0] - period * v
+    held = np.zeros(3)
     out = np.zeros((3, len(q_ref), 3))
     for k in range(len(q_ref)):
         seen = q + noise[k]
@@ -73,7 +74,9 @@ def run(q_ref, v_ref, kp, kd, noise, arm, drives):
         before = seen
         matrix, torque = rigid(q, v, arm)
         out[0, k], out[1, k] = q, tau
-        out[2, k] = matrix @ accelerations(q, v, tau, arm, drives) + torque
+        jump = accelerations(q, v, tau, arm, drives) + accelerations(q, v, held, arm, drives)
+        out[2, k] = 0.5 * matrix @ jump + torque
+        held = tau
         for _ in range(STEPS):
             a1 = accelerations(q, v, tau, arm, drives)
             v2 = v + 0.5 * step * a1

@@ -34,7 +34,7 @@ from calib.estimation.whiteness import inflation
 from calib.identification.closed_loop import instrumental_variables
 from calib.identification.closed_loop.instrumental_variables import Instruments, InstrumentStrength
 from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
-from calib.identification.closed_loop.sign_noise import PositionNoise, mean_signs, position_noise
+from calib.identification.closed_loop.sign_noise import PositionNoise, mean_signs, position_noise, with_quiet_speed
 from calib.identification.closed_loop.simulated_runs import (
     MAX_GAIN_RATIO,
     MAX_RETREATS,
@@ -270,10 +270,12 @@ def identify_instrumental(
     plant = regular_plant(model, friction.terms, loop, inertia)
     std = ordinary.group_std
     before: LinearFit | None = None
+    noise: list[PositionNoise] = []
     rounds: list[Round] = []
     try:
         runs = simulated_runs(plant, cases)
-        noise = [position_noise(plant, case, loop) for case, loop in cases]
+        for case, recording_loop in cases:
+            noise.append(position_noise(plant, case, recording_loop))
         retreats = 0
         tau = 1.0
     except NotConverged as error:
@@ -288,8 +290,7 @@ def identify_instrumental(
         iteration = Round(_change(before, estimate.fit), residual_std, retreats)
         rounds.append(iteration)
         if say is not None:
-            change = f": parameters change by {100 * iteration.change:.3g} %" if before is not None else ""
-            say(f"{method}, round {len(rounds)}{change}")
+            say(f"{method}, round {len(rounds)}: parameters change by {100 * min(iteration.change, 1.0):.3g} %")
         if before is not None and retreats == 0 and instrumental_variables.settled(before, estimate.fit):
             return _result(task, estimate, ordinary, task.plant(plant, estimate), rounds, std, runs)
         try:
@@ -403,8 +404,19 @@ class _Fixed:
         base_signs = np.zeros(len(self.base.kept), dtype=bool)
         for position, k in enumerate(self.base.kept - self.model.inertial):
             base_signs[position] = k >= 0 and self.model.columns[k].form.undecided_at_rest
-        richer_signs = [term.form.undecided_at_rest for term in self.friction.terms]
-        return base_signs, np.array(richer_signs, dtype=bool)
+        richer_signs = np.zeros(len(self.friction.terms), dtype=bool)
+        for position, term in enumerate(self.friction.terms):
+            richer_signs[position] = term.form.undecided_at_rest
+        return base_signs, richer_signs
+
+    @cached_property
+    def width(self) -> float:
+        """The least width of a smoothed sign [rad/s or m/s]."""
+        widths = [np.inf]
+        for term in (*self.model.columns, *self.friction.terms):
+            settings = dict(zip(term.form.settings, term.settings))
+            widths.append(settings.get("v0", np.inf))
+        return min(widths)
 
     def after(self, estimate: _Found) -> _Fixed:
         """Return the settings of the next iteration; its constraints start with the postures binding in `estimate`."""
@@ -466,9 +478,10 @@ def _estimate_round(task: _Fixed, plant: Plant, runs: Runs, std: np.ndarray, tau
         matrix = task.friction.added(simulated_rows, replayed).matrix
         signs = np.concatenate(task.signs)
         if signs.any():
-            true, recorded = mean_signs(partial(_sign_columns, task), plant, case, loop, run, noise)
+            sign_columns = partial(_sign_columns, task)
+            true, recorded = mean_signs(sign_columns, plant, case, loop, run, noise, task.width)
             corrected = rows.matrix.copy()
-            corrected[:, :, signs] += true - recorded
+            corrected[:, :, signs] = sign_columns(with_quiet_speed(case, task.width)) + true - recorded
             rows = replace(rows, matrix=corrected)
             if not task.estimator.measured:
                 matrix = matrix.copy()

@@ -13,6 +13,9 @@ v_± is the motion under the noise e and under -e, which cancels what is linear 
 is averaged by Simpson's rule: under a derivative of noise it changes by more than a sign's width from one instant to
 the next. The measured sign remains, and with it reversals that the simulation does not know.
 
+Both signs are those of a speed that is low-passed until its noise is a sign's width, but not below half the band: what
+that rounds off is taken back with the rest, and less noise remains in the column.
+
 The share of the noise that is in the loop is told by the torques: above the motion's band a controller answers the
 noise that it sees, and no other. It is the slope of the recorded covariances of positions and torques, by lags, on
 those of a simulation with all noise in the loop.
@@ -27,7 +30,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from calib.data.signals.bandwidth import USABLE
-from calib.data.signals.filtering import low_pass
+from calib.data.signals.filtering import low_pass, slope
 from calib.identification.closed_loop.loop_recordings import Loop, simulated_case, simulated_samples
 from calib.identification.closed_loop.simulated_runs import simulated_run
 from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun
@@ -90,7 +93,11 @@ def position_noise(plant: Plant, case: Case, loop: Loop) -> PositionNoise:
         fast_q = q - low_pass(q, motion.rate, cutoff)
         fast_tau = tau - low_pass(tau, motion.rate, cutoff)
         count = len(q) - lags
-        return np.array([np.mean(fast_q[:count] * fast_tau[lag : lag + count], axis=0) for lag in range(lags + 1)])
+        covariances = []
+        for lag in range(lags + 1):
+            products = fast_q[:count] * fast_tau[lag : lag + count]
+            covariances.append(products.mean(axis=0))
+        return np.array(covariances)
 
     expected = answered(run.measured[samples], run.tau[samples])
     recorded = answered(motion.q_measured, torque)
@@ -101,7 +108,13 @@ def position_noise(plant: Plant, case: Case, loop: Loop) -> PositionNoise:
 
 
 def mean_signs(
-    columns: Callable[[Case], np.ndarray], plant: Plant, case: Case, loop: Loop, run: SimulatedRun, noise: PositionNoise
+    columns: Callable[[Case], np.ndarray],
+    plant: Plant,
+    case: Case,
+    loop: Loop,
+    run: SimulatedRun,
+    noise: PositionNoise,
+    width: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return columns of signs (M, rows, k), means over noise: of the true motion, and of that recorded and filtered.
 
@@ -112,6 +125,7 @@ def mean_signs(
         case: the recording.
         loop: its closed loop.
         noise: standard deviations of the noise in the loop and in the log.
+        width: as in `with_quiet_speed`.
     """
     true_means = []
     recorded_means = []
@@ -123,7 +137,7 @@ def mean_signs(
         error = factor * noise.log * np.random.default_rng([SEED, 1]).normal(size=q.shape)
         recorded = simulated_case(case, replace(run, q=q + error), loop)
         samples = simulated_samples(case, run.t, loop)
-        recorded_columns = columns(recorded)
+        recorded_columns = columns(with_quiet_speed(recorded, width))
         true_columns = np.zeros_like(recorded_columns)
         for weight, speed in zip(weights, speeds):
             motion = replace(recorded.motion, v=speed[samples])
@@ -131,6 +145,20 @@ def mean_signs(
         true_means.append(0.5 * true_columns)
         recorded_means.append(0.5 * recorded_columns)
     return true_means[0] + true_means[1], recorded_means[0] + recorded_means[1]
+
+
+def with_quiet_speed(case: Case, width: float) -> Case:
+    """Return the case with a speed whose noise is a sign's `width` [rad/s or m/s] at most, or that of half the band."""
+    motion = case.motion
+    noise = np.maximum(motion.velocity_noise(), 1e-300)
+    cutoff = motion.velocity_cutoff * np.minimum(1.0, (width / noise) ** (2.0 / 3.0))
+    cutoff = np.maximum(cutoff, 0.5 * motion.band)
+    v = np.array(motion.v)
+    for joint in np.flatnonzero(cutoff < motion.velocity_cutoff):
+        q = low_pass(motion.q[:, joint], motion.rate, float(cutoff[joint]))
+        quiet = slope(q, motion.rate)
+        v[:, joint] = np.where(np.isnan(quiet), motion.v[:, joint], quiet)
+    return replace(case, motion=replace(motion, v=v))
 
 
 def _in_loop(
@@ -153,6 +181,8 @@ def _in_loop(
         q = noisy.q[nearest]
     else:
         q = CubicSpline(np.arange(len(noisy.t)), noisy.q)(places)
-    last = len(noisy.t) - 1
-    speeds = [noisy.v[np.minimum(nearest + step, last)] for step in range(3)]
+    speeds = []
+    for step in range(len(SIMPSON)):
+        instants = np.minimum(nearest + step, len(noisy.t) - 1)
+        speeds.append(noisy.v[instants])
     return q + error, speeds

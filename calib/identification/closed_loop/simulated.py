@@ -408,8 +408,8 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
             f"with the instruments of unbound parameters alone (Janot's form) the estimate is at most "
             f"{distance.max():.2g} σ away, at {identification.names[int(np.argmax(distance))]}",
         )
-    shares = np.array([noise.share for noise in identification.noise]).min(axis=0)
-    by_joint = ", ".join(f"{100 * share:.0f}" for share in shares)
+    shares = np.min([noise.share for noise in identification.noise], axis=0)
+    by_joint = np.array2string(100 * shares, formatter={"float": "{:.0f}".format})
     notes = (
         f"share of the position noise that the controller answers, by joint: {by_joint} %; Coulomb signs are averaged "
         "over the noise, simulated in the loop by this share",

@@ -61,7 +61,11 @@ def simulated_runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
         plant: the simulated robot.
         cases: gap-free parts of recordings, each with its loop.
     """
-    return [((case, loop), simulated_run(plant, case, loop, Sensing(every=loop.every))) for case, loop in cases]
+    result: Runs = []
+    for case, loop in cases:
+        run = simulated_run(plant, case, loop, Sensing(every=loop.every))
+        result.append(((case, loop), run))
+    return result
 
 
 def simulated_run(plant: Plant, case: Case, loop: Loop, sensing: Sensing, seed: int = 0) -> SimulatedRun:

@@ -154,7 +154,8 @@ class _Comparison:
         loops: closed loops of the recordings.
         torques: whether motor torques are compared instead of positions.
         count: number of simulations so far, in a list of one entry.
-        noise: (N, n) noise of the measured positions in each loop [rad or m], drawn once; None for loops without.
+        noise: (N, n) noise of the measured positions in each loop [rad or m], drawn once; None for loops without,
+            no entries for none.
     """
 
     problem: IdentificationProblem
@@ -209,7 +210,8 @@ class _Comparison:
         """
         residuals = []
         slopes = []
-        for (case, loop), drawn in zip(self.loops.pairs, self.noise, strict=True):
+        noise = self.noise or (None,) * len(self.loops.pairs)
+        for (case, loop), drawn in zip(self.loops.pairs, noise, strict=True):
             plant = self.robot.at(values, case)
             controller = loop.controller
             relative = None
@@ -257,11 +259,14 @@ class _Comparison:
         """
         if self.robot.steps is not None:
             return replace(self, noise=(None,) * len(self.loops.pairs))
-        noise = []
+        noise: list[np.ndarray | None] = []
         for case, loop in self.loops.pairs:
             sigma = position_noise(self.robot.at(values), case, loop).loop
             drawn = np.random.default_rng(SEED).normal(size=loop.reference.q.shape) * sigma
-            noise.append(drawn if np.any(sigma) else None)
+            if np.any(sigma):
+                noise.append(drawn)
+            else:
+                noise.append(None)
         return replace(self, noise=tuple(noise))
 
     def _mean_run(
@@ -289,7 +294,9 @@ class _Comparison:
             return first
         self.count[0] += 1
         second = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative, -drawn)
-        means = {name: 0.5 * (value + getattr(second, name)) for name, value in field_values(first).items()}
+        means = {}
+        for name, value in field_values(first).items():
+            means[name] = 0.5 * (value + getattr(second, name))
         return Sensitivities(**means)
 
     def _sensed(self, plant: Plant, case: Case, run: Sensitivities, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -105,24 +105,22 @@ def test_mean_of_noisy_sign_is_restored(monkeypatch):
 
     simulated, didim = wrong(), wrong(method="didim", limit=20)
     monkeypatch.setattr(instrumental, "mean_signs", lambda columns, plant, case, *_: (columns(case), columns(case)))
+    monkeypatch.setattr(instrumental, "with_quiet_speed", lambda case, width: case)
     measured = wrong()
     assert didim < 0.01 and simulated < 0.08 and measured > 0.2
 
 
 @pytest.mark.slow
 def test_noisy_sign_where_simulation_lags():
-    """With a fifth of the bandwidth the simulated reversals come late, and so does what is taken back of the noise.
+    """With a fifth of the bandwidth the simulated reversals come late; friction of four seeds has no bias from it.
 
-    Measured: 7.1 % off, and 0.8 % with the right one.
+    Measured: 2.2 % off at most in the mean; with the simulated sign in W's place 19 %.
     """
-    case, slow = log(1e-3, 1, 0.02), Loop(PD.slower(5.0), motion(), EVERY)
-
-    def wrong(loop=None) -> float:
-        values = found(case, loop, v0=0.02, limit=20).fit.estimate.values
-        return float(np.linalg.norm((values - truth(0.02)) / np.abs(truth(0.02)).max()))
-
-    here, there = wrong(), wrong(slow)
-    assert here < 0.02 and there < 0.1
+    slow = Loop(PD.slower(5.0), motion(), EVERY)
+    friction = [k for k, name in enumerate(arm(0.02)[2].names) if name.startswith("F")]
+    errors = [found(log(1e-3, seed, 0.02), slow, v0=0.02, limit=20).fit.estimate.values for seed in range(4)]
+    relative = np.mean(errors, axis=0)[friction] / truth(0.02)[friction] - 1.0
+    assert np.abs(relative).max() < 0.06
 
 
 @pytest.mark.parametrize(("runs", "accused"), [(3, 0), pytest.param(12, 1, marks=pytest.mark.slow)])
