@@ -19,7 +19,7 @@ from calib.data.poses.pose_lists import read_poses
 from calib.data.schema import Joints
 from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.pseudo_inertia import ball, from_standard, to_standard
+from calib.dynamics.pseudo_inertia import ball
 from calib.files import write_numbers
 from calib.identification.prior import rods
 from calib.parallel.mechanism.closure import closed
@@ -29,7 +29,7 @@ from calib.parallel.robots import find
 from calib.procedure.excitation import coefficients
 from calib.simulation import camera_cell, cell, virtual_arm, virtual_cells
 from calib.simulation.cell import write_log, write_measured
-from calib.simulation.known_robots import random_fourier
+from calib.simulation.known_robots import random_fourier, truth
 
 NEAR = np.array([0.3, -1.2, 1.6, -1.1, -1.4, 0.5])  # where the UR5 works [rad]
 TAUGHT = NEAR + np.random.default_rng(3).uniform(-0.4, 0.4, (50, 6))
@@ -83,6 +83,13 @@ def tracker(plan: str, path: str, robot: str = "tx40") -> None:
     write_measured(cell.measure(arm, q, seed=1), path)
 
 
+def cmm(plan: str, path: str, robot: str = "lwr4plus") -> None:
+    """Measure planned poses with an optical CMM: joints [deg], the fixture's position [mm] and orientation."""
+    arm = virtual_cells.virtual_cell(robot, 0)
+    q = read_poses(Path(plan), Joints.of(arm.nominal.joint_names))
+    write_measured(cell.measure(arm, q, sum(map(ord, path))), path)
+
+
 def stream(log: str, points: str, robot: str = "tx40") -> None:
     """Follow a slow motion of 4 min with a laser tracker at 1 kHz, and log the joints at 125 Hz.
 
@@ -115,7 +122,10 @@ TOOL = ball(2.8, 0.06, np.array([0.01, 0.02, 0.07]))  # the true tool: 2.8 kg, 7
 
 
 def moving(robot: str, load: bool = False) -> virtual_arm.MovingArm:
-    """Return the moving arm of a robot, with or without the tool; the library's masses, or rods between the joints."""
+    """Return the moving arm of a robot, with or without a load; the library's masses, or rods between the joints.
+
+    The load is the tool; of the LWR4+ that of Kolyubin, Shiriaev and Jubien (2019), 3.28 kg beside axis 7.
+    """
     place = virtual_cells.virtual_cell(robot, 0)
     if place.nominal.inertias is None:
         masses = rods(place.nominal, IdentificationModel(bodies_of(place.nominal), ()), total=30.0)
@@ -123,9 +133,8 @@ def moving(robot: str, load: bool = False) -> virtual_arm.MovingArm:
     arm = virtual_arm.moving_arm(place, robot, 0)
     if not load:
         return arm
-    tail, values, last = np.asarray(arm.chain.tail), arm.plant.parameters.copy(), 10 * (arm.chain.n - 1)
-    values[last : last + 10] += to_standard(tail @ from_standard(TOOL) @ tail.T)
-    return replace(arm, plant=arm.plant.with_parameters(values))
+    body = truth(robot)["payload"]["inertia"] if robot == "lwr4plus" else TOOL
+    return virtual_arm.carrying(arm, body)
 
 
 def log(path: str, robot: str, motion: str, what: str = "torque", load: str = "") -> None:
@@ -133,8 +142,8 @@ def log(path: str, robot: str, motion: str, what: str = "torque", load: str = ""
 
     Args:
         path: CSV to write: time [s], positions [deg], and
-        what: motor torques, torques of joint sensors (link) or motor currents.
-        load: "load": with the tool.
+        what: motor torques (torque), torques of joint sensors (link), both, or motor currents (current).
+        load: "load": with the load of `moving`.
     """
     arm, seed = moving(robot, load == "load"), sum(map(ord, path))
     if Path(motion).is_dir():
@@ -150,16 +159,27 @@ def log(path: str, robot: str, motion: str, what: str = "torque", load: str = ""
         seen = replace(seen, effort=seen.tau_link)
     elif what == "current":
         seen = replace(seen, effort=seen.effort / GAINS)
-    file = write_log(replace(seen, tau_link=None), path)
+    file = write_log(seen if what == "both" else replace(seen, tau_link=None), path)
     if what == "current":
         head, rows = file.read_text().split("\n", 1)
         file.write_text(head.replace("tau_", "current_").replace("[Nm]", "[A]") + "\n" + rows)
 
 
+def degrade(log: str, path: str, noise: str = "1") -> None:
+    """Copy a log and add white noise [mrad] to its positions, as a bad encoder would: the torques stay as they are."""
+    head, rows = Path(log).read_text(encoding="utf-8").split("\n", 1)
+    names = head.split(",")
+    values = np.loadtxt(rows.splitlines(), delimiter=",")
+    positions = [name.startswith("q_") for name in names]
+    sigma = np.degrees(1e-3 * float(noise))
+    values[:, positions] += sigma * np.random.default_rng(0).normal(size=(len(values), sum(positions)))
+    write_numbers(path, names, values)
+
+
 def platform(folder: str) -> None:
     """Write a DualV's files: encoder readings with platform poses, logs without and with a payload of 5.37 kg.
 
-    The true legs are 1 mm and 1 mrad (1 sigma) off their nominal in the poses; the torques are the model's, with noise.
+    The true legs are 1 mm and 1 mrad (1 sigma) off their nominal; the torques are the model's, with noise.
     """
     known, place, rng = find("dualv").mechanism, Path(folder), np.random.default_rng(0)
     motors = known.robot.joint_names
@@ -170,7 +190,7 @@ def platform(folder: str) -> None:
     head = [*(f"{name} [deg]" for name in motors), "x [mm]", "y [mm]", "rz [deg]"]
     write_numbers(place / "measured.csv", head, np.column_stack([np.degrees(q), 1e3 * x[:, :2], np.degrees(x[:, 2])]))
 
-    model = make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["plate"])
+    model = make_parallel_model(true, ["Fv Fc"], v0=0.05, payloads=["plate"])
     values = np.concatenate([model.known_parameters(), np.tile([0.05, 0.3], 4)])
     values[model.names.index("Mplate")] = 5.37
     t, order = np.arange(1000) / 1000.0, 2 * np.pi * np.array([1.5, 2.5, 4.0, 5.5])[:, None, None]
@@ -181,7 +201,7 @@ def platform(folder: str) -> None:
         motion = plan.motion(*((size * part).sum(axis=0) for part in (
             np.sin(angle), order * np.cos(angle), -(order**2) * np.sin(angle)
         )))  # fmt: skip
-        q = motion.posture.q[:, known.robot.actuated] + 1e-5 * rng.normal(size=(len(t), 4))
+        q = motion.posture.q[:, true.robot.actuated] + 1e-5 * rng.normal(size=(len(t), 4))
         tau = plan.torques(motion) + 0.5 * rng.normal(size=q.shape)
         head = ["t [s]", *(f"{name}_q [deg]" for name in motors), *(f"{name}_tau [Nm]" for name in motors)]
         write_numbers(place / f"{name}.csv", head, np.column_stack([t, np.degrees(q), tau]))

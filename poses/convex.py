@@ -68,8 +68,10 @@ def bound(
 ) -> Bound:
     """Return an upper bound on det(WᵀW)^(1/p) over all choices of m candidates.
 
+    W (rows of all poses, p) is the stack of the Jacobians of the chosen poses and of those already measured.
+
     Args:
-        jacobians: (N, rows, p) whitened Jacobians of the candidates.
+        jacobians: (N, rows, p) Jacobians of the candidates, each row divided by its standard deviation.
         m: number of poses.
         existing: (k, rows, p) Jacobians of poses already measured, whose information is added with weight 1; None for
             no such poses.
@@ -121,13 +123,27 @@ def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: f
 
 
 def certificate(candidates: Candidates, x: np.ndarray, m: int, capped: bool = True) -> float:
-    """Return the upper bound on log det M proved by any feasible weights x (N,); +inf if M(x) is singular."""
+    """Return the upper bound on log det M proved by any feasible weights x (N,); +inf if M(x) is singular.
+
+    Args:
+        candidates: the scaled candidates; M(x) is the information of the weighted candidates and the poses already
+            measured.
+        x: (N,) weights ≥ 0 with Σ x = m (and ≤ 1 if `capped`).
+        m: number of poses to choose.
+        capped: whether each candidate may be chosen once only; False gives the looser bound for repeated poses.
+    """
     certified = _certify(candidates.z, candidates.known, x, m, capped)
     return certified.log_upper + candidates.shift
 
 
 def information_of(z: np.ndarray, known_information: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return M = M_known + Σ x_i z_iᵀz_i (p, p) from Jacobians z (N, rows, p) and weights x (N,)."""
+    """Return M = M_known + Σ x_i z_iᵀz_i (p, p) from Jacobians z (N, rows, p) and weights x (N,).
+
+    Args:
+        z: (N, rows, p) Jacobians z_i of the candidates, in scaled coordinates.
+        known_information: M_known (p, p), information of the poses already measured.
+        x: (N,) weights of the candidates.
+    """
     chosen = np.flatnonzero(x)
     rows = z[chosen].reshape(-1, z.shape[2])
     row_weights = np.repeat(x[chosen], z.shape[1])
@@ -135,7 +151,7 @@ def information_of(z: np.ndarray, known_information: np.ndarray, x: np.ndarray) 
 
 
 def scores_of(z: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Return the scores d_i = tr(z_i M⁻¹ z_iᵀ) (N,) of candidates z (N, rows, p) for the matrix M (p, p)."""
+    """Return the scores d_i = tr(z_i M⁻¹ z_iᵀ) (N,) of candidates z (N, rows, p) for the information M (p, p)."""
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     spread = z.reshape(-1, z.shape[2]) @ root.T
     spread = spread.reshape(len(z), -1)
@@ -160,7 +176,11 @@ def _certify(z: np.ndarray, known_information: np.ndarray, x: np.ndarray, m: int
 
 
 def _tighter(first: _Certified, second: _Certified) -> _Certified:
-    """Return the weights with the larger log det of the two, combined with the smaller of the two bounds."""
+    """Return the weights with the larger log det of the two, combined with the smaller of the two bounds.
+
+    Args:
+        first, second: weights with their proved bounds, for the same candidates and number of poses.
+    """
     upper = min(first.log_upper, second.log_upper)
     if second.logdet >= first.logdet:
         better = second
@@ -172,7 +192,15 @@ def _tighter(first: _Certified, second: _Certified) -> _Certified:
 def _warm(
     z: np.ndarray, known_information: np.ndarray, m: int, cap: float, steps: int = 6
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return initial weights (N,) by a few multiplicative steps, and the candidates' scores (N,) at these weights."""
+    """Return initial weights (N,) by a few multiplicative steps, and the candidates' scores (N,) at these weights.
+
+    Args:
+        z: (N, rows, p) scaled Jacobians of the candidates.
+        known_information: (p, p) information of the poses already measured.
+        m: sum of the weights.
+        cap: largest weight of a candidate.
+        steps: number of multiplicative steps.
+    """
     x = np.full(len(z), m / len(z))
     matrix = information_of(z, known_information, x)
     scores = scores_of(z, matrix)
@@ -200,6 +228,14 @@ def _priced(scores: np.ndarray, x: np.ndarray, active: np.ndarray, price: float,
 
     Kept are active candidates with a weight, or with a score near `price` or above; added are at most `max_count` other
     candidates, those whose scores exceed `price` most.
+
+    Args:
+        scores: (N,) scores d_i of all candidates.
+        x: (N,) present weights.
+        active: indices of the candidates of the last problem.
+        price: multiplier λ of the constraint Σ x = m in that problem; the score of a candidate with a weight between
+            the bounds.
+        max_count: largest number of candidates to add.
     """
     has_weight = x[active] > 1e-4
     near_price = scores[active] > 0.9 * price
@@ -231,6 +267,15 @@ def _interior(
     is
 
         (Q + u/x + v/(cap−x)) dx + λ = d + τ/x − τ/(cap−x),  Σ dx = m − Σ x,   Q_ij = ‖z_i M⁻¹ z_jᵀ‖² .
+
+    Args:
+        z: (K, rows, p) scaled Jacobians of the candidates.
+        known_information: (p, p) information of the poses that are not varied.
+        x: (K,) first weights.
+        m: sum of the weights.
+        cap: largest weight of a candidate.
+        tolerance: relative gap of det(M)^(1/p) to its optimum at which the iteration ends.
+        max_steps: largest number of Newton steps.
     """
     count, _, p = z.shape
     mean = m / count
@@ -275,7 +320,12 @@ def _interior(
 
 
 def _newton_terms(z: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the gradient d (K,) and the matrix Q (K, K) of the Newton step for K candidates."""
+    """Return the gradient d (K,) and the matrix Q (K, K) of the Newton step for K candidates.
+
+    Args:
+        z: (K, rows, p) scaled Jacobians of the candidates.
+        matrix: (p, p) information M at the present weights.
+    """
     count, rows, p = z.shape
     root = np.linalg.inv(np.linalg.cholesky(matrix))
     rows_spread = z.reshape(-1, p) @ root.T

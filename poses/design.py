@@ -50,7 +50,12 @@ class Design:
 
 
 def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
-    """Return the design of the given members, computed from scratch to remove the rounding errors of many updates."""
+    """Return the design of the given members, computed from scratch to remove the rounding errors of many updates.
+
+    Args:
+        pool: the candidates and the information of the poses measured before.
+        members: indices of the chosen candidates in the pool.
+    """
     p = pool.z.shape[2]
     count = len(pool.z)
     rows = pool.z[list(members)].reshape(-1, p)
@@ -67,24 +72,36 @@ def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
 
 
 def with_added(pool: Pool, design: Design, i: int) -> Design:
-    """Return the design after adding candidate number i."""
+    """Return the design after adding the candidate with index i, which must not be a member.
+
+    Args:
+        pool: the candidates from which the design is chosen.
+        design: the design, which is not changed.
+        i: index of the candidate in the pool.
+    """
     return _changed(pool, design, i, 1.0)
 
 
 def with_removed(pool: Pool, design: Design, i: int) -> Design:
-    """Return the design after removing candidate number i, which must be a member."""
+    """Return the design after removing the candidate with index i, which must be a member.
+
+    Args:
+        pool: the candidates from which the design is chosen.
+        design: the design, which is not changed.
+        i: index of the candidate in the pool.
+    """
     return _changed(pool, design, i, -1.0)
 
 
 def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int = 48) -> tuple[int, float]:
     """Return the candidate outside the design that raises log det most, and that gain of log det.
 
-    The search is exact, though only few candidates are evaluated. By the arithmetic-geometric mean det(I + B) ≤ (1 +
-    tr(B)/r)^r for r rows; a candidate whose score by this bound cannot exceed the best gain so far (or `above`) is
-    skipped.
+    The search is exact, though only few candidates are evaluated. With B (r, r) = z C zᵀ of a candidate, by the
+    arithmetic-geometric mean det(I + B) ≤ (1 + tr(B)/r)^r for r rows; a candidate whose score by this bound cannot
+    exceed the best gain so far (or `above`) is skipped.
 
     Args:
-        pool: candidates.
+        pool: the N candidates; an index refers to them.
         design: the present design.
         above: gains of log det up to this value are ignored.
         first: number of candidates evaluated before any is skipped.
@@ -113,7 +130,12 @@ def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int
 
 
 def best_removal(pool: Pool, design: Design) -> tuple[int, float]:
-    """Return the member whose removal reduces log det least, and the (negative) change of log det."""
+    """Return the index of the member whose removal reduces log det least, and the (negative) change of log det.
+
+    Args:
+        pool: the candidates; the index refers to them.
+        design: the design, which is not changed.
+    """
     members = np.array(design.members)
     gains = gains_of(pool, design, members, -1.0)
     return int(members[gains.argmax()]), float(gains.max())
@@ -122,7 +144,13 @@ def best_removal(pool: Pool, design: Design) -> tuple[int, float]:
 def gains_of(pool: Pool, design: Design, candidates: np.ndarray, sign: float) -> np.ndarray:
     """Return the changes of log det (K,) by adding (`sign` 1) or removing (`sign` −1) each of K candidates alone.
 
-    The change is log det(I ± z_i C z_iᵀ).
+    The change is log det(I ± z_i C z_iᵀ), with the candidate's Jacobian z_i (rows, p) and C = M⁻¹ of the design.
+
+    Args:
+        pool: the candidates.
+        design: the design to change.
+        candidates: (K,) indices into the pool.
+        sign: 1 or −1.
     """
     z = pool.z[candidates]
     transposed = z.transpose(0, 2, 1)

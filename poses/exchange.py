@@ -15,7 +15,14 @@ TOLERANCE = 1e-9
 
 
 def greedy(pool: Pool, m: int) -> Design:
-    """Return the design of m candidates added one after another, each time the candidate that raises det M most."""
+    """Return the design of m candidates added one after another, each time the candidate that raises det M most.
+
+    M (p, p) is the information of the chosen candidates and of the poses measured before.
+
+    Args:
+        pool: the candidates and the information of the poses measured before.
+        m: number of candidates to choose.
+    """
     design = design_of(pool, ())
     for _ in range(m):
         candidate, _ = best_addition(pool, design)
@@ -26,8 +33,9 @@ def greedy(pool: Pool, m: int) -> Design:
 def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: int = 50) -> Design:
     """Return the design after replacing members one by one by the best candidate, until no replacement raises det M.
 
-    This is the modified Fedorov exchange (Fedorov 1972; one member after another: Cook & Nachtsheim 1980). The result
-    is a local optimum: no exchange of one member for one candidate improves it.
+    M is the information matrix of the design. This is the modified Fedorov exchange (Fedorov 1972; one member after
+    another: Cook & Nachtsheim 1980). The result is a local optimum: no exchange of one member for one candidate
+    improves it.
 
     Args:
         pool: candidates.
@@ -54,11 +62,11 @@ def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: 
 def detmax(pool: Pool, design: Design, report: Report | None = None, *, longest: int = 6, failures: int = 40) -> Design:
     """Return a design with larger det M, searched by temporarily adding and removing poses (DETMAX).
 
-    DETMAX (Mitchell 1974, section 3) makes excursions from the design of m poses: candidates are added (the best first)
-    or members removed (the one that costs least first), and then the size is brought back to m. The designs passed on
-    an excursion that gained nothing form the failure list. An excursion that meets a listed design is lengthened, up to
-    m ± `longest` poses. The method ends when excursions in both directions exceed that length, or after `failures`
-    excursions in a row without gain (our addition).
+    M is the information matrix of the design. DETMAX (Mitchell 1974, section 3) makes excursions from the design of m
+    poses: candidates are added (the best first) or members removed (the one that costs least first), and then the size
+    is brought back to m. The designs passed on an excursion that gained nothing form the failure list. An excursion
+    that meets a listed design is lengthened, up to m ± `longest` poses. The method ends when excursions in both
+    directions exceed that length, or after `failures` excursions in a row without gain (our addition).
 
     Args:
         pool: candidates.
@@ -147,6 +155,13 @@ def _excursion(
     """Return the design at the end of one DETMAX excursion, and the sets of members passed on the way.
 
     The design is None if the excursion exceeds m ± `longest` poses.
+
+    Args:
+        pool: the candidates.
+        start: design of m poses from which the excursion starts.
+        upwards: True adds poses first, False removes poses first.
+        longest: largest number of poses by which the excursion may differ from m.
+        failed: failure list: sets of members passed on earlier excursions without gain.
     """
     m = len(start.members)
     passed = set[frozenset[int]]()

@@ -104,7 +104,7 @@ def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
     """Return the observability index from singular values (last axis, largest first).
 
     Args:
-        s: (..., p) singular values.
+        s: (..., p) singular values of the whitened observation matrix W of all poses.
         index: one of "O1" ... "O5", "cond".
         m: number of poses (used by O1).
 
@@ -135,7 +135,12 @@ def has_kinks(index: Index) -> bool:
 
 
 def log_slope(s: np.ndarray, index: Index) -> np.ndarray:
-    """Return ∂ log O / ∂s (p,) at the singular values s (p,), largest first."""
+    """Return ∂ log O / ∂s (p,) at the singular values s (p,), largest first.
+
+    Args:
+        s: (p,) singular values of the whitened observation matrix.
+        index: observability index O, "O1" ... "O5" or "cond".
+    """
     slope = np.zeros_like(s)
     if index == "O1":
         return 1.0 / (len(s) * s)
@@ -161,6 +166,11 @@ def _soft_maximum(values: np.ndarray, sharpness: float) -> tuple[float, np.ndarr
 
 def _stacked(W: ArrayLike, index: Index, m: int | None) -> tuple[np.ndarray, int]:
     """Return W, checked and stacked to (m rows, p), and the number of poses m.
+
+    Args:
+        W: (m, rows, p) or (m rows, p) Jacobians of the poses.
+        index: one of "O1" ... "O5", "cond".
+        m: number of poses; None takes the length of a W with three axes.
 
     Raises:
         BadInput: an unknown index, a wrong shape, values that are not finite, or no `m` where O1 needs it.

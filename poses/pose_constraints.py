@@ -37,7 +37,11 @@ def height(tool: Tool, lowest: float, highest: float = np.inf, jacobian: ToolJac
 
 
 def _finite_limits(lower: float, upper: float) -> tuple[tuple[float, float], ...]:
-    """Return (sign, bound) of each finite limit; a value satisfies the limit where sign · (value − bound) ≤ 0."""
+    """Return (sign, bound) of each finite limit; a value satisfies the limit where sign · (value − bound) ≤ 0.
+
+    Args:
+        lower, upper: limits of one value; an infinite limit is skipped. The sign is −1 for `lower` and 1 for `upper`.
+    """
     limits = []
     if np.isfinite(lower):
         limits.append((-1.0, lower))
@@ -50,6 +54,11 @@ def axis_distance(tool: Tool, min_distance: float, jacobian: ToolJacobian | None
     """Return the constraint d_xy = √(x² + y²) ≥ min_distance [m] on the tool point's distance from the z axis.
 
     The constraint is evaluated in the smooth form min_distance² − x² − y² ≤ 0.
+
+    Args:
+        tool: forward kinematics, see the module's docstring; x, y, z are the tool point's coordinates in its frame [m].
+        min_distance: least distance [m].
+        jacobian: tool Jacobian for exact gradients; None uses central differences.
     """
     slope = None
     if jacobian is not None:
@@ -64,6 +73,12 @@ def reach(
     """Return the constraint that the tool point x is within `max_distance` [m] of the point `centre` c (3,) [m].
 
     The constraint is evaluated in the smooth form ‖x − c‖² − max_distance² ≤ 0.
+
+    Args:
+        tool: forward kinematics, see the module's docstring.
+        max_distance: largest distance [m].
+        centre: c (3,) in the frame of `tool` [m].
+        jacobian: tool Jacobian for exact gradients; None uses central differences.
     """
     point = np.asarray(centre, dtype=float)
     slope = None
@@ -79,6 +94,12 @@ def distance(
     """Return the constraint that the tool point is `min_distance` to `max_distance` [m] from an instrument at `centre`.
 
     `centre` is a point (3,) [m]. The constraint is not smooth where the tool point coincides with `centre`.
+
+    Args:
+        tool: forward kinematics, see the module's docstring.
+        min_distance, max_distance: limits of the distance [m].
+        centre: (3,) position of the instrument in the frame of `tool` [m].
+        jacobian: tool Jacobian for exact gradients; None uses central differences.
     """
     point = np.asarray(centre, dtype=float)
     limits = _finite_limits(min_distance, max_distance)
@@ -123,7 +144,7 @@ def line_of_sight(
     The constraint is cos(half_angle) − (R a)·u ≤ 0 with u = (s − x)/‖s − x‖.
 
     Args:
-        tool: forward kinematics of the target's centre x and orientation R.
+        tool: forward kinematics of the target: its centre x (3,) [m] and orientation R (3, 3).
         instrument: (3,) s, position of the tracker or camera [m].
         axis: (3,) a, the direction in which the target faces, in the tool's frame.
         half_angle: half opening angle of the cone [rad] (a retroreflector accepts about 0.5 rad).

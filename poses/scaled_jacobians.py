@@ -63,7 +63,7 @@ def prepared(jacobians: ArrayLike, m: int, existing: ArrayLike | None = None) ->
     the mean information after scaling by D.
 
     Args:
-        jacobians: (N, rows, p) whitened Jacobians of the candidates.
+        jacobians: (N, rows, p) Jacobians J of the candidates, each row divided by its standard deviation.
         m: number of poses to choose.
         existing: (k, rows, p) whitened Jacobians of poses already measured; None without such poses.
 

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .by_index import exchanged_by_index, merits
+from .by_index import exchanged_by_index, kicked_by_index, merits
 from .candidates import draw_candidates
 from .continuous.global_local import mlsl_search
 from .continuous.local import Improved, improved
@@ -26,6 +26,10 @@ from .whole_space import Ceiling, bound_over_space
 Method = Literal["detmax", "polish", "local", "multistart", "mlsl", "tabu"]
 Progress = Callable[[int, int, str], None]
 
+# trial sets of the restarts for other indices than O1, for each kick asked for (our choice): with ten kicks some 60
+# restarts of 7 poses among 18, 10 of 30 among 2000
+TRIALS_PER_KICK = 2000
+
 
 @dataclass(frozen=True)
 class SearchSettings:
@@ -37,7 +41,8 @@ class SearchSettings:
         method: see `select_poses`.
         count: candidates to generate if none are given.
         seed: of every random draw; the same seed gives the same selection.
-        kicks: random restarts of detmax around its best set; skipped if at most 0.5 % can be gained.
+        kicks: random restarts of detmax around its best set; skipped if at most 0.5 % can be gained. For other indices
+            than O1 as many restarts as 2000 trial sets for each kick last.
         starts: start sets of multistart.
         evaluations: largest number of evaluations of one local search.
         rule: settings of the tabu search.
@@ -67,7 +72,7 @@ class Selection:
 
     Attributes:
         q: (m, n) joint values [rad or m]; None where the candidates were given without joint values.
-        indices: (m,) numbers of the chosen candidates, rising; None for methods whose poses are not candidates.
+        indices: (m,) indices of the chosen candidates, rising; None for methods whose poses are not candidates.
         index: name of the index the search improved.
         value: value of that index for the chosen poses together with the poses measured before (m counts both).
         history: values of the index as the search improved it; the last is `value`.
@@ -172,12 +177,13 @@ def select_poses(
     * ``tabu`` is IMHATR, the two-stage meta-heuristic (`calib.poses.continuous.tabu`).
 
     Args:
-        jacobians: (N, rows, p) whitened observation Jacobians of the candidates by the base parameters. None computes
-            them by `space` at q, or at feasible Sobol poses where q is None too.
+        jacobians: (N, rows, p) observation Jacobians of the candidates by the p base parameters, whitened: each row
+            divided by its standard deviation. None computes them by `space` at q, or at feasible Sobol poses where q is
+            None too.
         m: number of poses to choose; detmax takes no candidate twice.
         settings: index, method and effort.
-        q: (N, n) joint values of the candidates [rad or m].
-        space: limits, constraints and Jacobian; needed by all methods but detmax.
+        q: (N, n) joint values of the candidates [rad or m]; None if unknown, or to draw them.
+        space: limits, constraints and Jacobian; needed by all methods but detmax. None without it.
         existing: (k, rows, p) whitened Jacobians of poses already measured, whose information is added; None for no
             such poses.
         map: the builtin, or a parallel map on which multistart runs its starts.
@@ -276,7 +282,7 @@ def _candidates(
 
 
 def _exchange(task: _Request) -> _Chosen:
-    """Return the poses chosen among the candidates by exchanges (detmax); after Ctrl-C, the best set reached."""
+    """Return the poses of `task` chosen by exchange of candidates (detmax); after Ctrl-C the best set reached."""
     candidates = task.candidates
     m = task.m
     p = task.jacobians.shape[2]
@@ -334,13 +340,20 @@ def _exchange(task: _Request) -> _Chosen:
     rising = tuple((logdet + candidates.shift) / (2 * p) for _, logdet in best)
     chosen = _Chosen(best[-1][0], None, rising, len(best), interrupted)
     if task.index != "O1" and not interrupted:
-        chosen = _by_index(task, chosen.members or ())
+        elapsed = time.process_time() - began
+        chosen = _by_index(task, chosen.members or (), task.settings.seconds - elapsed)
     stage(5, "done")
     return chosen
 
 
-def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
-    """Return the D-optimal set `members` improved by exchanges for the requested index, where the index is not O1."""
+def _by_index(task: _Request, members: tuple[int, ...], seconds: float) -> _Chosen:
+    """Return the D-optimal set `members` improved by exchanges for the requested index, where the index is not O1.
+
+    Args:
+        task: candidates and arguments of `select_poses`.
+        members: indices of the set's candidates.
+        seconds: processor time [s] after which the exchange is not restarted any more.
+    """
     p = task.jacobians.shape[2]
     past = np.zeros((0, p))
     if task.before is not None:
@@ -356,7 +369,12 @@ def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
 
     interrupted = False
     try:
-        exchanged_by_index(task.jacobians, known_information, members, task.index, keep)
+        information = task.jacobians, known_information
+        optimum = exchanged_by_index(*information, members, task.index, keep)
+        trials = TRIALS_PER_KICK * task.settings.kicks
+        optimum = kicked_by_index(*information, optimum, task.index, trials, task.seed, keep, seconds=seconds)
+        # the kicks tried fewer candidates
+        exchanged_by_index(*information, optimum.members, task.index, keep)
     except KeyboardInterrupt:
         interrupted = True
     rising = tuple(value for _, value in best)
@@ -364,7 +382,11 @@ def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
 
 
 def _polished(task: _Request) -> _Chosen:
-    """Return poses chosen among the candidates, then improved in all joint values continuously."""
+    """Return poses chosen among the candidates, then improved in all joint values continuously.
+
+    Args:
+        task: candidates, search space and arguments of `select_poses`.
+    """
     began = time.process_time()
     chosen = _exchange(task)
     if chosen.interrupted:
@@ -380,7 +402,12 @@ def _polished(task: _Request) -> _Chosen:
 
 
 def _multistart(task: _Request, starts: int) -> _Chosen:
-    """Return the best result of the local search from `starts` random sets of candidates."""
+    """Return the best result of the local search from `starts` random sets of candidates.
+
+    Args:
+        task: candidates, search space and arguments of `select_poses`.
+        starts: number of random sets.
+    """
     space, joints = _movable(task)
 
     def report(number: int, _: Improved) -> None:
@@ -400,7 +427,11 @@ def _multistart(task: _Request, starts: int) -> _Chosen:
 
 
 def _mlsl(task: _Request) -> _Chosen:
-    """Return a set of poses searched by MLSL within the joint limits, beginning at a random set of candidates."""
+    """Return a set of poses searched by MLSL within the joint limits, beginning at a random set of candidates.
+
+    Args:
+        task: candidates, search space and arguments of `select_poses`.
+    """
     space, joints = _movable(task)
     task.progress(0, 1, "global search")
     [start] = random_starts(joints, task.m, 1, task.seed)
@@ -495,7 +526,14 @@ def _selection(task: _Request, chosen: _Chosen, baseline: float, began: float) -
 
 
 def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
-    """Return the upper bound over the candidates and the chosen poses q; over all feasible poses if `climbs` > 0."""
+    """Return the upper bound over the candidates and the chosen poses q; over all feasible poses if `climbs` > 0.
+
+    Args:
+        task: candidates with their bound, and arguments of `select_poses`; without a search space its bound is
+            returned.
+        q: (m, n) chosen poses [rad or m]; None: the bound over the candidates is returned.
+        climbs: number of local searches for poses that exceed the bound (`bound_over_space`).
+    """
     space, joints = task.space, task.q
     if space is None or joints is None or q is None or (not climbs and np.isin(q, joints).all()):
         return Ceiling(task.bound.upper, task.bound.gap, 0, 0.0, np.zeros((0, 0)), 0)
@@ -508,7 +546,13 @@ def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
 
 
 def _value(jacobians: np.ndarray, existing: np.ndarray | None, index: Index) -> float:
-    """Return the index of the chosen poses and the poses measured before, together, from their Jacobians."""
+    """Return the index of the chosen poses and the poses measured before, together, from their Jacobians.
+
+    Args:
+        jacobians: (m, rows, p) whitened Jacobians of the chosen poses.
+        existing: (k, rows, p) those of the poses measured before; None without such poses.
+        index: name of the observability index.
+    """
     p = jacobians.shape[2]
     if existing is None:
         return observability(jacobians.reshape(-1, p), index, len(jacobians))

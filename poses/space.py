@@ -63,7 +63,13 @@ class SearchSpace:
 
 
 def is_feasible(space: SearchSpace, q: np.ndarray, tolerance: float = 1e-8) -> np.ndarray:
-    """Return whether each pose q (m, n) satisfies joint limits, constraints and predicate, (m,) bool."""
+    """Return whether each pose q (m, n) satisfies joint limits, constraints and predicate, (m,) bool.
+
+    Args:
+        space: joint limits, constraints and predicate.
+        q: (m, n) joint values [rad or m].
+        tolerance: excess of a joint limit [rad or m] or a constraint's value that still counts as satisfied.
+    """
     above_lower = q >= space.lower - tolerance
     below_upper = q <= space.upper + tolerance
     good = np.all(above_lower & below_upper, axis=1)
@@ -79,7 +85,12 @@ def is_feasible(space: SearchSpace, q: np.ndarray, tolerance: float = 1e-8) -> n
 
 
 def product(space: SearchSpace, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-    """Return Σ_rp G[i,r,p] ∂J[i,r,p]/∂q[i,k] (m, n), by `space.jacobian_product`, else by central differences."""
+    """Return Σ_rp G[i,r,p] ∂J[i,r,p]/∂q[i,k] (m, n), by `space.jacobian_product`, else by central differences.
+
+    Args:
+        q: (m, n) joint values [rad or m].
+        G: (m, rows, p) weights of the entries of the Jacobians J (m, rows, p) at q.
+    """
     if space.jacobian_product is not None:
         return np.asarray(space.jacobian_product(q, G), dtype=float)
     slopes = central_difference(space.jacobian, q)
@@ -87,21 +98,24 @@ def product(space: SearchSpace, q: np.ndarray, G: np.ndarray) -> np.ndarray:
 
 
 def constraint_values(space: SearchSpace, q: np.ndarray) -> np.ndarray:
-    """Return the values (m, k) of all constraints at poses q (m, n); a constraint is satisfied where ≤ 0."""
+    """Return the values (m, k) of all constraints of `space` at poses q (m, n); a constraint is satisfied where ≤ 0."""
     empty = np.zeros((len(q), 0))
     values = [np.asarray(constraint.function(q)) for constraint in space.constraints]
     return np.concatenate([empty, *values], axis=1)
 
 
 def constraint_gradients(space: SearchSpace, q: np.ndarray) -> np.ndarray:
-    """Return the derivatives of `constraint_values` with respect to q, (m, k, n)."""
+    """Return the derivatives of `constraint_values` of `space` with respect to q, (m, k, n), at poses q (m, n)."""
     empty = np.zeros((len(q), 0, q.shape[1]))
     gradients = [constraint_gradient(constraint, q) for constraint in space.constraints]
     return np.concatenate([empty, *gradients], axis=1)
 
 
 def constraint_gradient(constraint: PoseConstraint, q: np.ndarray) -> np.ndarray:
-    """Return the gradient ∂c/∂q (m, k, n) of a constraint's values c at poses q (m, n)."""
+    """Return the gradient ∂c/∂q (m, k, n) of the values c of `constraint` at poses q (m, n).
+
+    Without `PoseConstraint.gradient` it is computed by central differences.
+    """
     if constraint.gradient is not None:
         return np.asarray(constraint.gradient(q), dtype=float)
     slopes = central_difference(constraint.function, q)

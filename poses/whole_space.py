@@ -80,7 +80,7 @@ def bound_over_space(
         rounds: largest number of rounds.
         tolerance: relative excess of d at which the rounds end.
         seed: seed of the random poses.
-        report: called with each round's number and the gap; None for no report.
+        report: called with each round's index (from 0) and the relative gap of the bound; None for no report.
     """
     generator = np.random.default_rng([seed, 5])
     jacobians = np.asarray(space.jacobian(q), dtype=float)
@@ -139,7 +139,13 @@ def bound_over_space(
 
 
 def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, int]:
-    """Return feasible local maxima (K, n) of d(q) = ‖J(q) root‖² from start poses, and the number of evaluations."""
+    """Return feasible local maxima (K, n) of d(q) = ‖J(q) root‖² from start poses, and the number of evaluations.
+
+    Args:
+        space: limits, constraints, predicate, Jacobian J.
+        starts: (K, n) poses [rad or m], each improved on its own.
+        root: (p, p) root of M⁻¹ = root rootᵀ, the inverse of the present information.
+    """
 
     def objective(q: np.ndarray) -> tuple[float, np.ndarray]:
         spread = np.asarray(space.jacobian(q), dtype=float) @ root
@@ -166,7 +172,15 @@ def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[
 def _starts(
     space: SearchSpace, q: np.ndarray, scores: np.ndarray, count: int, generator: np.random.Generator
 ) -> np.ndarray:
-    """Return `count` start poses: half with the largest scores d, pairwise distinct, and half drawn at random."""
+    """Return `count` start poses: half with the largest scores d, pairwise distinct, and half drawn at random.
+
+    Args:
+        space: limits, constraints and predicate of the random poses.
+        q: (N, n) poses to choose from [rad or m].
+        scores: (N,) d of these poses.
+        count: number of start poses.
+        generator: source of the random poses.
+    """
     order = np.argsort(-scores, kind="stable")[: 20 * count]
     ranked_count = count - count // 2
     ranked = _apart(q[order])[:ranked_count]

@@ -1,6 +1,7 @@
 """Which module may import which, held against every import in the sources, those inside functions included."""
 
 import ast
+import os
 import re
 import subprocess
 import sys
@@ -52,7 +53,7 @@ HOMES = {
     "toppra": ["calib.trajectories."],
     "ruckig": ["calib.trajectories."],
     "clarabel": ["calib.estimation."],
-    "cvxpy": [],  # the tests' independent solver
+    "cvxpy": ["calib.identification.methods.convex"],  # users' constraints; in the tests an independent solver
     "matplotlib": ["calib.procedure.", "calib.api.", "calib.apps."],
     "jinja2": ["calib.procedure.report.templates", "calib.apps.controller_programs.program"],
     "typst": ["calib.procedure.report.certificate.rendering"],
@@ -174,6 +175,16 @@ def test_applications_can_be_removed(monkeypatch):
     code += "sys.exit(run(['formats', 'mdh']))"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_geometry_is_fitted_without_nlopt(tmp_path):
+    """It is for a few searches of poses and motions, which import it where they use it."""
+    code = "import sys; sys.modules['nlopt'] = None; import calib, practice; from calib.cli import run; "
+    code += "import calib.poses.select, calib.trajectories.design.search; practice.measure('seen.csv', 40); "
+    code += "sys.exit(run(['fit', 'ur5', 'seen.csv', '--model', 'offsets', '--no-plots', '--out', 'fit']))"
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}:{ROOT / 'examples'}"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode in (0, 1) and (tmp_path / "fit/robot.urdf").exists(), done.stderr
 
 
 def test_a_folder_holds_at_most_14_modules():

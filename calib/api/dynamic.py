@@ -108,7 +108,12 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the result folder, with the same files as `calib identify --out`, and return its path."""
+        """Write the result folder, with the same files as `calib identify --out`, and return its path.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
+        """
         from calib.procedure.report import outputs
 
         return folder.write_folder(self, Path(out), partial(outputs.write_model, plots=plots))
@@ -180,8 +185,9 @@ def identify_dynamics(
 ) -> DynamicsModel:
     """Return a robot's dynamics, identified on its geometry and judged on motion that was not fitted.
 
-    If the robot is the result of a fit (``fit.robot``), the covariance of its geometry is propagated to the estimate: Σ
-    = Σ_torque + S Σ_geometry Sᵀ, with S the sensitivity of the estimate to the geometry.
+    If the robot is the result of a fit (``fit.robot``), the covariance of its geometry is propagated to the estimate:
+    the covariance Σ of the base parameters is Σ_torque + S Σ_geometry Sᵀ, with Σ_torque due to the errors of the
+    torques and S the sensitivity of the estimate to the geometry.
 
     Args:
         robot, base, tip: arguments of `calib.load`; or, for `robot`, the result of `calib.load` or ``fit.robot``. For a
@@ -192,11 +198,12 @@ def identify_dynamics(
         validate: recordings of other motion, which are used to validate the result only.
         method, friction: identification method (one of `methods`) and friction model, which replace those of the
             settings; None takes those of the settings.
-        options: the settings as a TOML file (``calib formats identify-options``).
+        options: the settings as a TOML file (``calib formats identify-options``), or the options read from one, given
+            instead of `settings`; None for no file.
         excitation: folder written by `design_excitation`, for methods that simulate the closed loop ([loop] in the
-            options). Its motion is the reference motion for recordings that contain none.
+            options). Its motion is the reference motion for recordings that contain none. None for no folder.
         seed: seed of all random numbers.
-        on_read: called with the inputs before the identification begins.
+        on_read: called with the inputs before the identification begins; None for no call.
         progress: called with the name of each step; None for no report.
 
     Raises:

@@ -61,6 +61,11 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
         `poses` of `fit_geometry` uses. The figures are those of `plot`. Existing files are replaced only if an earlier
         selection wrote them and no measurements were added, or with `overwrite`.
 
+        Args:
+            path: the CSV to write.
+            plots: whether to write the figures.
+            overwrite: whether to replace any existing file.
+
         Raises:
             UsageError: a file exists and must not be replaced.
         """
@@ -79,6 +84,10 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
         """Write the measuring run, with the poses in their order, as CSV, and return its path.
 
         The columns are t [s], pose (0 for a via-point) and the joints [deg or mm].
+
+        Args:
+            path: the CSV to write.
+            overwrite: whether to replace any existing file; without it, only an unchanged file of an earlier call.
         """
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
             return write_run(Path(path), self.run, self.chain)
@@ -160,7 +169,7 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
 
         Args:
             q: (m, n) joint values [rad or m].
-            tool: index of the fit's tool.
+            tool: index of the fitted tool, from 0.
         """
         geometry = self.selection.fit
         poses = self._poses(q)
@@ -180,7 +189,7 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
 
         Args:
             q: (m, n) joint values [rad or m].
-            tool: index of the fit's tool.
+            tool: index of the fitted tool, from 0.
 
         Raises:
             UsageError: fewer than 20 positions were measured.
@@ -200,6 +209,10 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         """Write the result folder, with the same files as `calib fit --out`, and return its path.
 
         The files are robot.toml, URDF, estimate, residuals and certificate.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
         """
         from calib.procedure.report import outputs
 
@@ -316,11 +329,11 @@ def fit_geometry(
         measured: CSV files, results of `read_poses`, or several of either.
         settings: model, loss, folds, stations, tools, rows to hold out, tolerance, seed; None takes the defaults.
         validate: poses that are not fitted but used to judge the result, in the same forms as `measured`.
-        options: units and columns that the files' headers do not state, priors, fixed parameters (``calib formats
-            options``).
+        options: units and columns that the files' headers do not state, priors, fixed parameters: in memory, or as a
+            TOML file (``calib formats options``). None takes the defaults.
         poses: the planned poses: result of `select_poses`, its CSV, or its folder. The predicted σ are compared with
             those of the fit (finding ``sigma-ratio``). None for no comparison.
-        on_read: called with the inputs before the fit begins.
+        on_read: called with the inputs before the fit begins; None for no call.
         progress: called with the name of each step; None for no report.
 
     Raises:

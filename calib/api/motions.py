@@ -14,7 +14,7 @@ from calib.api.rendering import ChartedResult, Progress, WithoutVerdict, optiona
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
-from calib.errors import TaskLost, as_ours
+from calib.errors import TaskLost, UsageError, as_ours, require
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
 from calib.procedure.excitation import design, folder, planning, stored_front
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
@@ -56,6 +56,10 @@ class ExcitationDesign(ChartedResult, WithoutVerdict, design.Designed):
         """Write the result folder, with the same files as `calib excite --out`, and return its path.
 
         The files are trajectory.csv, ROS 2 messages, metrics and figures.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
         """
         from calib.procedure.report import motion_figures
 
@@ -99,7 +103,12 @@ class MotionPlan(ChartedResult, WithoutVerdict, planning.Planned):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the result folder, with the same files as `calib plan --out`, and return its path."""
+        """Write the result folder, with the same files as `calib plan --out`, and return its path.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
+        """
         from calib.procedure.report import motion_figures
 
         write_figures = motion_figures.write_plan if plots else None
@@ -156,7 +165,8 @@ def design_excitation(
         options: settings of the later identification, as in `calib.identify_dynamics`. The motion is designed for the
             torque rows, drive terms, couplings and payloads in them. None takes the defaults.
         after: identified dynamics to be improved by a further motion, given instead of `model`. The motion that reduces
-            the σ of their parameters most is designed, and the reduction is predicted.
+            the σ of their parameters most is designed, and the reduction is predicted. None: the design does not refer
+            to an earlier identification.
         pick: folder of a design with a Pareto front, made with the same settings, and the number of a motion on that
             front. This motion is returned instead of a new search; None searches.
         workers: number of local processes, or the address of a Dask scheduler.
@@ -179,6 +189,7 @@ def design_excitation(
         previous_folder = None if after is None else stack.enter_context(saved(after))
         crew = stack.enter_context(opened(workers))
         if stage is not None:
+            require(pick is None, "pick: fronts of trade-offs are designed for serial arms only", UsageError)
             return stage.run(
                 settings,
                 model=model_folder,

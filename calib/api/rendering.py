@@ -54,7 +54,12 @@ class SavedResult(Protocol):
     """A result that can be written to a folder."""
 
     def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
-        """Write the result's folder, and return the folder's path."""
+        """Write the result's folder, and return the folder's path.
+
+        Args:
+            out: folder to write.
+            plots: whether to write the figures.
+        """
         ...
 
 
@@ -81,14 +86,14 @@ def saved(result: str | Path | SavedResult) -> Iterator[Path]:
 
 
 def _renamed(argument: object, path: str, name: str) -> object:
-    """Return an error's argument; in a text, `path` is replaced by `name`."""
+    """Return an error's argument; if it is a text, with the temporary `path` replaced by `name` of the result."""
     if isinstance(argument, str):
         return argument.replace(path, name)
     return argument
 
 
 def as_text(renderables: Iterable[object]) -> str:
-    """Return the plain text of objects of the library rich."""
+    """Return the plain text that the library rich prints for `renderables`, objects such as tables and panels."""
     from rich.console import Console
 
     console = Console(file=io.StringIO(), width=WIDTH, highlight=False, color_system=None, force_jupyter=False)
@@ -125,7 +130,12 @@ class Kept(Shown, ABC):
 
     @abstractmethod
     def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
-        """Write the result's folder, and return the folder's path."""
+        """Write the result's folder, and return the folder's path.
+
+        Args:
+            out: folder to write.
+            plots: whether to write the figures.
+        """
 
     def figures(self) -> Mapping[str, Picture]:
         """Return the figures by name, as PNG images; empty for a result without figures."""
@@ -231,6 +241,10 @@ class ReportedResult(Kept):
 
 def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:
     """Return rows as a pandas DataFrame with the given columns.
+
+    Args:
+        rows: sequences or records, one per row.
+        columns: names of the columns.
 
     Raises:
         UsageError: pandas is not installed.

@@ -73,7 +73,13 @@ class Table:
         return name in self.header
 
     def fail(self, message: str, column: str | None = None, row: int | None = None) -> NoReturn:
-        """Raise MeasurementError about the table, about its column `column`, or about one cell (`row` from 0)."""
+        """Raise MeasurementError about the table, or about one of its columns or cells.
+
+        Args:
+            message: text of the error; the file's name is prepended.
+            column: name of the column; None: the whole table.
+            row: index of the cell's row, from 0; None: the whole column.
+        """
         refuse_data(self.file, message, column, None if row is None else int(self.rows[row]))
 
     def index(self, name: str) -> int:
@@ -88,7 +94,11 @@ class Table:
         return self.header.index(name)
 
     def texts(self, name: str) -> list[str]:
-        """Return a column (m,) as texts, with numbers in their shortest form (``0``, not ``0.0``)."""
+        """Return a column (m,) as texts, with numbers in their shortest form (``0``, not ``0.0``).
+
+        Args:
+            name: name of the column.
+        """
         cells = self.cells[self.index(name)]
         if cells.dtype == float:
             return [f"{cell:.12g}" for cell in cells]
@@ -98,6 +108,9 @@ class Table:
         """Return the columns named `head` and a joint (``q_joint1`` or ``q1``) as an array (m, n), not in SI.
 
         None if there are no such columns.
+
+        Args:
+            head: name of the quantity, such as ``q``.
         """
         names = [name for name in self.header if re.fullmatch(rf"{head}(\d+|_.+)", name)]
         if not names:
@@ -200,7 +213,12 @@ def read_table(path: str | Path, header: Sequence[str] | None = None, doubles: b
 
 
 def _refuse_doubles(names: tuple[str, ...], path: str | Path) -> None:
-    """Raise MeasurementError for a header in which a name occurs twice."""
+    """Raise MeasurementError for a header in which a name occurs twice.
+
+    Args:
+        names: the names in the header.
+        path: the file, for messages.
+    """
     for index, name in enumerate(names):
         if name in names[:index]:
             columns = " and ".join(str(column) for column, heading in enumerate(names, 1) if heading == name)
@@ -241,7 +259,11 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
 
 
 def _as_our_text(path: str | Path) -> IO[str] | None:
-    """Return another program's export as a text stream of a CSV table; None if the file is no known export."""
+    """Return another program's export as a text stream of a CSV table; None if the file is no known export.
+
+    Args:
+        path: the file, which may be the export of an instrument or a controller.
+    """
     for read_export in EXPORTS.all():
         export = read_export(path)
         if export is not None:
@@ -253,6 +275,11 @@ def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, lis
     """Return the separator and the cells of the first line that is not a comment.
 
     The file is then positioned after this line.
+
+    Args:
+        file: the open file.
+        path: its path, for messages.
+        headed: whether this line is a header; otherwise it is the first row of numbers.
     """
     try:
         comment = ""
@@ -286,7 +313,12 @@ def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, lis
 
 
 def _with_quoted_breaks(line: str, file: IO[str]) -> str:
-    """Return a line joined with the following lines, if a quoted name in it contains line breaks."""
+    """Return a line joined with the following lines, if a quoted name in it contains line breaks.
+
+    Args:
+        line: a line of the file.
+        file: the open file, from which the following lines are read.
+    """
     while line.count('"') % 2 and len(line) < LONGEST:
         continuation = file.readline(LONGEST)
         if not continuation:
@@ -297,6 +329,10 @@ def _with_quoted_breaks(line: str, file: IO[str]) -> str:
 
 def _headless(cells: Sequence[str], path: str | Path) -> bool:
     """Return whether most cells of a first line are numbers, so that the file has no header.
+
+    Args:
+        cells: cells of the file's first line.
+        path: the file, for messages.
 
     Raises:
         MeasurementError: most cells are numbers with decimal commas.
@@ -363,6 +399,12 @@ def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: 
 
     Blocks of rows that contain only numbers are read by numpy, which is about five times faster. From the first other
     block on, the file is read cell by cell.
+
+    Args:
+        lines: the open file, positioned below the header.
+        separator: the file's separator.
+        names: column names.
+        path: the file, for messages.
     """
     body = _without_comments(lines)
     blocks: list[np.ndarray] = []
@@ -392,7 +434,13 @@ def _without_comments(lines: IO[str]) -> Iterator[str]:
 
 
 def plain_rows(block: list[str], separator: str, width: int) -> np.ndarray | None:
-    """Return lines of numbers as an array (m, width); None if a cell is not a number or a row has another width."""
+    """Return lines of numbers as an array (m, width); None if a cell is not a number or a row has another width.
+
+    Args:
+        block: m lines of the file.
+        separator: separator of the cells.
+        width: number of cells in each line.
+    """
     delimiter = None if separator == " " else separator
     try:
         values = np.loadtxt(block, delimiter=delimiter, comments=None, quotechar='"', ndmin=2)

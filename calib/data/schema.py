@@ -156,7 +156,13 @@ class Column:
     positive: str = ""
 
     def check(self, values: np.ndarray, source: Rows, columns: Sequence[str]) -> np.ndarray:
-        """Return a column's values (m, k) [SI] (NaN for an empty cell); refuse values outside the bounds."""
+        """Return a column's values (m, k) [SI] (NaN for an empty cell); refuse values outside the bounds.
+
+        Args:
+            values: the column's values, in SI.
+            source: file and row numbers, for messages.
+            columns: the file's names of the k columns.
+        """
         unit = {"angle": " rad", "length": " m"}.get(self.dimension, "")
 
         def other_unit(row: int, k: int) -> str:
@@ -174,12 +180,20 @@ class Column:
 
 
 def joint_unit(kind: str) -> tuple[str, str, float]:
-    """Return a joint type's SI unit, the unit that is often used by mistake, and the factor of the latter to SI."""
+    """Return a joint type's SI unit, the unit that is often used by mistake, and the factor of the latter to SI.
+
+    Args:
+        kind: URDF type of the joint.
+    """
     return ("m", "mm", 1e-3) if kind == "prismatic" else ("rad", "deg", DEG)
 
 
 def max_travel(kinds: Sequence[str]) -> np.ndarray:
-    """Return the largest plausible joint values (n,) [rad or m] for joints of the given types without known limits."""
+    """Return the largest plausible joint values (n,) [rad or m] for joints of the given types without known limits.
+
+    Args:
+        kinds: URDF type of each joint.
+    """
     travel_of = {"prismatic": BOUNDS.max_length, "continuous": math.inf}
     return np.array([travel_of.get(kind, BOUNDS.max_turn) for kind in kinds])
 

@@ -38,7 +38,7 @@ MIN_INDEPENDENT = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """Base parameters of a model.
+    """Base parameters of a model: b combinations T (b, p) of its p standard parameters, with independent columns.
 
     Attributes:
         rows: name of the model's torque rows.
@@ -105,7 +105,7 @@ class Base:
         return tuple(self.standard_units[column] for column in self.kept)
 
     def to_standard(self, values: np.ndarray) -> np.ndarray:
-        """Return standard parameters (p,) that give the torques of base parameters `values` (b,).
+        """Return standard parameters (p,) that give the same torques as the base parameters `values` (b,).
 
         Kept parameters have the base values, all others are zero.
         """
@@ -140,7 +140,11 @@ class BaseModel:
         return self.base.units
 
     def regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the base regressor (N, rows, b) at q, v, a (N, n), with all payloads attached."""
+        """Return the base regressor (N, rows, b) at q, v, a (N, n), with all payloads attached.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+        """
         full = self.model.regressor(q, v, a)
         return full.transpose(2, 1, 0)[self.base.kept].transpose(2, 1, 0)
 
@@ -198,7 +202,7 @@ def find(
     """Return the base parameters of a model: the independent columns of its regressor.
 
     Args:
-        model: torques as a linear function of p parameters.
+        model: torques as a linear function of p parameters, with the regressor W (rows, p).
         samples: states at which columns are compared; None: `random_samples`. For the states of a recorded motion, the
             result has the base parameters that this motion identifies.
         loads: load cases whose rows are stacked, each in the form of the regressor's argument `carried`; None: the
@@ -221,9 +225,10 @@ def find(
 def regroup(base: Base, model: RegressorModel, samples: States | None = None, loads: Loads | None = None) -> Base:
     """Return the base parameters on another geometry, with the kept columns unchanged and K recomputed.
 
-    K minimises ‖W_dropped - W_kept K‖; `Base.remainder` is the relative error over the samples. Columns that are zero
-    on the nominal chain are included, since they may have a small effect on the calibrated chain. The singular values
-    are those of the new geometry.
+    K (b, p - b) minimises ‖W_dropped - W_kept K‖, with W_kept and W_dropped the kept and the dropped columns of the
+    regressor over all samples; `Base.remainder` is the relative error. Columns that are zero on the nominal chain are
+    included, since they may have a small effect on the calibrated chain. The singular values are those of the new
+    geometry.
 
     Args:
         base: base parameters on the nominal geometry.
@@ -260,6 +265,11 @@ def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> 
     Samples are processed in blocks, so that the memory does not grow with their number. There is one triangle per
     torque row, updated only with the columns that can affect this row (the links before a joint do not); in the end all
     triangles are combined by a QR.
+
+    Args:
+        model: model with p parameters, whose regressor is stacked to the observation matrix.
+        samples: states at which the regressor is computed.
+        loads: load cases, each in the form of the regressor's argument `carried`; (None,): once, with all payloads.
     """
     p = model.p
     states = samples.states
@@ -317,6 +327,11 @@ def places(parameters: Sequence[str], names: Sequence[str], standard: Collection
 
     Names are compared without the suffix R (`standard_name`): which parameters are regrouped may differ on another
     geometry or with joint corrections.
+
+    Args:
+        parameters: names of the base parameters to find.
+        names: names in which they are searched.
+        standard: names of the model's standard parameters.
     """
     index_of = {standard_name(name, standard): index for index, name in enumerate(names)}
     standard_names = [standard_name(name, standard) for name in parameters]
@@ -326,7 +341,12 @@ def places(parameters: Sequence[str], names: Sequence[str], standard: Collection
 
 
 def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the R factor (p, p) of `triangle` (p, p) with further rows below, which are given transposed (p, N)."""
+    """Return the R factor (p, p) of `triangle` (p, p) with further rows below, which are given transposed (p, N).
+
+    Args:
+        triangle: R factor of the rows so far.
+        columns: (p, N) the further N rows, transposed.
+    """
     nonzero = np.flatnonzero(columns.any(axis=1) | triangle.any(axis=0))
     count = len(nonzero)
     result = np.zeros_like(triangle)
@@ -348,7 +368,11 @@ def _clean(split: ColumnSplit) -> ColumnSplit:
 
 
 def _norms(factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a mask (p,) of the columns that are zero, and the norms (p,) of all columns, with 1 in place of 0."""
+    """Return a mask (p,) of the columns that are zero, and the norms (p,) of all columns, with 1 in place of 0.
+
+    Args:
+        factor: (p, p) R factor of a matrix, whose columns have the same norms.
+    """
     norms = np.linalg.norm(factor, axis=0)
     without_effect = norms <= 1e-12 * norms.max(initial=0.0)
     return without_effect, np.where(without_effect, 1.0, norms)
@@ -360,7 +384,7 @@ def _describe(model: RegressorModel, split: ColumnSplit, factor: np.ndarray, sam
     Args:
         model: the model.
         split: kept columns W_k and dropped columns W_d.
-        factor: (p, p) R factor of W.
+        factor: (p, p) R factor of the observation matrix W.
         samples: number of samples times load cases in W.
     """
     without_effect, scale = _norms(factor)
@@ -391,7 +415,7 @@ def information(
     Args:
         model: base model with b columns.
         q, v, a: (N, n) the motion [rad or m, and per s, per s²].
-        sigmas: (rows,) standard deviations by which the rows of ω are divided; None: 1.
+        sigmas: (rows,) standard deviations [N m or N] by which the rows of ω are divided; None: 1.
     """
     b = len(model.names)
     total = np.zeros((b, b))
@@ -420,10 +444,10 @@ def columns_at_rest(
 
     Args:
         model: base model with b columns.
-        resting: maps a joint at rest to its position [rad or m]; None: one random position.
-        lower, upper: (n,) finite limits of the random states at which columns are compared.
+        resting: maps a joint at rest, from 0, to its position [rad or m], or to None for one random position.
+        lower, upper: (n,) finite limits [rad or m] of the random positions at which columns are compared.
         known: (b, b) information matrix of other motions, in which the resting joints may move; None: no other motions.
-        unused: torque rows that are not used; None: those of the resting joints.
+        unused: indices of torque rows that are not used; None: those of the resting joints.
     """
     states = random_samples(model.model, lower=lower, upper=upper)
     q = np.array(states.q)

@@ -216,7 +216,13 @@ def _assemble(
     gravity: np.ndarray,
     n: int,
 ) -> Bodies:
-    """Return `Bodies` with read-only arrays; `paths`, `links`, `constants` and `order` are computed."""
+    """Return `Bodies` with read-only arrays; `paths`, `links`, `constants` and `order` are computed.
+
+    Args:
+        labels, parents, kinds, axes, scales, coordinates, placements: one entry per body, as in `Bodies`.
+        gravity: (3,) gravity vector in the base frame [m/s²].
+        n: number of coordinates.
+    """
     count = len(labels)
     paths = np.full((count, n), -1)
     depths = np.zeros(count, dtype=int)

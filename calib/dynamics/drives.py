@@ -81,15 +81,17 @@ class DriveTerm:
         """Yield each torque row that the term acts on, with the term's column (N,) in this row.
 
         Args:
-            motions: q, v, a, load, (n, N) each; load is None if the term does not need it.
-            states: (s, N) hysteresis states of this term alone, from `friction_states`.
+            motions: q, v, a [rad or m, per s, per s²] and load [N m or N], (n, N) each; load (the torque that the gears
+                transmit) is None if the term does not need it.
+            states: (s, N) hysteresis states of this term alone, from `friction_states`; s is 0 for a term without
+                hysteresis.
         """
         for k, (row, motion) in enumerate(self.acts):
             state = states[k] if self.form.remembers else None
             yield row, self.values(_join(self, motion, motions, state))
 
     def values(self, joined: TermMotion) -> np.ndarray:
-        """Return the term's column (N,) for a motion, i.e. its torque per unit of the parameter."""
+        """Return the term's column (N,), its torque per unit of the parameter, for the motion `joined`."""
         if self.shape == "acceleration":
             return joined.a
         if self.shape == "velocity":
@@ -100,12 +102,21 @@ class DriveTerm:
         return values
 
     def slopes(self, joined: TermMotion) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return the derivatives of the term's column by position (N,), velocity (N,) and acceleration (a number)."""
+        """Return the derivatives of the term's column by position (N,), velocity (N,) and acceleration (a number).
+
+        Args:
+            joined: motion that the term depends on.
+        """
         _, by_x, by_v = self._evaluated(joined, 3)
         return by_x, by_v, float(self.shape == "acceleration")
 
     def _evaluated(self, joined: TermMotion, rows: int) -> np.ndarray:
-        """Return the shape's value, with its derivatives by position and velocity if `rows` is 3, as (rows, N)."""
+        """Return the shape's value, with its derivatives by position and velocity if `rows` is 3, as (rows, N).
+
+        Args:
+            joined: motion of N samples that the term depends on.
+            rows: 1 for the value alone, 3 with the derivatives.
+        """
         from calib.dynamics import shape_kernels
 
         acts = np.zeros((1, 8))
@@ -126,7 +137,7 @@ def term(name: str, shape: str, joint: int, *settings: float, side: str = "motor
         name: name of the term's parameter.
         shape: a key of `SHAPES`.
         joint: joint, from 0.
-        settings: values of the shape's settings.
+        settings: values of the shape's settings, in the order of `Shape.settings`.
         side: "link" or "motor" side of a joint torque sensor.
         linear: whether the joint is prismatic.
     """
@@ -141,7 +152,9 @@ def standard(
     """Return the standard drive terms of n joints, joint after joint.
 
     Args:
-        sets: n strings of term names from Ia Fv Fc off (and Fvl Fcl offl, Fvm Fcm offm), e.g. ``["Ia Fv Fc"] * 6``.
+        sets: n strings, one per joint, of term names from Ia Fv Fc off (motor inertia, viscous and Coulomb friction,
+            offset; with a torque sensor Fvl Fcl offl on its link side, Fvm Fcm offm on its motor side), e.g. ``["Ia Fv
+            Fc"] * 6``.
         v0: smoothing of the Coulomb sign [rad/s or m/s], one value or one per joint.
         linear: (n,) whether each joint is prismatic; None: no joint is.
 
@@ -196,7 +209,7 @@ def coupled(
     Args:
         first, second: the coupled joints, from 0.
         v0: smoothing of the Coulomb sign [rad/s].
-        label: suffix of the parameters' names; None: the number of the second joint, from 1.
+        label: suffix of the parameters' names; None: that of the second joint, counted from 1.
         weight: weight of the second joint.
     """
     if label is None:
@@ -237,7 +250,7 @@ def fill_energies(terms: Sequence[DriveTerm], out: np.ndarray, v: np.ndarray) ->
     Args:
         terms: k drive terms.
         out: (k, N) energies.
-        v: (n, N) velocities.
+        v: (n, N) joint velocities [rad/s or m/s].
     """
     for column, term in zip(out, terms, strict=True):
         if term.shape != "acceleration":
@@ -279,6 +292,10 @@ def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
     (stop operator). After a reversal the state changes in proportion to the displacement; beyond a travel of 2 · width
     it equals Coulomb's sign. Friction thus depends on past motion (Iwan 1966; several widths side by side are the
     Maxwell-slip model). There is one state for each torque row of each term with hysteresis.
+
+    Args:
+        terms: drive terms; s is 0 if none of them has hysteresis.
+        q: (n, N) joint positions x [rad or m].
     """
     from calib.dynamics import kernels
 
@@ -299,7 +316,14 @@ def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
 def _join(
     term: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None], state: np.ndarray | None
 ) -> TermMotion:
-    """Return the motion that a term depends on: weighted sums of the joints' q, v, a and load."""
+    """Return the motion that a term depends on: weighted sums of the joints' q, v, a and load.
+
+    Args:
+        term: the drive term.
+        motion: pairs (joint, weight) of the joints that the term depends on.
+        motions: q, v, a, load, (n, N) each; load is None if no term needs it.
+        state: (N,) state of the stop operator; None for a term without hysteresis.
+    """
     if term.form.loaded and motions[3] is None:
         raise CalibError(f"term '{term.name}' needs the transmitted torque; give load (N, n), measured or predicted")
     q, v, a, load = motions
@@ -317,6 +341,10 @@ def _weighted(motion: Motion, series: np.ndarray) -> np.ndarray:
     """Return the weighted sum (N,) of the joints' time series (n, N).
 
     A single joint of weight 1 is returned without a copy.
+
+    Args:
+        motion: pairs (joint, weight).
+        series: (n, N) position, velocity, acceleration or load of all joints.
     """
     if len(motion) == 1:
         joint, weight = motion[0]

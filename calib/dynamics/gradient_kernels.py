@@ -39,6 +39,13 @@ def _share(links, order, i, weights, motion, twists, slopes, bars):
     S_j is the twist of the body per unit rate of coordinate j; wrench_i is the body's wrench for the parameters g_j =
     weights[j, body i]. ``slopes`` (B + 1, 9) are the derivatives with respect to w, dw, a; ``bars`` (B + 1, n, 6) the
     derivatives with respect to the twists.
+
+    Args:
+        links, order: those of `Bodies`.
+        i: index of the body.
+        weights: (n, 10 B) weight of each entry of the regressor.
+        motion, twists: motion and twists of all bodies, from `kernels.advance` and `kernels.carry`.
+        slopes, bars: the derivatives, to which is added.
     """
     h = i + 1
     index = order[i]
@@ -69,7 +76,16 @@ def _share(links, order, i, weights, motion, twists, slopes, bars):
 
 @njit(**OPTIONS)
 def _unjoint(links, i, rate, motion, slopes):
-    """Reverse the joint's part of `advance`; return the derivatives by joint rate and joint acceleration."""
+    """Reverse the joint's part of `advance`; return the derivatives by joint rate and joint acceleration.
+
+    Args:
+        links: those of `Bodies`.
+        i: index of the body.
+        rate: velocity of the body's joint.
+        motion: (B + 1, 9) w, dw, a of all bodies, from `kernels.advance`.
+        slopes: (B + 1, 9) derivatives with respect to w, dw, a; row i + 1 is changed to the derivatives before the
+            joint.
+    """
     h = i + 1
     if links[i, KIND] == FIXED:
         return 0.0, 0.0
@@ -86,7 +102,16 @@ def _unjoint(links, i, rate, motion, slopes):
 
 @njit(**OPTIONS)
 def _unadvance(links, i, rate, frames, motion, slopes):
-    """Add body i's motion derivatives to its parent's; return the derivative by the joint position."""
+    """Add body i's motion derivatives to its parent's; return the derivative by the joint position.
+
+    Args:
+        links: those of `Bodies`.
+        i: index of the body.
+        rate: velocity of the body's joint.
+        frames: (B, 12) rotation and origin of each body in its parent's frame, from `kernels.place`.
+        motion: (B + 1, 9) w, dw, a of all bodies, from `kernels.advance`.
+        slopes: (B + 1, 9) derivatives with respect to w, dw, a.
+    """
     p = links[i, PARENT] + 1
     h = i + 1
     by_amount = 0.0
@@ -119,7 +144,15 @@ def _unadvance(links, i, rate, frames, motion, slopes):
 
 @njit(**OPTIONS)
 def _uncarry(links, i, frames, twists, bars):
-    """Add body i's twist derivatives to its parent's; return the derivative by the joint position."""
+    """Add body i's twist derivatives to its parent's; return the derivative by the joint position.
+
+    Args:
+        links: those of `Bodies`, or of `hung_on_one`.
+        i: index of the body.
+        frames: (B, 12) rotation and origin of each body in its parent's frame, from `kernels.place`.
+        twists: (B + 1, n, 6) twists of all bodies, from `kernels.carry`.
+        bars: (B + 1, n, 6) derivatives with respect to the twists.
+    """
     p = links[i, PARENT]
     by_amount = 0.0
     twist = twists[i + 1]
@@ -148,7 +181,13 @@ def _uncarry(links, i, frames, twists, bars):
 def _back(links, hung, constants, v, frames, motion, twists, slopes, bars, gq, gv, ga):
     """Add one sample's derivatives to gq, gv, ga (n,), in a backward pass from the last body to the first.
 
-    `hung` (B, 4 + n) are the links used for the twists: those of the robot, or `hung_on_one`.
+    Args:
+        links, constants: those of `Bodies`.
+        hung: (B, 4 + n) the links used for the twists: those of the robot, or of `hung_on_one`.
+        v: (n,) joint velocities.
+        frames, motion, twists: results of `kernels.place`, `kernels.advance` and `kernels.carry` for the sample.
+        slopes, bars: derivatives with respect to `motion` (B + 1, 9) and `twists` (B + 1, n, 6), which are overwritten.
+        gq, gv, ga: (n,) derivatives with respect to q, v and a.
     """
     for i in range(len(frames) - 1, -1, -1):
         c = links[i, COORDINATE]
@@ -168,6 +207,13 @@ def regressor_gradient(links, constants, order, amount, cosine, sine, v, a, weig
     """Add the gradients of Σ weights · Y(q, v, a), weights (N, n, 10 B), to gq, gv, ga (N, n), which must be zero.
 
     One forward and one backward pass per sample; the cost per sample is O(n B).
+
+    Args:
+        links, constants, order: those of `Bodies`.
+        amount, cosine, sine: (N, B) joint position that moves each body [rad or m], its cosine and sine.
+        v, a: (N, n) joint velocities and accelerations.
+        weights: (N, n, 10 B) weight of each entry of the regressor Y.
+        gq, gv, ga: (N, n) gradients with respect to q, v and a.
     """
     bodies = amount.shape[1]
     n = v.shape[1]
@@ -208,7 +254,16 @@ def torque_gradient(links, chain, constants, order, amount, cosine, sine, v, a, 
 
     This equals `regressor_gradient` for weights of rank one. The joints' twists then occur only in their weighted sum,
     so that one virtual joint that carries every body (``chain``, from `hung_on_one`) replaces all joints. The cost per
-    sample is O(B). ``parameters`` (1, 10 B) are the standard parameters.
+    sample is O(B).
+
+    Args:
+        links, constants, order: those of `Bodies`.
+        chain: links from `hung_on_one`.
+        amount, cosine, sine: (N, B) joint position that moves each body [rad or m], its cosine and sine.
+        v, a: (N, n) joint velocities and accelerations.
+        parameters: (1, 10 B) standard parameters, which give the torques tau.
+        weights: (N, n) weight of each torque.
+        gq, gv, ga: (N, n) gradients with respect to q, v and a.
     """
     bodies = amount.shape[1]
     frames = np.empty((bodies, 12))

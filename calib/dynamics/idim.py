@@ -251,8 +251,12 @@ class IdentificationModel:
     ) -> np.ndarray:
         """Return the torques (N, rows) for parameters `values` (p,), by recursive Newton-Euler.
 
-        For load-dependent friction, the load is the model's own torque of the bodies, which move as `link`. The other
-        arguments are those of `regressor`.
+        For load-dependent friction, the load is the model's own torque of the bodies, which move as `link`.
+
+        Args:
+            values: (p,) parameter values.
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+            carried, states, link: as in `regressor`.
         """
         load, load_columns = None, None
         if self.inertial:
@@ -287,7 +291,7 @@ class IdentificationModel:
 
         Args:
             values: (p,) parameters.
-            q, v, a: (N, n) motion of the bodies.
+            q, v, a: (N, n) motion of the bodies [rad or m, and per s, per s²].
             carried: labels of the attached payloads; None: all.
         """
         present = np.ones(self.inertial)
@@ -303,7 +307,7 @@ class IdentificationModel:
         motor inertia is ½ v², per unit of a coupled motor inertia v_i v_j.
 
         Args:
-            q, v: (N, n) joint positions and velocities.
+            q, v: (N, n) joint positions and velocities [rad or m, and per s].
             carried: labels of the attached payloads; None: all.
         """
         out = np.zeros((len(q), self.p))

@@ -65,7 +65,12 @@ def sincos(x):
 def place(links, constants, i, amount, cosine, sine, frames):
     """Write rotation and origin of body i, in its parent's frame, into row i of `frames`.
 
-    `amount` is the joint position [rad or m], `cosine` and `sine` are those of this position.
+    Args:
+        links, constants: those of `Bodies`.
+        i: index of the body.
+        amount: joint position [rad or m].
+        cosine, sine: cosine and sine of this position.
+        frames: (B, 12) array to write: nine entries of the rotation, row by row, then the origin.
     """
     for r in range(3):
         x = constants[i, 4 * r]
@@ -139,7 +144,7 @@ def inertia_times(J, a):
 
 @njit(**JOINED)
 def turned(frames, i, a, k=0):
-    """Return R a, with the rotation matrix R stored row by row in row i of `frames`, from column k on."""
+    """Return R a for a vector a (3,), with the rotation R stored row by row in row i of `frames`, from column k on."""
     x = dot(three(frames, i, k), a)
     y = dot(three(frames, i, k + 3), a)
     z = dot(three(frames, i, k + 6), a)
@@ -148,7 +153,7 @@ def turned(frames, i, a, k=0):
 
 @njit(**JOINED)
 def turned_back(frames, i, a, k=0):
-    """Return Rᵀ a, with the rotation matrix R stored row by row in row i of `frames`, from column k on."""
+    """Return Rᵀ a for a vector a (3,), with the rotation R stored row by row in row i of `frames`, from column k on."""
     x = scaled(a[0], three(frames, i, k))
     y = scaled(a[1], three(frames, i, k + 3))
     z = scaled(a[2], three(frames, i, k + 6))
@@ -181,7 +186,13 @@ def ten_columns(w, e, a, u, s):
 def advance(links, i, rate, change, frames, motion):
     """Write w, dw, a of body i, computed from its parent's, into row i + 1 of `motion` (B + 1, 9).
 
-    `rate` and `change` are joint velocity and joint acceleration.
+    Args:
+        links: those of `Bodies`.
+        i: index of the body.
+        rate, change: joint velocity and joint acceleration.
+        frames: (B, 12) rotation and origin of each body in its parent's frame, from `place`.
+        motion: (B + 1, 9) angular velocity w, angular acceleration dw and acceleration a of the bodies; row 0 is the
+            base.
     """
     p = links[i, PARENT] + 1
     h = i + 1
@@ -207,7 +218,15 @@ def advance(links, i, rate, change, frames, motion):
 
 @njit(**OPTIONS)
 def carry(links, constants, i, frames, twists):
-    """Write the twists (u_j, s_j) of body i, computed from its parent's, into row i + 1 of `twists` (B + 1, n, 6)."""
+    """Write the twists (u_j, s_j) of body i, computed from its parent's, into row i + 1 of `twists` (B + 1, n, 6).
+
+    Args:
+        links, constants: those of `Bodies`.
+        i: index of the body.
+        frames: (B, 12) rotation and origin of each body in its parent's frame, from `place`.
+        twists: (B + 1, n, 6) angular and linear velocity of each body per unit rate of each coordinate; row 0 is the
+            base.
+    """
     p = links[i, PARENT]
     coordinate = links[i, COORDINATE]
     up = twists[p + 1]
@@ -230,7 +249,11 @@ def carry(links, constants, i, frames, twists):
 def _place_lanes(constants, i, joint, turn):
     """Write rotation (rows 0 to 8) and origin (rows 9 to 11) of body i into `turn`, for L samples.
 
-    `joint` contains cosine, sine and shift of the joint (rows 0 to 2).
+    Args:
+        constants: those of `Bodies`.
+        i: index of the body.
+        joint: flat (5 L,), rows of L samples: cosine, sine and shift of the joint in rows 0 to 2.
+        turn: flat (12 L,) array to write.
     """
     a0 = constants[i, 0]
     a1 = constants[i, 1]
@@ -275,7 +298,13 @@ def _write_lane(x, r, k, a):
 
 @njit(**JOINED)
 def _lane_back(turn, k, a):
-    """Return Rᵀ a for sample k, with the rotation R of this sample from `turn`."""
+    """Return Rᵀ a for sample k, with the rotation R of this sample from `turn`.
+
+    Args:
+        turn: flat (12 L,) rotations and origins of L samples, from `_place_lanes`.
+        k: index of the sample.
+        a: vector (3,).
+    """
     x = scaled(a[0], _lane(turn, 0, k))
     y = scaled(a[1], _lane(turn, 3, k))
     z = scaled(a[2], _lane(turn, 6, k))
@@ -284,7 +313,15 @@ def _lane_back(turn, k, a):
 
 @njit(**OPTIONS)
 def _advance_lanes(turning, joint, turn, up, motion_here):
-    """Compute `advance` for L samples, for a joint about z (turning 1), or one along z or a fixed body (turning 0)."""
+    """Compute `advance` for L samples, for a joint about z (turning 1), or one along z or a fixed body (turning 0).
+
+    Args:
+        turning: 1.0 for a revolute joint, 0.0 otherwise.
+        joint: flat (5 L,): cosine, sine, shift, velocity and acceleration of the joint, from `_load_lanes`.
+        turn: flat (12 L,) rotation and origin of the body, from `_place_lanes`.
+        up: flat (9 L,) w, dw, a of the parent.
+        motion_here: flat (9 L,) array to write, those of the body.
+    """
     f, g = turning, 2.0 - 2.0 * turning
     for k in range(L):
         w = _lane(up, 0, k)
@@ -305,7 +342,13 @@ def _advance_lanes(turning, joint, turn, up, motion_here):
 
 @njit(**OPTIONS)
 def _carry_lanes(turn, up, twist_here):
-    """Compute the twist of one coordinate as in `carry`, from the parent's twist `up`, for L samples."""
+    """Compute the twist of one coordinate as in `carry`, from the parent's twist `up`, for L samples.
+
+    Args:
+        turn: flat (12 L,) rotation and origin of the body, from `_place_lanes`.
+        up: flat (6 L,) twist of the parent.
+        twist_here: flat (6 L,) array to write, the twist of the body.
+    """
     for k in range(L):
         u = _lane(up, 0, k)
         _write_lane(twist_here, 0, k, _lane_back(turn, k, u))
@@ -315,7 +358,13 @@ def _carry_lanes(turn, up, twist_here):
 
 @njit(**OPTIONS)
 def _project_lanes(motion, twist, columns):
-    """Write the ten regressor columns of one body in one coordinate's torque row, for L samples."""
+    """Write the ten regressor columns of one body in one coordinate's torque row, for L samples.
+
+    Args:
+        motion: flat (9 L,) w, dw, a of the body.
+        twist: flat (6 L,) twist of the body per unit rate of the coordinate.
+        columns: flat (10 L,) array to write.
+    """
     for k in range(L):
         w = _lane(motion, 0, k)
         e = _lane(motion, 3, k)
@@ -340,7 +389,12 @@ def _project_lanes(motion, twist, columns):
 def _load_lanes(kind, scale, amount, v, a, joint):
     """Write cosine, sine, shift, velocity and acceleration of one joint into `joint`, for up to L samples.
 
-    The arrays `amount`, `v` and `a` contain the samples.
+    Args:
+        kind: kind of the joint, as in `Bodies.kinds`.
+        scale: factor of the coordinate, as in `Bodies.scales`.
+        amount: position of the joint in each sample [rad or m].
+        v, a: velocity and acceleration of the coordinate in each sample.
+        joint: flat (5 L,) array to write.
     """
     for k in range(amount.shape[0]):
         joint[2 * L + k] = amount[k]
@@ -412,7 +466,14 @@ def regressor(links, constants, order, amount, v, a, out):
 
 @njit(**OPTIONS)
 def _wrench(i, parameters, motion, wrench):
-    """Write the inertial force and moment of body i about its frame's origin into row i of `wrench` (B, 6)."""
+    """Write the inertial force and moment of body i about its frame's origin into row i of `wrench` (B, 6).
+
+    Args:
+        i: index of the body.
+        parameters: (10 B,) standard parameters in the kernels' frames.
+        motion: (B + 1, 9) w, dw, a of all bodies, from `advance`.
+        wrench: (B, 6) array to write.
+    """
     w = three(motion, i + 1, 0)
     e = three(motion, i + 1, 3)
     a = three(motion, i + 1, 6)
@@ -428,7 +489,15 @@ def _wrench(i, parameters, motion, wrench):
 
 @njit(**OPTIONS)
 def _return(links, constants, i, frames, wrench, tau):
-    """Add body i's joint torque to tau (n,) and its wrench to its parent's (the backward step of Newton-Euler)."""
+    """Add body i's joint torque to tau (n,) and its wrench to its parent's (the backward step of Newton-Euler).
+
+    Args:
+        links, constants: those of `Bodies`.
+        i: index of the body.
+        frames: (B, 12) rotation and origin of each body in its parent's frame, from `place`.
+        wrench: (B, 6) force and moment about each body's origin; the parent's row is increased.
+        tau: (n,) joint torques [N m or N].
+    """
     c = links[i, COORDINATE]
     p = links[i, PARENT]
     if c >= 0:
@@ -480,6 +549,10 @@ def stop(x, width):
     """Return the states (N,) within ±1 of a stop operator of half-width `width` driven by positions x (N,).
 
     The first state is 0. The state follows x / width and saturates at ±1 (hysteresis of friction).
+
+    Args:
+        x: (N,) positions in order of time.
+        width: travel over which the state changes by 1.
     """
     out = np.zeros(x.shape[0])
     for k in range(1, x.shape[0]):

@@ -54,13 +54,22 @@ class LoadCases(BaseModel):
         return tuple(names)
 
     def of_rows(self, of_joints: np.ndarray, fill: float = np.inf) -> np.ndarray:
-        """Return values of joints (n,) at the corresponding rows of `limited`, and `fill` at all other rows."""
+        """Return values of the n joints at the corresponding rows of `limited`, and `fill` at all other rows.
+
+        Args:
+            of_joints: (n,) one value per joint.
+            fill: value of the rows without torque limit.
+        """
         values = np.full(len(self.joint_of_row), fill)
         values[self.limited] = of_joints
         return values
 
     def regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the stacked base regressor (N, loads x rows per sample, b); columns of absent payloads are zero."""
+        """Return the stacked base regressor (N, loads x rows per sample, b); columns of absent payloads are zero.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+        """
         regressor = super().regressor(q, v, a)
         if self._plain:
             return regressor
@@ -106,7 +115,12 @@ class LoadCases(BaseModel):
         return by_q, by_v, by_a
 
     def largest_torques(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the motor torques (N, n) for base parameters (b,), each under the load with the largest |torque|."""
+        """Return the motor torques (N, n) of a motion, each under the load that gives the largest |torque|.
+
+        Args:
+            values: (b,) base parameters.
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+        """
         # (N, loads, n)
         torques = (self.regressor(q, v, a) @ values)[:, self.limited]
         largest = np.abs(torques).argmax(axis=1, keepdims=True)

@@ -58,10 +58,10 @@ class PathDynamics:
     def along(
         self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the coefficients A, B, Γ of the path dynamics, each (N, n), at N points of the path.
+        """Return the coefficients A, B, Γ of the torques A s̈ + B ṡ² + Γ, each (N, n), at N points of the path.
 
         Args:
-            q, slope, curvature: (N, n) Φ and its derivatives Φ', Φ'' with respect to s.
+            q, slope, curvature: (N, n) path q = Φ(s) and its derivatives Φ', Φ'' with respect to the path parameter s.
         """
         zero = np.zeros_like(q)
         gravity = self.rigid(q, zero, zero)
@@ -70,13 +70,20 @@ class PathDynamics:
         return by_acceleration, by_square_of_speed, gravity
 
     def rigid(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the torques (N, n) without friction for a motion q, v, a (N, n)."""
+        """Return the torques (N, n) [N m or N] without friction.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+        """
         return self.regressor(q, v, a)[:, -self.n :] @ self.parameters
 
     def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the friction torques (N, n).
 
         The state of friction with hysteresis is taken as ±1, the value in continued sliding.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
         """
         terms, amounts = [], []
         for term, amount in zip(self.terms, self.amounts):
@@ -89,7 +96,11 @@ class PathDynamics:
         return self._drives(terms, np.array(amounts), q, v, a, load)
 
     def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the complete torques (N, n) of a motion, friction included, by recursive Newton-Euler."""
+        """Return the complete torques (N, n) of a motion, friction included, by recursive Newton-Euler.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+        """
         load = rigid_body.inverse_dynamics(self.bodies, np.array(self.inertial), q, v, a)
         return load + self._drives(self.terms, np.asarray(self.amounts), q, v, a, load)
 
@@ -107,7 +118,7 @@ class PathDynamics:
         Args:
             terms, amounts: drive terms and their values.
             q, v, a: (N, n) the motion.
-            load: (N, n) transmitted torques; None if no term depends on them.
+            load: (N, n) torques that the gears transmit [N m or N]; None if no term depends on them.
         """
         motions: list[np.ndarray | None] = [np.ascontiguousarray(series.T) for series in (q, v, a)]
         motions.append(None if load is None else load.T)
@@ -161,7 +172,7 @@ def _with_exact_sign(term: DriveTerm) -> DriveTerm:
 
 
 def _stressed(terms: Sequence[DriveTerm], v: np.ndarray) -> np.ndarray:
-    """Return the states (s, N), ±1, of stop operators that slide in the direction of the velocities v (n, N)."""
+    """Return the states (s, N), ±1, of the terms' stop operators that slide in the direction of velocity v (n, N)."""
     count = v.shape[1]
     states = []
     for term in terms:

@@ -19,7 +19,10 @@ def from_standard(parameters: np.ndarray) -> np.ndarray:
 
 
 def to_standard(pseudo: np.ndarray) -> np.ndarray:
-    """Return the standard parameters (…, 10) of pseudo-inertias P (…, 4, 4); the inertia is I = tr(Σ) 1 - Σ."""
+    """Return the standard parameters (…, 10) of pseudo-inertias P (…, 4, 4); the inertia is I = tr(Σ) 1 - Σ.
+
+    Σ (3, 3) is the upper left block of P, the second moment of mass.
+    """
     pseudo = np.asarray(pseudo, dtype=float)
     second = pseudo[..., :3, :3]
     trace = np.trace(second, axis1=-2, axis2=-1)
@@ -133,6 +136,10 @@ def unknown_bodies(count: int, term_count: int) -> np.ndarray:
 
     The unknowns are ten coordinates per body in the basis `UNITS`, followed by the drive parameters, on which the
     pseudo-inertias do not depend.
+
+    Args:
+        count: number of bodies.
+        term_count: number of drive parameters.
     """
     bodies = np.einsum("ij,krs->irsjk", np.eye(count), UNITS)
     bodies = bodies.reshape(count, 4, 4, 10 * count)

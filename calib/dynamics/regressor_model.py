@@ -86,7 +86,13 @@ class RegressorModel(Protocol):
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return W (N, rows, p) at q, v, a (N, n); `IdentificationModel.regressor` explains the further arguments."""
+        """Return the regressor W (N, rows, p) of a motion.
+
+        Args:
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+            load, carried, states: as in `IdentificationModel.regressor`: transmitted torques, attached payloads and
+                states of friction with hysteresis.
+        """
         ...
 
     def torque(
@@ -98,7 +104,14 @@ class RegressorModel(Protocol):
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the torques (N, rows) W · values for parameters `values` (p,), possibly by a faster algorithm."""
+        """Return the torques (N, rows) W · values for parameters `values` (p,), possibly by a faster algorithm.
+
+        Args:
+            values: (p,) parameter values.
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+            carried: labels of the attached payloads; None: all.
+            states: states of friction with hysteresis, as in `regressor`.
+        """
         ...
 
     def acting(self) -> np.ndarray:

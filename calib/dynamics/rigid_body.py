@@ -54,10 +54,11 @@ def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
         ½ q̇ᵀ [Y(q, 0, q̇) - Y(q, 0, 0)] - [0, gᵀ R, gᵀ p],    R, p: pose of the body's frame in the base
 
-    (Gautier 1997, with the regressor Y of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi.)
+    Here g is the gravity vector and Y the regressor of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi
+    for the inertia matrix M and standard parameters chi (Gautier 1997).
 
     Args:
-        bodies: the robot's bodies.
+        bodies: the B bodies of the robot.
         q, v: (N, n) joint positions and velocities [rad or m, and per s].
     """
     zero = np.zeros_like(np.asarray(v, dtype=float))
@@ -74,7 +75,7 @@ def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _frames(bodies: Bodies, q: np.ndarray) -> np.ndarray:
-    """Return the poses of the bodies' frames in the base frame, (B, N, 4, 4)."""
+    """Return the poses (B, N, 4, 4) of the bodies' frames in the base frame, at joint positions q (N, n) [rad or m]."""
     frames = np.empty((bodies.count, len(q), 4, 4))
     for body, parent in enumerate(bodies.parents):
         placement = bodies.placements[body]
@@ -196,7 +197,12 @@ def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.nda
 
 
 def kernel_parameters(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
-    """Return standard parameters (10 B,) in the order of the kernels' frames, whose z axis is the joint axis."""
+    """Return standard parameters (10 B,) in the order of the kernels' frames, whose z axis is the joint axis.
+
+    Args:
+        bodies: the robot's bodies.
+        parameters: (10 B,) in the order of the bodies' own frames.
+    """
     parameters = shaped(parameters, (10 * bodies.count,), "standard parameters")
     rows = parameters.reshape(bodies.count, 10)
     return np.take_along_axis(rows, bodies.order, axis=1).ravel()
@@ -206,7 +212,12 @@ _NAMES = {"q": "joint positions q", "v": "joint velocities v", "a": "joint accel
 
 
 def _states(bodies: Bodies, **arrays: np.ndarray) -> list[np.ndarray]:
-    """Return q, v, a as checked, finite arrays (N, n) of one memory layout (numba compiles a kernel per layout)."""
+    """Return q, v, a as checked, finite arrays (N, n) of one memory layout (numba compiles a kernel per layout).
+
+    Args:
+        bodies: the robot's bodies, which give n.
+        arrays: the arrays by the names used in messages.
+    """
     rows: int | None = None
     checked = []
     for key, array in arrays.items():
@@ -222,7 +233,12 @@ def _plain(array: np.ndarray) -> np.ndarray:
 
 
 def _placed(bodies: Bodies, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the joint position that moves each body, its cosine and its sine, (N, B) each."""
+    """Return the joint position that moves each body, its cosine and its sine, (N, B) each.
+
+    Args:
+        bodies: the robot's bodies.
+        q: (N, n) joint positions [rad or m].
+    """
     # Not q[:, …], which is laid out by columns.
     amount = q.take(bodies.coordinates, axis=1) * bodies.scales
     return amount, np.cos(amount), np.sin(amount)

@@ -36,7 +36,7 @@ def smooth_sign(v, v0):
 
 @njit(**JOINED)
 def _sign_slope(sign, v0):
-    """Return the derivative of `smooth_sign` with respect to v, given its value `sign`."""
+    """Return the derivative of `smooth_sign` with respect to v, given its value `sign` and its width `v0`."""
     return (1.0 - sign * sign) / v0 if v0 > 0.0 else 0.0
 
 
@@ -46,6 +46,11 @@ def _band(acts, t, x, v):
 
     The gain is a triangular function of the frequency order · |v| / 2π [Hz]. Beyond the positions of the identification
     (lower … upper) it decreases to zero within `FADE`.
+
+    Args:
+        acts: array of settings, one row per shape.
+        t: row of this shape.
+        x, v: position and velocity [rad or m, per s].
     """
     left = acts[t, 2]
     middle = acts[t, 3]
@@ -130,6 +135,10 @@ def steepest(code, acts, t):
 
     They are the largest slope of a smoothed sign, the |v| of that slope, its width in v, and the stiffness of a stop
     operator; 0, 0, 1, 0 for other shapes.
+
+    Args:
+        code: code of the shape.
+        acts, t: array of settings, and the row of this shape in the array.
     """
     first = acts[t, 1]
     second = acts[t, 2]

@@ -139,25 +139,38 @@ class Offer(NamedTuple):
 
 
 def _presliding(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return settings of candidate stop operators of several widths.
+    """Return settings of candidate stop operators of several widths, by the ending of their names.
 
     Each shape is the stop operator's state minus sign(v), so that Fc remains the friction of sliding.
+
+    Args:
+        joint: recorded range of the joint's motion; the widths are shares of its travel.
     """
     return {f".{k}": (share * joint.travel, joint.v0) for k, share in enumerate(PRESLIDING_SHARES, 1)}
 
 
 def _cable(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return settings of candidate harmonics with period 2 · travel, for any smooth torque of cables and hoses."""
+    """Return settings of candidate harmonics of the joint position, by the ending of their names.
+
+    With the period 2 · travel they represent any smooth torque of cables and hoses.
+
+    Args:
+        joint: recorded range of the joint's motion.
+    """
     return {f".{k}": (k * math.pi / joint.travel, math.inf) for k in CABLE_HARMONICS}
 
 
 def _stribeck(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return settings of candidate Stribeck terms with two Stribeck speeds."""
+    """Return settings of candidate Stribeck terms with two Stribeck speeds, by the ending of their names.
+
+    Args:
+        joint: recorded range of the joint's motion; the Stribeck speeds are shares of its peak speed.
+    """
     return {end: (share * joint.peak, 1.0, joint.v0) for end, share in STRIBECK_SHARES.items()}
 
 
 def _smoothed(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return settings of one candidate: the smoothing of its Coulomb sign."""
+    """Return settings of one candidate: the smoothing v0 of the Coulomb sign of `joint`."""
     return {"": (joint.v0,)}
 
 

@@ -154,7 +154,7 @@ class TorqueRows:
         return tuple(joint_units * len(self.blocks))
 
     def of_joints(self, mask: np.ndarray) -> np.ndarray:
-        """Return flags of rows (N, rows) from flags of joints (N, n).
+        """Return flags of rows (N, rows) from `mask`, flags of joints (N, n).
 
         A projected row is flagged if all joints are.
         """
@@ -201,13 +201,17 @@ class TorqueRows:
         return self._projected(columns.transpose(2, 1, 0), q, v)
 
     def _projected(self, torques: np.ndarray, q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the rows of the blocks (N, rows, p), multiplied by the projection if there is one."""
+        """Return the rows of the blocks `torques` (N, k, p), multiplied by the projection at q, v (N, n), if any."""
         if self.projection is None:
             return torques
         return self.projection.torques(q, v) @ torques
 
     def fold(self, weights: np.ndarray, sides: Sequence[str]) -> np.ndarray:
         """Return weights of joint torques (N, n, p) from weights of rows (N, rows, p): the adjoint map of `observe`.
+
+        Args:
+            weights: (N, rows, p) weight of each entry of the rows.
+            sides: (p,) side of each column: ``bodies``, ``link`` or ``motor``.
 
         Raises:
             CalibError: for rows with a projection, whose derivative with respect to the state is not implemented.

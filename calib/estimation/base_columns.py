@@ -16,7 +16,7 @@ TIE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ColumnSplit:
-    """Columns of W split into independent columns and columns that are linear combinations of them.
+    """Columns of an observation matrix W (rows, p), split into independent columns and linear combinations of them.
 
     Attributes:
         kept: (b,) indices of the independent (base) columns, ascending.
@@ -58,8 +58,9 @@ def split_columns(
     which count as zero (scaling a column of norm 1e-17 would turn rounding into information).
 
     Args:
-        matrix: (rows, p) W, whitened or in one unit.
-        groups: arrays of column indices, most preferred first; columns in no group form a last group. None: one group.
+        matrix: observation matrix W (rows, p), its rows divided by their standard deviations or all in one unit.
+        groups: arrays of column indices, one per group, most preferred group first; columns in no group form a last
+            group. None: one group of all columns.
         tolerance: norm below which the independent part of a unit-norm column counts as zero.
     """
     p = matrix.shape[1]
@@ -89,7 +90,12 @@ def split_columns(
 
 
 def _with_all_columns(groups: Sequence[np.ndarray] | None, p: int) -> list[np.ndarray]:
-    """Return the groups of column indices, with a last group of all columns 0 … p - 1 that are in no group."""
+    """Return the groups of column indices, with a last group of all columns 0 … p - 1 that are in no group.
+
+    Args:
+        groups: arrays of column indices, most preferred first; None: no groups.
+        p: number of columns.
+    """
     result: list[np.ndarray] = []
     remaining = np.arange(p)
     if groups is None:
@@ -106,7 +112,7 @@ def _independent(scaled: np.ndarray, groups: list[np.ndarray], silent: np.ndarra
     """Return the sorted indices of independent columns, chosen group by group.
 
     Args:
-        scaled: (rows, p) W with columns of unit norm or zero.
+        scaled: (rows, p) the matrix to split, with columns of unit norm or zero.
         groups: arrays of column indices, most preferred first.
         silent: indices of the zero columns, which are never chosen.
         tolerance: norm below which the independent part of a column counts as zero.

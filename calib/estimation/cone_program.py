@@ -3,13 +3,16 @@
 # pyright: reportAttributeAccessIssue=false
 # clarabel is a compiled extension without stubs
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 
 from calib.errors import NotConverged
+from calib.estimation.convex_sets import ConvexSet
 from calib.estimation.triangles import require_rank
 
 if TYPE_CHECKING:
@@ -33,12 +36,14 @@ class ConeOptimum:
         rows: (c,) multipliers of the linear inequalities, >= 0.
         matrices: (k, n, n) multipliers of the semidefinite constraints, symmetric.
         equalities: (e,) multipliers of the linear equalities.
+        sets: multipliers (k,) of each convex set's rows.
     """
 
     values: np.ndarray
     rows: np.ndarray
     matrices: np.ndarray
     equalities: np.ndarray
+    sets: tuple[np.ndarray, ...] = ()
 
 
 def minimise(
@@ -50,8 +55,9 @@ def minimise(
     least: np.ndarray | float = 0.0,
     equality_rows: np.ndarray | None = None,
     equality_values: np.ndarray | None = None,
+    sets: Sequence[ConvexSet] = (),
 ) -> ConeOptimum:
-    """Minimise ½ ‖R b - z‖² over b (p,) subject to A b + c >= 0, E b = d and M_k(b) ⪰ λ_k 1.
+    """Minimise ½ ‖R b - z‖² over b (p,) subject to A b + c >= 0, E b = d, M_k(b) ⪰ λ_k 1 and b in convex sets.
 
     RᵀR is never formed: t = R b - z is added to the unknowns of the program.
 
@@ -61,6 +67,7 @@ def minimise(
         matrices: (k, n, n, p) coefficients A_kj of M_k(b) = Σ_j A_kj b_j.
         least: lower bound λ of the eigenvalues of the M_k, one number or (k,).
         equality_rows, equality_values: E (e, p) and d (e,); None without equalities.
+        sets: convex sets of b.
 
     Raises:
         NotConverged: if no b satisfies all constraints, or Clarabel finds no optimum.
@@ -78,22 +85,36 @@ def minimise(
     weight = np.where(i == j, 1.0, np.sqrt(2.0))
     flat = (matrices[:, i, j] * weight[:, None]).reshape(-1, p)
     bounds = -np.outer(np.broadcast_to(least, size), i == j).ravel()
-    system = np.vstack([upper, equality_rows, -rows, -flat])
-    right = np.concatenate([target, equality_values, offset, bounds])
-    end_of_target, end_of_equalities, end_of_rows = np.cumsum([m, len(equality_rows), len(rows)]).tolist()
+    set_rows: list[np.ndarray] = []
+    set_sides: list[np.ndarray] = []
+    set_unknowns: list[np.ndarray] = []
+    for convex in sets:
+        set_rows.append(convex.matrix)
+        set_sides.append(convex.sides)
+        set_unknowns.append(convex.further)
+    system = np.vstack([upper, equality_rows, -rows, -flat, *set_rows])
+    right = np.concatenate([target, equality_values, offset, bounds, *set_sides])
+    ends = np.cumsum([m, len(equality_rows), len(rows), len(flat), *map(len, set_sides)]).tolist()
+    end_of_target, end_of_equalities, end_of_rows, end_of_matrices = ends[:4]
     cones = [clarabel.ZeroConeT(end_of_equalities)]
     if len(rows):
         cones.append(clarabel.NonnegativeConeT(len(rows)))
     cones += [clarabel.PSDTriangleConeT(n)] * size
+    for convex in sets:
+        cones += convex.cones
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
-    cost = sparse.diags(np.repeat([0.0, 1.0], [p, m])).tocsc()
-    system = sparse.csc_matrix(np.hstack([system, -np.eye(len(system), m)]))
+    further = np.asarray(scipy.linalg.block_diag(np.zeros((end_of_matrices, 0)), *set_unknowns))
+    further_count = further.shape[1]
+    cost = sparse.diags(np.repeat([0.0, 1.0, 0.0], [p, m, further_count])).tocsc()
+    system = sparse.csc_matrix(np.hstack([system, -np.eye(len(system), m), further]))
     solution = None
     for accuracy in ACCURACIES:
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = accuracy
-        solution = _solved(clarabel.DefaultSolver(cost, np.zeros(p + m), system, right, cones, settings))
+        solution = _solved(
+            clarabel.DefaultSolver(cost, np.zeros(p + m + further_count), system, right, cones, settings)
+        )
         if solution is not None and str(solution.status) in FINAL:
             break
     if solution is None:
@@ -109,20 +130,24 @@ def minimise(
         )
     dual = np.array(solution.z)
     matrix_multipliers = np.zeros((size, n, n))
-    matrix_multipliers[:, i, j] = dual[end_of_rows:].reshape(size, len(i)) / weight
+    matrix_multipliers[:, i, j] = dual[end_of_rows:end_of_matrices].reshape(size, len(i)) / weight
     matrix_multipliers[:, j, i] = matrix_multipliers[:, i, j]
+    set_multipliers: list[np.ndarray] = []
+    for start, end in pairwise(ends[3:]):
+        set_multipliers.append(dual[start:end])
     return ConeOptimum(
         values=values,
         rows=dual[end_of_equalities:end_of_rows],
         matrices=matrix_multipliers,
         equalities=-dual[end_of_target:end_of_equalities],
+        sets=tuple(set_multipliers),
     )
 
 
 def _solved(solver: "clarabel.DefaultSolver") -> "clarabel.DefaultSolution | None":
-    """Return Clarabel's solution; None if Clarabel panics because an eigenvalue computation of LAPACK fails.
+    """Return the solution found by Clarabel's `solver`; None if Clarabel panics as an eigenvalue computation fails.
 
-    Whether such a failure happens depends on the processor, since LAPACK's kernels differ.
+    Whether LAPACK's eigenvalue computation fails depends on the processor, since LAPACK's kernels differ.
     """
     try:
         return solver.solve()
@@ -141,7 +166,7 @@ def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, sides: 
     (Gouriéroux & Monfort 1995, section 10.3). For inequalities, A and d are the rows of the binding ones.
 
     Args:
-        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem min ‖R b - z‖².
         free: (p,) unconstrained estimate b_f.
         normals: A (k, p), of full rank.
         sides: d (k,).
@@ -163,7 +188,7 @@ def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
     is far from Clarabel's), Clarabel's solution is returned.
 
     Args:
-        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] with R of full rank.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of a least-squares problem, with R of full rank; ρ is not used.
         rows: A (c, p); a row with a single non-zero entry is satisfied exactly.
 
     Raises:

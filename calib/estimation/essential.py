@@ -90,14 +90,14 @@ def eliminate(
     by many that are zero.
 
     Args:
-        data: triangles of the base columns.
+        data: R factors of the columns of the b base parameters, in g groups of rows.
         rule: criterion that ends the elimination.
-        ratio: r_σ.
+        ratio: r_σ, the largest over the smallest RSD (relative standard deviation) at which the RSD rule stops.
         level: significance level of each test, i.e. the probability of keeping a parameter that is zero.
         keep: names of parameters that are never dropped.
         drop: names of parameters that are dropped first, whatever the rule.
-        std: (g,) noise standard deviations of the groups of rows; None: `settled_std` of the base model. They remain
-            constant during the elimination.
+        std: (g,) noise standard deviations of the groups of rows, in units of y; None: `settled_std` of the base model.
+            They remain constant during the elimination.
         inflation: (g,) variance inflation of autocorrelated residuals (module `linear`); without it too many parameters
             are kept.
 
@@ -136,6 +136,10 @@ def nested_test(base: LinearFit, dropped: Sequence[int]) -> tuple[float, float]:
 
     F is the Wald statistic with the residual variance of the base fit. It equals the F statistic of the two residual
     sums of squares (with and without these parameters).
+
+    Args:
+        base: fit of all base parameters.
+        dropped: indices of the parameters that are tested jointly.
     """
     values = base.estimate.values[list(dropped)]
     covariance = base.estimate.covariance[np.ix_(dropped, dropped)] * base.estimate.residual_std**2
@@ -180,7 +184,11 @@ def _step(
 def _next(current: LinearFit, keep: Sequence[str], drop: Sequence[str]) -> int | None:
     """Return the index of the next parameter to drop, None if no candidate remains.
 
-    Parameters named in `drop` are first, then those not named in `keep`; of several, the largest RSD decides.
+    Args:
+        current: fit of the parameters that remain.
+        keep: names of parameters that are never dropped.
+        drop: names of parameters that are dropped first; of those not in `keep`, and of several in `drop`, the one with
+            the largest RSD (relative standard deviation) is next.
     """
     names = current.estimate.names
     rsd = current.estimate.rsd
@@ -193,7 +201,14 @@ def _next(current: LinearFit, keep: Sequence[str], drop: Sequence[str]) -> int |
 
 
 def _refused(step: EliminationStep, rule: Rule, ratio: float, level: float) -> bool:
-    """Return whether the rule rejects this step and so ends the elimination."""
+    """Return whether the rule rejects this step and so ends the elimination.
+
+    Args:
+        step: the step to judge.
+        rule: criterion that ends the elimination.
+        ratio: largest over smallest RSD (relative standard deviation) below which the RSD rule rejects the step.
+        level: significance level of both F tests; a smaller p-value rejects the step.
+    """
     even = step.ratio < ratio
     significant = step.p < level or step.p_total < level
     if rule is Rule.RSD:

@@ -45,10 +45,11 @@ class LinearFit(Frozen):
 def ols(data: Triangles, inflation: np.ndarray | None = None) -> LinearFit:
     """Estimate x = argmin ‖y - W x‖² with covariance σ² (WᵀW)⁻¹, σ² = ‖ρ‖² / (r - p), by ordinary least squares.
 
-    This covariance is correct if all groups of rows have the same noise; otherwise use `wls`.
+    This covariance is correct if the noise of y has the same standard deviation in all groups of rows; otherwise use
+    `wls`.
 
     Args:
-        data: R factors of [W y].
+        data: R factors of [W y], W (r, p) the observation matrix and y (r,) the measured values; ρ are the residuals.
         inflation: (g,) variance inflation >= 1 of each group, explained in the module's docstring; None: every row is
             independent.
 
@@ -64,7 +65,8 @@ def wls(data: Triangles, std: np.ndarray | None = None, inflation: np.ndarray | 
     Kolyubin et al. (2019), eq. 22 and 25; the RSD of eq. 26 is ``fit.estimate.rsd``.
 
     Args:
-        data: R factors of [W y], one group of rows per standard deviation.
+        data: R factors of [W y], W (r, p) the observation matrix and y (r,) the measured values, with one group of rows
+            per standard deviation.
         std: (g,) noise standard deviation σ_g of each group in units of y; None: `settled_std`. Kolyubin et al. use
             `subsystem_std`.
         inflation: (g,) variance inflation >= 1 of each group, explained in the module's docstring; None: every row is
@@ -84,7 +86,7 @@ def ridge(data: Triangles, mean: np.ndarray, covariance: np.ndarray, std: np.nda
     The covariance of the result is that of the posterior; its condition numbers are those of data and prior together.
 
     Args:
-        data: R factors of [W y].
+        data: R factors of [W y], W (r, p) the observation matrix and y (r,) the measured values.
         mean: (p,) prior mean.
         covariance: (p, p) prior covariance; an infinite diagonal entry means no prior knowledge of that parameter.
         std: (g,) noise standard deviation of each group in units of y; None: `settled_std`, for which the data alone
@@ -115,6 +117,10 @@ def subsystem_std(data: Triangles) -> np.ndarray:
 
     Kolyubin et al. (2019), after eq. 22.
 
+    Args:
+        data: R factors of [W y] (observation matrix and measured values), one group g with r_g rows per standard
+            deviation; ρ_g are the group's residuals in units of y.
+
     Raises:
         CalibError: for a group with no more rows than independent columns.
     """
@@ -140,7 +146,8 @@ def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> n
     estimate (Patterson & Thompson 1971). The iteration starts from `subsystem_std`.
 
     Args:
-        data: R factors of [W y].
+        data: R factors of [W y], W (r, p) the observation matrix and y (r,) the measured values; a group g has r_g
+            rows.
         tolerance: largest relative change of any σ_g at which the iteration ends.
         limit: largest number of iterations.
 
@@ -169,7 +176,7 @@ def _fit(data: Triangles, std: np.ndarray, inflation: np.ndarray | None, stated:
 
     Args:
         data: R factors of [W y].
-        std: (g,) standard deviations of the groups.
+        std: (g,) noise standard deviations of the groups of rows, in units of y.
         inflation: (g,) variance inflation of each group; None: 1.
         stated: whether `std` is the noise itself; if not, only its proportions are used and the residuals give the
             scale of the covariance.
@@ -204,7 +211,7 @@ def _pack(
     Args:
         data: R factors of [W y].
         values, covariance: (p,) estimate and its (p, p) covariance.
-        std, tau: (g,) standard deviations and variance inflation of the groups.
+        std, tau: (g,) noise standard deviation (in units of y) and variance inflation of each group of rows.
         inverse: (p, p) R⁻¹ of the weighted W.
         conditions: condition numbers of the weighted W, as it is and with unit-norm columns.
 
@@ -238,8 +245,8 @@ def leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarra
     """Return the leverage h_g = ‖W_g R⁻¹‖² / σ_g² (g,) of each group; the leverages of all groups sum to p.
 
     Args:
-        data: R factors of [W y].
-        std: (g,) standard deviations σ_g.
+        data: R factors of [W y], W_g being the rows of group g of the observation matrix W.
+        std: (g,) standard deviations σ_g of the groups, in units of y.
         inverse: (p, p) R⁻¹ of the weighted W.
     """
     whitened = data.factors[:, :, :-1] @ inverse

@@ -84,13 +84,21 @@ class Reduced:
     rows: int
 
     def extended(self, residual: np.ndarray, matrix: np.ndarray) -> Reduced:
-        """Return the problem extended by further residuals r (m,) and rows W (m, p)."""
+        """Return the problem extended by further residuals r (m,) and rows W (m, p).
+
+        Args:
+            residual: r (m,).
+            matrix: W (m, p), derivatives of the model by the parameters.
+        """
         stacked = triangle(np.concatenate([self.target, residual]), np.vstack([self.factor, matrix]))
         cost = self.cost + float(residual @ residual)
         return replace(stacked, cost=cost, rows=self.rows + len(residual))
 
     def moved(self, change: np.ndarray) -> Reduced:
-        """Return the problem with r + W dx as its residual instead of r, for `change` dx (p,)."""
+        """Return the problem with the residual r + W dx instead of r, for `change` dx (p,) of the parameters.
+
+        W are the rows of the problem, the derivatives of the model by the parameters.
+        """
         target = self.target + self.factor @ change
         cost = self.cost + float(target @ target - self.target @ self.target)
         return replace(self, target=target, cost=cost)
@@ -103,7 +111,9 @@ class Reduced:
 def triangle(residual: np.ndarray, matrix: np.ndarray) -> Reduced:
     """Return the problem min ‖r - W x‖² of r (rows,) and W (rows, p), reduced by one QR of [W r].
 
-    A column-major `matrix` is copied once only.
+    Args:
+        residual: r (rows,), whitened.
+        matrix: W (rows, p); column-major order saves a copy.
     """
     p = matrix.shape[1]
     stacked = np.empty((len(residual), p + 1), order="F")
@@ -121,8 +131,9 @@ def reduced(pieces: Callable[[], Iterable[Rows]], total: Gram | None = None) -> 
     exceeds `MAX_CONDITION`, QR is used piece by piece.
 
     Args:
-        pieces: function that yields residuals and rows (r, W) piece by piece; each call yields the same rows.
-        total: sufficient statistics of all rows, if they are already known; None: computed if needed.
+        pieces: function that yields the problem in pieces (r, W), residuals (rows,) with their rows of W (rows, p);
+            each call yields the same pieces.
+        total: sufficient statistics WᵀW, Wᵀr, rᵀr of all rows, if they are already known; None: computed if needed.
     """
     if total is None:
         rows, total = _gathered(pieces())
@@ -142,6 +153,9 @@ def _gathered(pieces: Iterable[Rows]) -> tuple[list[Rows], Gram | None]:
     """Return the list of all pieces and None, or an empty list and the sufficient statistics for a large W.
 
     W is large if it has more than `MOST_NUMBERS` entries.
+
+    Args:
+        pieces: the problem in pieces (r, W), residuals (rows,) with their rows of W (rows, p).
     """
     rows = list[Rows]()
     total = None
@@ -181,8 +195,8 @@ def damped_step(factor: np.ndarray, target: np.ndarray, damping: float) -> np.nd
     Kolyubin et al. (2019), eq. 12; λ = 0 is eq. 11.
 
     Args:
-        factor: R (p, p), upper triangular.
-        target: z (p,).
+        factor: R (p, p), upper triangular factor of the rows W = ∂f/∂x.
+        target: z (p,) = Qᵀr, the reduced residuals (`Reduced`).
         damping: λ >= 0.
     """
     p = len(target)
@@ -257,6 +271,10 @@ def solve(
 
 def covariance(factor: np.ndarray, variance: float = 1.0) -> np.ndarray:
     """Return the covariance variance · (RᵀR)⁻¹ (p, p) from an upper triangular R (p, p).
+
+    Args:
+        factor: R (p, p), the triangular factor of the whitened W.
+        variance: variance of the whitened residuals.
 
     Raises:
         LinAlgError: if R has a zero on its diagonal.

@@ -47,12 +47,12 @@ class Gram:
         return Gram(self.square - term.square, self.cross - term.cross, self.total - term.total, self.rows - term.rows)
 
     def scaled(self, factor: float) -> Gram:
-        """Return the statistics after multiplication of W and y by √factor; the number of rows does not change."""
+        """Return the statistics after multiplication of W and y by √`factor`; the number of rows does not change."""
         return Gram(factor * self.square, factor * self.cross, factor * self.total, self.rows)
 
 
 def gram(residual: np.ndarray, matrix: np.ndarray) -> Gram:
-    """Return the sufficient statistics of y = `residual` (rows,) and W = `matrix` (rows, p)."""
+    """Return the sufficient statistics of y ≈ W x, with y = `residual` (rows,) and W = `matrix` (rows, p)."""
     return Gram(matrix.T @ matrix, matrix.T @ residual, float(residual @ residual), len(residual))
 
 
@@ -95,7 +95,11 @@ class Condensed:
     blocks: tuple[tuple[np.ndarray, np.ndarray | None], ...]
 
     def columns(self, matrix: np.ndarray) -> np.ndarray:
-        """Return Wᵀ (r, ...) in the coordinates z, from Wᵀ (p, ...) in the original parameters x."""
+        """Return Wᵀ (r, ...) in the coordinates z, from Wᵀ (p, ...) in the original parameters x.
+
+        Args:
+            matrix: (p, ...) Wᵀ, or any stack of columns with one entry per original parameter.
+        """
         flat = matrix.reshape(len(matrix), -1)
         parts = []
         for columns, basis in self.blocks:
@@ -106,7 +110,11 @@ class Condensed:
         return np.concatenate(parts).reshape(-1, *matrix.shape[1:])
 
     def gram(self, data: Gram) -> Gram:
-        """Return the sufficient statistics in the coordinates z, from those in the original parameters x."""
+        """Return the sufficient statistics in the coordinates z, from those in the original parameters x.
+
+        Args:
+            data: statistics of the p original parameters.
+        """
         half = self.columns(data.square)
         parts = []
         for columns, basis in self.blocks:
@@ -123,7 +131,8 @@ def condensed(square: Callable[[np.ndarray], np.ndarray], groups: np.ndarray, st
     Args:
         square: function of column indices (k,) that returns WᵀW (k, k) of these columns, over all rows of the problem.
         groups: (p,) group of each column; -1 for no ridge.
-        start: (p,) first guess of each parameter's prior standard deviation; the ratios within a group are kept.
+        start: (p,) first guess of each parameter's prior standard deviation, in the parameter's unit; the ratios within
+            a group are kept.
     """
     numbers, number_of_column, members = np.unique(groups, return_inverse=True, return_counts=True)
     single = np.flatnonzero((groups < 0) | (members[number_of_column] == 1))
@@ -189,13 +198,14 @@ def relevance(
 ) -> Relevance:
     """Return the estimate of x with a prior x_g ~ N(0, 1/λ_g) per group, with the most probable λ_g and noise.
 
-    MacKay's fixed point (1992; Tipping 2001, eq. 16–18) is λ_g = γ_g / ‖x_g‖² with γ_g = Σ_{i in g} (1 - λ_g Σ_ii), and
-    the noise precision is β = (N - Σ γ - p_free) / ‖y - W x‖², where p_free is the number of columns without a ridge. A
-    group is switched off (its parameters become zero) once its prior is `MAX_PRIOR_WEIGHT` times as precise as the
-    data. The ridges keep WᵀW well conditioned; columns without a ridge must be independent.
+    x_g are the parameters of group g, Σ is the posterior covariance. MacKay's fixed point (1992; Tipping 2001, eq.
+    16–18) is λ_g = γ_g / ‖x_g‖² with γ_g = Σ_{i in g} (1 - λ_g Σ_ii), and the noise precision is β = (N - Σ γ - p_free)
+    / ‖y - W x‖², where p_free is the number of columns without a ridge. A group is switched off (its parameters become
+    zero) once its prior is `MAX_PRIOR_WEIGHT` times as precise as the data. The ridges keep WᵀW well conditioned;
+    columns without a ridge must be independent.
 
     Args:
-        data: statistics of all rows.
+        data: sufficient statistics WᵀW, Wᵀy, yᵀy of all N rows.
         groups: (p,) group of each column; -1 for no ridge.
         start: (p,) first guess of each parameter's prior standard deviation, equal within a group (otherwise use
             `condensed`); ignored for columns without a ridge.
@@ -276,7 +286,7 @@ def _posterior(
     Args:
         square, cross: WᵀW (p, p) and Wᵀy (p,).
         penalty: (p,) prior precision of each parameter.
-        beta: noise precision β.
+        beta: β, the inverse variance of y's noise.
     """
     if not len(cross):
         return cross, cross
@@ -291,6 +301,10 @@ def _root(square: np.ndarray, penalty: np.ndarray | float = 0.0) -> np.ndarray:
 
     The diagonal is raised by a relative 1e-12, or by the smallest larger power of ten with which the factorisation
     succeeds: repeated rows may leave columns that no two poses distinguish.
+
+    Args:
+        square: WᵀW (p, p).
+        penalty: (p,) or one number, added to the diagonal.
 
     Raises:
         Unidentifiable: if the factorisation fails even with a doubled diagonal.

@@ -27,7 +27,7 @@ def variance_weights(
     Args:
         squares: (m,) squared errors.
         shapes: (m, k) non-negative columns whose weighted sum is the variance.
-        start: (k,) non-negative first weights; zeros remain zero.
+        start: (k,) non-negative first values of the weights θ; zeros remain zero.
         counts: (m,) number of errors that each squared error represents.
         rounds: number of updates; few suffice if `start` is the result for nearly equal errors.
     """
@@ -48,7 +48,7 @@ def weights(size: np.ndarray, loss: str, scale: float | None = None) -> np.ndarr
     95 % efficient on normal residuals (Holland & Welsch 1977).
 
     Args:
-        size: residuals' absolute values over sigma, of any shape.
+        size: s, absolute values of the residuals over their standard deviations, of any shape.
         loss: one of `LOSSES`; "none" gives weights of 1.
         scale: k or c; None: the default values 1.345 or 2.385.
 

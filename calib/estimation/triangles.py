@@ -137,8 +137,8 @@ def collect(
     """Return the R factors of a whole problem.
 
     Args:
-        matrix: (r, p) W.
-        target: (r,) y.
+        matrix: (r, p) W, the observation matrix.
+        target: (r,) y, the measured values.
         group: (r,) group index of each row; None: all rows form one group.
         names: names of the p columns; None: x1, x2, …
         units: units of the parameters; None: unknown.
@@ -157,7 +157,7 @@ def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
 
     Args:
         data: R factors of the groups.
-        std: (g,) standard deviations; None: rows are not divided.
+        std: (g,) noise standard deviation of each group of rows, in units of y; None: rows are not divided.
 
     Raises:
         CalibError: for a standard deviation that is not positive.
@@ -173,9 +173,11 @@ def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
 
 
 def retriangulate(stacked: np.ndarray, overwrite: bool = False) -> np.ndarray:
-    """Return the R factor of any matrix (N, k) as an upper triangular matrix (k, k), with zero rows if N < k.
+    """Return the R factor of a matrix (N, k) as an upper triangular matrix (k, k), with zero rows if N < k.
 
-    If `overwrite` is true, the matrix may be overwritten.
+    Args:
+        stacked: the matrix (N, k).
+        overwrite: whether the matrix may be overwritten, which saves a copy.
     """
     size = stacked.shape[1]
     result = np.zeros((size, size))
@@ -209,7 +211,7 @@ def condition_numbers(factor: np.ndarray) -> tuple[float, float]:
     columns are zero.
 
     Args:
-        factor: W, or any R factor of W.
+        factor: W (rows, p), or any triangular factor of it.
     """
     norms = np.linalg.norm(factor, axis=0)
     excited = norms > 0.0
@@ -227,7 +229,7 @@ def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray
     The two condition numbers are those of W as it is and of W with unit-norm columns.
 
     Args:
-        factor: (p + 1, p + 1) R factor.
+        factor: (p + 1, p + 1) R factor of [W y], observation matrix and measured values.
         names: names of the p columns, for the error message.
 
     Raises:
@@ -247,6 +249,11 @@ def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray
 def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE) -> np.ndarray:
     """Return the singular values of a matrix with columns of comparable norms, if its columns are independent.
 
+    Args:
+        scaled: (rows, p) matrix, or its R factor.
+        names: names of the p columns.
+        advice: end of the error message: what the user can do.
+
     Raises:
         Unidentifiable: if columns are linearly dependent; the message names the columns with a part in a null
             direction.
@@ -265,7 +272,12 @@ def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE)
 
 
 def _update(factor: np.ndarray, matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the R factor of [factor; matrix target]; columns that are zero in both are skipped."""
+    """Return the R factor of [factor; matrix target]; columns that are zero in both are skipped.
+
+    Args:
+        factor: (p + 1, p + 1) R factor of the rows absorbed so far.
+        matrix, target: (r, p) and (r,), further rows of W and y.
+    """
     top = factor[factor.any(axis=1)]
     in_matrix = np.append(matrix.any(axis=0), True)
     live = np.flatnonzero(in_matrix | top.any(axis=0))

@@ -32,10 +32,10 @@ class Whiteness:
 
 
 def examine(residual: np.ndarray, lags: int = 30) -> Whiteness:
-    """Return the whiteness tests of evenly sampled residuals (N,) of one joint in one recording.
+    """Return the whiteness tests of the residuals (N,) of one joint in one recording, sampled at a constant rate.
 
     Args:
-        residual: (N,) with N > lags and N >= 20.
+        residual: (N,) in order of time, of any unit, with N > lags and N >= 20.
         lags: number of autocorrelations.
 
     Raises:
@@ -74,7 +74,7 @@ def _shape(x: np.ndarray) -> tuple[float, float]:
 
 
 def _normality(skewness: float, kurtosis: float, n: int) -> float:
-    """Return the p-value of skewness and excess kurtosis of n >= 20 values under a normal distribution.
+    """Return the p-value of the hypothesis that n >= 20 values with this skewness and excess kurtosis are normal.
 
     Skewness and kurtosis are each transformed into a standard normal variable, and the sum of both squares is tested
     (D'Agostino & Pearson 1973; D'Agostino 1970; Anscombe & Glynn 1983). The result equals that of
@@ -102,6 +102,10 @@ def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
     """Return the autocorrelations ρ_k = Σ_t x_t x_{t+k} / Σ_t x_t² for k = 1 … lags (by FFT), with means removed.
 
     For residuals (N, columns) both sums also run over the columns. A constant series gives zeros.
+
+    Args:
+        residual: (N,) or (N, columns), in order of time.
+        lags: number of autocorrelations.
     """
     columns = np.asarray(residual, dtype=float).reshape(len(residual), -1).T
     size = 1 << (2 * len(residual) - 1).bit_length()
@@ -150,8 +154,8 @@ def inflation(residual: np.ndarray) -> float:
     Fewer than 8 residuals give τ = 1.
 
     Args:
-        residual: (N,) residuals, or (N, 1 + p) residuals with the columns W C^(1/2) appended (C the covariance of the
-            fit), which account for the part of the errors that the fit absorbed.
+        residual: (N,) residuals, or (N, 1 + p) residuals with the columns W C^(1/2) appended (W the fitted columns, C
+            the covariance of the fit), which account for the part of the errors that the fit absorbed.
     """
     x = np.asarray(residual, dtype=float)
     if len(x) < 8:
@@ -163,7 +167,12 @@ def inflation(residual: np.ndarray) -> float:
 
 
 def r_squared(target: np.ndarray, residual: np.ndarray) -> float:
-    """Return R² = 1 - Σ ρ² / Σ (y - mean y)²; negative if the mean predicts y better, NaN for a constant y."""
+    """Return R² = 1 - Σ ρ² / Σ (y - mean y)²; NaN for a constant y, negative if the mean of y predicts y better.
+
+    Args:
+        target: y (N,), the measured values.
+        residual: ρ (N,), measured minus predicted values.
+    """
     total = float(np.sum((target - np.mean(target)) ** 2))
     if not total > 0.0:
         return float("nan")

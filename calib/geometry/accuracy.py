@@ -124,13 +124,22 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements]) -> Errors:
 
 
 def _concatenated(sizes: list[np.ndarray]) -> np.ndarray | None:
-    """Return the error magnitudes of all blocks in one array; None for an empty list."""
+    """Return the error magnitudes of all blocks in one array; None for an empty list.
+
+    Args:
+        sizes: error magnitudes of each block.
+    """
     result = np.concatenate([np.zeros(0), *sizes])
     return result if len(result) else None
 
 
 def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> ErrorStatistics | None:
-    """Return mean, rms, 95 % quantile and maximum of `factor` times the error magnitudes; None for None."""
+    """Return mean, rms, 95 % quantile and maximum of `factor` times the error magnitudes.
+
+    Args:
+        sizes: (N,) error magnitudes [m or rad]; None where they were not measured.
+        factor: factor by which they are converted to mm or deg.
+    """
     if sizes is None:
         return None
     scaled = factor * sizes
@@ -203,7 +212,7 @@ def _socket_spread(point: np.ndarray, measured: Sockets) -> np.ndarray:
 
     Args:
         point: (3, m) predicted target positions [m].
-        measured: the block of m rows.
+        measured: the block of m rows, in which the target rested in sockets.
     """
     sockets: dict[str, dict[str, np.ndarray]] = {}
     for number in np.unique(measured.group):

@@ -59,7 +59,12 @@ FLIP = np.array([1.0, -1.0, 1.0])
 
 
 def diagnose(fit: GeometricFit, with_changes: bool = True) -> list[Finding]:
-    """Return findings on systematic residuals of each block and, if `with_changes`, on a set-up changed in between."""
+    """Return findings on systematic residuals of each block and, if `with_changes`, on a set-up changed in between.
+
+    Args:
+        fit: the fit to examine.
+        with_changes: whether a changed set-up is searched.
+    """
     findings: list[Finding] = []
     for block, part in _lengths(fit):
         # pairs of rows count once
@@ -72,13 +77,18 @@ def diagnose(fit: GeometricFit, with_changes: bool = True) -> list[Finding]:
 
 
 def _lengths(fit: GeometricFit) -> list[tuple[Block, ResidualPart]]:
-    """Return each block with its first residual part, which is in metres for every kind of measurement."""
+    """Return each block of `fit` with its first residual part, which is in metres for every kind of measurement."""
     first = {piece.block: piece.part.per_row() for piece in reversed(fit.pieces)}
     return [(block, first[number]) for number, block in enumerate(fit.blocks)]
 
 
 def _setup_change(block: Block, part: ResidualPart) -> list[Finding]:
-    """Return a finding if the residuals before and after some row differ significantly in size."""
+    """Return a finding if the residuals before and after some row differ significantly in size.
+
+    Args:
+        block: the prepared measurements of m rows.
+        part: their residuals [m].
+    """
     size = np.linalg.norm(part.value, axis=0)
     # a few gross rows are not a set-up
     size = np.minimum(size, 4.0 * np.median(size))
@@ -116,6 +126,10 @@ def _systematic(block: Block, part: ResidualPart) -> list[Finding]:
 
     Residuals are systematic where they are similar at neighbouring poses: noise would differ there, a missing effect
     would not.
+
+    Args:
+        block: the prepared measurements of m rows.
+        part: their residuals [m].
     """
     findings = []
     name = _name(block)
@@ -147,6 +161,10 @@ def neighbour_floor(q: np.ndarray, part: ResidualPart) -> float | None:
     This is von Neumann's mean square successive difference (1941), with neighbours in joint space in place of time.
     None where neighbours are further apart than a third of the joints' spread, since their systematic errors are then
     unrelated.
+
+    Args:
+        q: (m, n) joint values of the rows [rad or m].
+        part: residuals of the m rows.
     """
     spread = q.std(axis=0)
     moving = spread > 1e-9
@@ -229,6 +247,9 @@ def length_factor(fit: GeometricFit) -> Scale | None:
 
     The factor's sigma is computed from the fit's covariance. `explained` is the share of the changes of the lengths
     that one common factor explains.
+
+    Args:
+        fit: a fit of the arm's lengths.
     """
     chain = fit.start.chain
     if fit.split is None:
@@ -330,6 +351,10 @@ def _median_angle(nominal: Installation, blocks: Blocks) -> np.ndarray:
 
     The median is robust to angles beyond the range of the stated convention, whose orientations were lost when the file
     was read.
+
+    Args:
+        nominal: the nominal arm.
+        blocks: the measurements; only full poses are used.
     """
     try:
         placed = polish_frames(install(nominal.chain, blocks, nominal.known), blocks, ROBUST).cell
@@ -347,14 +372,14 @@ def _few(blocks: Blocks) -> Blocks:
 
 
 def _turned(joint: int, angle: float, blocks: Blocks) -> Blocks:
-    """Return the blocks with `angle` [rad] added to the values of one joint."""
+    """Return the blocks with `angle` [rad] added to the values of the joint with index `joint`."""
     turn = np.zeros(blocks[0].q.shape[1])
     turn[joint] = angle
     return [replace(block, q=block.q + turn) for block in blocks]
 
 
 def _end_without(chain: Chain, joint: int) -> str | None:
-    """Return the command option that excludes joint number `joint` from a URDF's chain.
+    """Return the command option that excludes the joint with index `joint` from a URDF's chain.
 
     The option begins the chain after its first joint or ends it before its last joint; None for other joints.
     """
@@ -397,6 +422,10 @@ def _mean_square(nominal: Installation, blocks: Blocks) -> np.ndarray:
     """Return the mean squared error of the nominal arm [m²] after fitting base and tool placement.
 
     The placements in `nominal` are used where they give a smaller error than the fitted ones.
+
+    Args:
+        nominal: the nominal arm, with stations and tools placed.
+        blocks: the measurements.
     """
     squares = [np.inf]
     # a second target has no placement yet

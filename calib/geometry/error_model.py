@@ -173,7 +173,11 @@ class ErrorModel:
         return sigma, np.interp(from_poses + from_ranges, model.reach, radii)
 
     def _widening(self, q: np.ndarray) -> np.ndarray:
-        """Return the factors (m,) by which the 95 % intervals widen outside the fitted joint ranges; 1 inside."""
+        """Return the factors (m,) by which the 95 % intervals widen outside the fitted joint ranges; 1 inside.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+        """
         result = np.ones(len(q))
         for joint, (below, above) in enumerate(self.discrepancy.wider):
             levels = [0.0, END_SHARE, 1.0 - END_SHARE, 1.0]
@@ -195,6 +199,11 @@ def _widened(distance: np.ndarray, width: float, factor: float) -> np.ndarray:
     """Return the widening (m,) at a distance (m,) beyond the end of a range.
 
     It rises linearly from 1 at the end to `factor` at half of `width` beyond, and then stays constant.
+
+    Args:
+        distance: (m,) distance beyond the end [rad or m].
+        width: the range's width [rad or m].
+        factor: widening at half of `width` beyond.
     """
     share = np.clip(2.0 * distance / max(width, 1e-9), 0.0, 1.0)
     return 1.0 + (factor - 1.0) * share
@@ -223,6 +232,11 @@ def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[n
 
     For each joint, the second distance is the smallest one within which a share `NEAR_SHARE` of the fitted poses lie. A
     few poses far from the others therefore do not extend the fitted range.
+
+    Args:
+        q: (m, n) joint values [rad or m].
+        learnt: (k, n) joint values of the fitted poses.
+        levers: (n,) motion of the tool per unit of each joint [m/rad or 1], by which joint differences are multiplied.
     """
     nearest = KDTree(learnt * levers).query(q * levers)[0]
     count = len(learnt)
@@ -244,7 +258,12 @@ def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[n
 
 
 def _joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the motion of the tip per unit of each joint (n,) [m/rad or 1], rms over poses."""
+    """Return the motion of the tip per unit of each joint (n,) [m/rad or 1], rms over poses.
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values of the poses [rad or m].
+    """
     poses = q[evenly(len(q), LEVER_POSES)]
     result = np.zeros(chain.n)
     for joint in range(chain.n):
@@ -307,6 +326,9 @@ def _range_folds(measured: Sequence[PoseMeasurements]) -> list[tuple[int, Folds]
     """Return, for each joint that moves, its index and two folds.
 
     The folds hold out the lower and the upper end of the joint's range.
+
+    Args:
+        measured: the blocks of measurements.
     """
     q = np.concatenate([block.q for block in measured])
     edges = np.cumsum([len(block) for block in measured])[:-1]
@@ -376,7 +398,11 @@ class _Rows:
         self._condense()
 
     def _choose(self, measured: Sequence[PoseMeasurements]) -> None:
-        """Choose the rows used to evaluate the folds: of very many rows, every k-th."""
+        """Choose the rows used to evaluate the folds: of very many rows, every k-th.
+
+        Args:
+            measured: the blocks of measurements.
+        """
         stride = max(1, -(-sum(map(len, measured)) // MAX_POSES))
         self.chosen = [np.arange(0, len(block), stride) for block in measured]
         self.measured = [take(block, rows) for block, rows in zip(measured, self.chosen)]
@@ -393,7 +419,12 @@ class _Rows:
         self.poses = np.concatenate(poses)
 
     def _observe(self, fit: GeometricFit, cell: Installation) -> None:
-        """Compute residuals and Jacobians of all rows, whitened and in metres."""
+        """Compute residuals and Jacobians of all rows, whitened and in metres.
+
+        Args:
+            fit: the fit of all rows, whose sigmas and weights whiten them.
+            cell: the rigid installation at which derivatives are computed.
+        """
         sigmas = fit.used_sigmas()
         weights = fit.row_weights()
         self.whitened: list[list[tuple[np.ndarray, np.ndarray]]] = []
@@ -426,8 +457,9 @@ class _Rows:
     def left_out(self, folds: Folds, levers: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the errors on the held-out rows of each fold, as an array (rows, 5).
 
-        The columns are |e|² [m²], trace J Σ Jᵀ [m²], squared distances from the fitted poses and from the joints'
-        ranges [m²] (as of `_distances`), and the pose number.
+        The columns are |e|² [m²] of the position error e, its variance trace J Σ Jᵀ [m²] due to the parameters (J
+        Jacobian, Σ their covariance), squared distances from the fitted poses and from the joints' ranges [m²] (as of
+        `_distances`), and the index of the pose.
 
         Args:
             folds: the partition of the rows.

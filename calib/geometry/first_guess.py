@@ -153,9 +153,13 @@ def place_pose(arm: np.ndarray, measured: np.ndarray) -> Placements:
 
 
 def by_orientations(arm: np.ndarray, measured: np.ndarray) -> Placements:
-    """Return S and X by Shah's method from the orientations of the poses.
+    """Return station S and tool X (4, 4) by Shah's method from the orientations of the poses.
 
     The result is accurate if the poses rotate about two axes by much more than the errors of the orientations.
+
+    Args:
+        arm: (m, 4, 4) poses A_i of the tip in the base.
+        measured: (m, 4, 4) poses B_i of the target in the station's frame.
     """
     # vec(R_S R_A R_X) = vec(R_B): the sum of R_B ⊗ R_A has vec(R_S) and vec(R_X) as its first singular pair
     kernel = np.einsum("mij,mkl->ikjl", measured[:, :3, :3], arm[:, :3, :3]).reshape(9, 9)
@@ -175,6 +179,10 @@ def _by_displacements(arm: np.ndarray, measured: np.ndarray) -> Placements:
     log(R_B,i R̄_Bᵀ) = R_S log(R_A,i R̄_Aᵀ), where R̄ is the chordal mean of the rotations, and y_i - ȳ = R_S (a_i - ā +
     (R_i - R̄) t). R_S is computed by Kabsch's method from both equations, with rotations multiplied by `LEVER` [m], in
     alternation with the linear solution for t.
+
+    Args:
+        arm: (m, 4, 4) poses A_i = (R_A,i, a_i) of the tip in the base; R_i is R_A,i.
+        measured: (m, 4, 4) poses B_i = (R_B,i, y_i) of the target in the station's frame.
     """
     arm_mean, arm_turns = chordal_turns(arm[:, :3, :3])
     measured_mean, measured_turns = chordal_turns(measured[:, :3, :3])
@@ -196,9 +204,14 @@ def chordal_turns(rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _translations(arm: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return p_S (3,) and t (3,) that solve y_i - R_S a_i = R_S R_i t + p_S.
+    """Return the positions p_S (3,) of the station and t (3,) of the target on the tool [m].
 
-    Components of t that are poorly identifiable are 0.
+    They solve y_i - R_S a_i = R_S R_i t + p_S; components of t that are poorly identifiable are 0.
+
+    Args:
+        arm: (m, 4, 4) poses (R_i, a_i) of the tip in the base.
+        position: (m, 3) measured positions y_i [m].
+        rotation: (3, 3) R_S, rotation of the station.
     """
     turned = rotation @ arm[:, :3, :3]
     target = position - arm[:, :3, 3] @ rotation.T
@@ -359,7 +372,13 @@ def _spread(positions: np.ndarray) -> tuple[float, float]:
 
 
 def _likely_units(block: Positions, chain: Chain, measured: float, predicted: float) -> tuple[str, str]:
-    """Return a question about the units that would explain the spread, and a column header that states these units."""
+    """Return a question about the units that would explain the spread, and a column header that states these units.
+
+    Args:
+        block: measured positions.
+        chain: the nominal arm.
+        measured, predicted: spreads of the measured and of the predicted positions [m].
+    """
     # what to ask about the joints, the spread that follows, and the header that states the unit
     guesses = [("", predicted, "'x [mm]'")]
     if np.abs(block.q).max() < MAX_TURN:
@@ -377,7 +396,12 @@ def _likely_units(block: Positions, chain: Chain, measured: float, predicted: fl
 
 
 def _turning(chain: Chain, block: PoseMeasurements) -> float:
-    """Return the size of a block's rotations about their second principal axis, in steps of `TURN` [rad]."""
+    """Return the size of a block's rotations about their second principal axis, in steps of `TURN` [rad].
+
+    Args:
+        chain: the nominal arm, which predicts the rotations.
+        block: measurements of any kind.
+    """
     rows = evenly(len(block), MAX_GUESS_ROWS)
     if len(rows) < 3:
         return 0.0
@@ -463,14 +487,18 @@ def _place_position(
 
 
 def _median_offset(rotation: np.ndarray, lever: np.ndarray) -> np.ndarray:
-    """Return the median (3,) of vectors `lever` (m, 3) [m], expressed in the frames of rotations (m, 3, 3)."""
+    """Return the median (3,) [m] of vectors R_iᵀ l_i, with R = `rotation` (m, 3, 3) and l = `lever` (m, 3) [m]."""
     return np.median(np.einsum("mji,mj->mi", rotation, lever), axis=0)
 
 
 def _linear_offset(rotation: np.ndarray, position: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return the offset t (3,) [m] that solves R_Sᵀ y - c - R t = a by linear least squares.
+    """Return the target's offset t (3,) [m] in the tip that solves R_Sᵀ y - c - R t = a by linear least squares.
 
-    The unknowns are the nine numbers of R_Sᵀ, c and t.
+    The unknowns are the nine numbers of the station's rotation R_Sᵀ, its offset c, and t.
+
+    Args:
+        rotation, position: (m, 3, 3) R and (m, 3) a, poses of the tip in the base.
+        measured: (m, 3) y, measured positions [m].
     """
     m = len(measured)
     centre = measured.mean(axis=0)
@@ -484,7 +512,7 @@ def _linear_offset(rotation: np.ndarray, position: np.ndarray, measured: np.ndar
 
 
 def _align(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return the pose S (4, 4) with measured ≈ S points (Kabsch 1976).
+    """Return the pose S (4, 4) with measured ≈ S points (Kabsch 1976), for points (m, 3) and measured (m, 3) [m].
 
     It is computed twice, the second time without the fifth of the points that fits worst.
     """
@@ -504,7 +532,12 @@ def _align(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
 
 
 def _place_sockets(arm: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """Return the offset t (3,) [m] for which R_i t + a_i varies least within each group of rows at one socket."""
+    """Return the offset t (3,) [m] for which R_i t + a_i varies least within each group of rows at one socket.
+
+    Args:
+        arm: (m, 4, 4) poses (R_i, a_i) of the tip in the base.
+        group: (m,) number of the socket of each row.
+    """
     rotation, position = arm[:, :3, :3].copy(), arm[:, :3, 3].copy()
     for number in np.unique(group):
         rows = group == number

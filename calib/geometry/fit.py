@@ -70,20 +70,22 @@ def fit(
 ) -> GeometricFit:
     """Return the most probable geometry: all candidate parameters of the arm, each with a prior of making.
 
+    A prior of making is a normal distribution about the nominal value, as wide as plausible manufacturing deviations.
     The fit minimises Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / w)². No parameters of the arm are selected. Parameters
     that cannot be distinguished share the effect that the measurements determine, and undetermined parameters stay near
     nominal. There are three widths w of making: for joint offsets, for other angles and for lengths. They are chosen to
-    maximise the evidence (MacKay 1992). Placements of stations and tools have no prior: only their base parameters are
-    fitted, and arm parameters that merely displace base or tool stay at nominal. The identifiable parameters are
-    computed afterwards (`GeometricFit.split`, `GeometricFit.base_sigma`).
+    maximise the evidence (MacKay 1992). x are the parameters, y the measured and f(x) the predicted numbers, σ their
+    standard deviations. Placements of stations and tools have no prior: only their base parameters are fitted, and arm
+    parameters that merely displace base or tool stay at nominal. The identifiable parameters are computed afterwards
+    (`GeometricFit.split`, `GeometricFit.base_sigma`).
 
     Args:
         cell: installation to start from, with stations and tools placed (`calib.geometry.first_guess`).
         measured: blocks of measurements.
         candidates: (c,) indices in the parameter vector; None for all parameters.
         settings: settings of the fit; None for the defaults.
-        prior: standard deviations of the whole parameter vector about its present values, infinite where the prior of
-            making applies; None for the prior of making everywhere.
+        prior: standard deviations of the whole parameter vector about its present values [m or rad], infinite where the
+            prior of making applies; None for the prior of making everywhere.
         widths: True estimates the widths of making; False uses `PLAUSIBLE`.
 
     Raises:
@@ -123,6 +125,11 @@ def fit(
 def _require_enough(cell: Installation, blocks: list[Block], unknowns: int) -> None:
     """Raise MeasurementError for fewer than `MIN_NUMBERS` measured numbers per unknown, since a fit could not be
     checked.
+
+    Args:
+        cell: the installation.
+        blocks: the prepared measurements.
+        unknowns: number of parameters to estimate.
     """
     numbers = 0
     poses = 0
@@ -164,6 +171,11 @@ def _estimated(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -
 
     Arm parameters that only displace base or tool are excluded: the placements of base and tool represent the same
     effect.
+
+    Args:
+        cell: the installation.
+        split: the candidates, split into base parameters and dependent ones.
+        candidates: (c,) indices in the parameter vector.
     """
     arm = layout(cell).index("arm")
     in_arm = np.isin(candidates[split.kept], arm)
@@ -180,6 +192,11 @@ def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndar
 
     Sockets and planes are explained equally well by a smaller arm, so that the scale must be taken from the nominal
     arm: the longest length keeps its nominal value, as do the parameters that could replace it.
+
+    Args:
+        cell: the installation.
+        split: the candidates, split into base parameters and dependent ones.
+        candidates: (c,) indices in the parameter vector.
     """
     lengths = np.zeros(len(candidates))
     for column, parameter in enumerate(candidates):
@@ -239,7 +256,7 @@ def _making(
         cell: the nominal installation.
         blocks: measurements prepared for it.
         free: (f,) indices in the parameter vector.
-        prior: (f,) initial standard deviations; infinite for none.
+        prior: (f,) initial standard deviations of the prior [m or rad]; infinite for no prior.
         has_stated_prior: (f,) mask of the parameters whose prior was given by the user and is kept.
         settings: settings of the fit.
     """
@@ -264,6 +281,10 @@ def _sampled_rows(blocks: list[Block], parameters: int) -> list[np.ndarray]:
     """Return numbers of random rows of each block: `WARM_POSES` in all, or four per parameter if this is more.
 
     All rows are returned where there are not so many.
+
+    Args:
+        blocks: the prepared measurements.
+        parameters: number of fitted parameters.
     """
     return sampled([block.measured for block in blocks], max(WARM_POSES, 4 * parameters))
 
@@ -311,6 +332,11 @@ def _making_families(cell: Installation, free: np.ndarray, has_stated_prior: np.
     """Return each parameter's family (f,): joint offsets, other angles or lengths.
 
     -1 is for a parameter without width of making.
+
+    Args:
+        cell: the installation.
+        free: (f,) indices in the parameter vector.
+        has_stated_prior: (f,) mask of the parameters whose prior was given by the user, which have no width of making.
     """
     kinds = np.where(has_stated_prior, "", families(cell)[free])
     family = np.full(len(free), -1)
@@ -334,7 +360,8 @@ def fit_with_prior(
 ) -> GeometricFit:
     """Return the fit of exactly the parameters `free`, which minimises squared residuals and distances from nominal.
 
-    The minimised function is Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)².
+    The minimised function is Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)², with x the parameters, y the
+    measured and f(x) the predicted numbers, σ their standard deviations.
 
     Sigmas that no file states are estimated, one per file and kind of residual (position, orientation …). The fit is
     repeated until sigmas and robust weights have converged. With thousands of poses the fit starts from the fit to a
@@ -344,7 +371,8 @@ def fit_with_prior(
         cell: installation to start from.
         blocks: measurements prepared for this installation.
         free: (f,) indices in the parameter vector.
-        prior: (f,) standard deviations, infinite for no prior; None for no prior at all.
+        prior: (f,) standard deviations of the parameters about nominal [m or rad], infinite for no prior; None for no
+            prior at all.
         settings: settings of the fit; None for the defaults.
         nominal: mean of the prior; None for `cell`.
         warm: True where `cell` is already fitted, so that the first sigmas can be estimated from its residuals.
@@ -400,7 +428,13 @@ def plausible_deviation(
 def polish_frames(
     cell: Installation, measured: Sequence[PoseMeasurements], settings: Settings | None = None
 ) -> GeometricFit:
-    """Return the fit of station and tool placements only; the arm's parameters are not changed."""
+    """Return the fit of station and tool placements only; the arm's parameters are not changed.
+
+    Args:
+        cell: the installation to start from.
+        measured: blocks of measurements.
+        settings: settings of the fit; None for the defaults.
+    """
     return fit(cell, measured, layout(cell).frame_index, settings=settings)
 
 
@@ -410,6 +444,11 @@ def placed_on(cell: Installation, block: PoseMeasurements, settings: Settings) -
     The block may hardly identify some direction, such as the rotation about a straight line of poses. If the fit does
     not converge for this reason, such directions (columns below `MIN_COLUMN`) are not changed. The solution's status
     records whether the fit converged.
+
+    Args:
+        cell: the installation to start from.
+        block: the measurements.
+        settings: settings of the fit.
     """
     start = install(cell.chain, [block], cell.known)
     start = replace(start, deflection=cell.deflection, optics=start.optics.like(cell.optics))

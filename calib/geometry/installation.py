@@ -54,7 +54,9 @@ class NoOptics:
     def view(self, measured: PoseMeasurements, free: np.ndarray) -> View | None:
         """Return what the optics add to the prediction of a block; None without cameras.
 
-        `free` are indices of parameters, counted from the first parameter of the optics.
+        Args:
+            measured: the block of measurements.
+            free: indices of fitted parameters, counted from the first parameter of the optics.
         """
         return None
 
@@ -183,7 +185,11 @@ class _Frames:
 
 
 def frame_tables(cell: Installation) -> dict[str, object]:
-    """Return the tables ``station`` and ``tool`` of an installation, and the tables of its cameras and boards."""
+    """Return the tables ``station`` and ``tool`` of an installation, and the tables of its cameras and boards.
+
+    Args:
+        cell: the installation of arm, stations, tools and optics.
+    """
     stations = [{"name": name, **placement_table(pose)} for name, pose in zip(cell.station_names, cell.stations)]
     tools = [{"name": name, **placement_table(pose)} for name, pose in zip(cell.tool_names, cell.tools)]
     return {**cell.optics.tables(), "station": stations, "tool": tools}
@@ -254,6 +260,10 @@ def _placements(entries: tuple[Mapping[str, object], ...], source: str) -> tuple
     """Return the names and placements (k, 4, 4) of the k entries of a table.
 
     An entry without name is named by its number.
+
+    Args:
+        entries: the tables, each with a placement.
+        source: name of the file, for messages.
     """
     names = []
     placements = []

@@ -59,7 +59,12 @@ class Goal:
 
 
 def seen_at(goal: Goal, q: np.ndarray) -> Seen:
-    """Return the predicted tool poses at joint values q (m, n), deflections included, in the station's frame."""
+    """Return the predicted tool poses at joint values q (m, n), deflections included, in the station's frame.
+
+    Args:
+        goal: the arm.
+        q: (m, n) joint values [rad or m].
+    """
     deflection = goal.cell.deflection
     torque = None
     if goal.torques is not None and any(term.basis == "torque" for term in deflection.terms):
@@ -100,7 +105,12 @@ def _differences(seen: Seen, targets: np.ndarray, dof: int) -> np.ndarray:
 
 
 def differences_jacobian(goal: Goal, seen: Seen) -> np.ndarray:
-    """Return the Jacobian (m, dof, n) of the tool's pose components, as in `differences`, by the joint values."""
+    """Return the Jacobian (m, dof, n) of the tool's pose components, as in `differences`, by the joint values.
+
+    Args:
+        goal: the arm, and the number of pose components.
+        seen: predicted tool poses at the joint values, from `seen_at`.
+    """
     jacobian = joint_jacobian(goal.cell.chain, seen.walked, seen.point)
     if goal.dof == 3:
         return jacobian[:, :3]
@@ -157,7 +167,13 @@ def _reach(goal: Goal, targets: np.ndarray, start: np.ndarray, iterations: int) 
 
 
 def _weighted(goal: Goal, q: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the error (m, dof) and its Jacobian (m, dof, n), with orientations multiplied by `LEVER` [m]."""
+    """Return the error (m, dof) and its Jacobian (m, dof, n), with orientations multiplied by `LEVER` [m].
+
+    Args:
+        goal: the arm.
+        q: (m, n) joint values [rad or m].
+        targets: (m, 4, 4) target poses in the station's frame.
+    """
     seen = seen_at(goal, q)
     weight = np.where(np.arange(goal.dof) < 3, 1.0, LEVER)
     error = weight * _differences(seen, targets, goal.dof)
@@ -170,6 +186,12 @@ def _step_within_limits(
     """Return damped joint steps (m, n) within the joint limits.
 
     A joint that would exceed its limit stops at it, and the other joints compensate.
+
+    Args:
+        goal: the arm, with its joint limits.
+        q: (m, n) joint values [rad or m].
+        error, jacobian: (m, dof) and (m, dof, n), as of `_weighted` [m].
+        damping: (m,) λ of each target, relative to the mean squared singular value of its Jacobian.
     """
     step = _damped(jacobian, error, damping)
     for _ in range(q.shape[1]):
@@ -184,7 +206,13 @@ def _step_within_limits(
 
 
 def _damped(jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Return the damped step Jᵀ (J Jᵀ + λ I)⁻¹ e; `damping` is λ relative to the mean squared singular value of J."""
+    """Return the damped joint steps Jᵀ (J Jᵀ + λ I)⁻¹ e (m, n).
+
+    Args:
+        jacobian: J (m, dof, n).
+        error: e (m, dof).
+        damping: (m,) λ of each target, relative to the mean squared singular value of J.
+    """
     across = np.swapaxes(jacobian, 1, 2)
     square = jacobian @ across
     rows = square.shape[1]
@@ -197,7 +225,14 @@ def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray) -
     """Return the joint values (m, n) nearest to `start` that have the same tool poses as `q`, for a redundant arm.
 
     The function minimises |q - q_start| (radians and metres with equal weight) under e(q) = 0. Each pass steps by d +
-    J⁺ (e - J d) with d = q_start - q. The given `q` is kept for targets that the result would no longer reach.
+    J⁺ (e - J d) with d = q_start - q, J the Jacobian and e the pose error at q. The given `q` is kept for targets that
+    the result would no longer reach.
+
+    Args:
+        goal: the arm.
+        targets: (m, 4, 4) target poses in the station's frame.
+        start: (m, n) joint values q_start to stay near [rad or m].
+        q: (m, n) joint values that reach the targets, J being the Jacobian and e the pose error there.
     """
     if q.shape[1] <= goal.dof:
         return q
@@ -220,8 +255,15 @@ def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray) -
 def held_back(goal: Goal, targets: np.ndarray, start: np.ndarray, max_change: float) -> np.ndarray:
     """Return joint values (m, n) near the targets, with no joint more than `max_change` from `start`.
 
-    This is for targets near a singularity, where a small correction needs a large motion. The function minimises |e|² +
-    μ² |q - q_start|² with the smallest μ of `BACK` for which the change is at most `max_change` [rad or m].
+    This is for targets near a singularity, where a small correction needs a large motion. With e the pose error, the
+    function minimises |e|² + μ² |q - q_start|² with the smallest μ of `BACK` for which the change is at most
+    `max_change` [rad or m].
+
+    Args:
+        goal: the arm.
+        targets: (m, 4, 4) target poses in the station's frame.
+        start: (m, n) joint values q_start [rad or m].
+        max_change: largest change of a joint value [rad or m].
     """
     best = np.clip(start, goal.lower, goal.upper)
     open_rows = np.arange(len(best))
@@ -247,6 +289,10 @@ def conditions(goal: Goal, q: np.ndarray) -> np.ndarray:
     """Return the ratio of smallest to largest singular value (m,) of the Jacobian at each pose q (m, n).
 
     The ratio is 0 at a singularity.
+
+    Args:
+        goal: the arm, and the pose components that form the Jacobian (orientations multiplied by `LEVER` [m]).
+        q: (m, n) joint values [rad or m].
     """
     no_targets = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     _, jacobian = _weighted(goal, q, no_targets)

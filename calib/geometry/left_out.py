@@ -68,7 +68,11 @@ Profile = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
 def unevenness(profile: Profile, q: np.ndarray) -> np.ndarray:
     """Return the factor s (m,) by which the error variance at poses q (m, n) is larger than on average.
 
-    1 for an empty profile. q is in rad or m.
+    1 for an empty profile.
+
+    Args:
+        profile: log s as one function per joint; s is the exponential of their sum.
+        q: (m, n) joint values [rad or m].
     """
     log_factor = np.zeros(len(q))
     for joint, (knots, values) in enumerate(profile):
@@ -123,7 +127,11 @@ class Unevenness:
         return tuple(result)
 
     def _values(self, data: Gram) -> list[np.ndarray]:
-        """Return E f + var f / 2 at the knots of each joint that moves."""
+        """Return E f + var f / 2 at the knots of each joint that moves, f being the joint's function in log s.
+
+        Args:
+            data: statistics of the squared errors for the values of all functions at their knots.
+        """
         data = replace(data, total=data.total + MIN_VARIANCE * data.rows)
         sizes = np.full(len(self.groups), FIRST_SIZE)
         estimate = relevance(data, self.groups, sizes, SEARCH_ROUNDS, SETTLED)
@@ -165,7 +173,10 @@ class LeftOut:
 
     @classmethod
     def of(cls, near: Sequence[np.ndarray], far: Sequence[np.ndarray], joints: Sequence[int]) -> LeftOut:
-        """Return the errors from one array (rows, 5) per fold: |e|², trace J Σ Jᵀ, two squared distances, pose number.
+        """Return the errors from one array (rows, 5) per fold, with the columns of `calib.geometry.error_model`.
+
+        The columns are |e|² [m²] of the position error e, its variance due to the parameters [m²], squared distances
+        from the fitted poses and from the joints' fitted ranges [m²], and the index of the pose.
 
         Args:
             near: arrays of the folds held out at random.
@@ -189,7 +200,11 @@ class LeftOut:
         )
 
     def without(self, poses: np.ndarray) -> LeftOut:
-        """Return the errors without the rows of the given poses."""
+        """Return the errors without the rows of the given poses.
+
+        Args:
+            poses: numbers of the poses.
+        """
         rows = ~np.isin(self.pose, poses)
         return LeftOut(
             squares=self.squares[rows],
@@ -224,6 +239,9 @@ class LeftOut:
     def learnt(self, start: Sequence[float] = ()) -> tuple[list[float], tuple[float, float]]:
         """Return κ, v_0, v_1, v_2, estimated from |e|² ~ variance · χ²_3 / 3, and the near and far 95 % radii.
 
+        κ, v_0, v_1, v_2 are the weights of the columns of `shapes` in the variance of the error e; a radius is a number
+        of standard deviations.
+
         Args:
             start: values from which the search starts; empty for values from the errors' median.
         """
@@ -241,13 +259,16 @@ class LeftOut:
         return weights.tolist(), self.quantiles(sizes)
 
     def _variances(self, weights: np.ndarray | Sequence[float]) -> np.ndarray:
-        """Return the expected variance (m,) [m²] of each error for the weights κ, v_0, v_1, v_2."""
+        """Return the expected variance (m,) [m²] of each error, for weights κ, v_0, v_1, v_2 of the `shapes`."""
         return np.maximum(self.shapes @ np.asarray(weights), SMALLEST_VARIANCE)
 
     def quantiles(self, sizes: np.ndarray) -> tuple[float, float]:
         """Return the bounds below which 95 % of future errors lie, for near and far rows, from error magnitudes (m,).
 
         They are conformal quantiles, as in the module's docstring.
+
+        Args:
+            sizes: (m,) error magnitudes, divided by the standard deviations expected for them.
         """
         poses = len(np.unique(self.pose))
         level = min(1.0, COVERED * (poses + 1) / poses)

@@ -26,7 +26,7 @@ CHUNK = 500
 
 
 def separable(measured: PoseMeasurements) -> bool:
-    """Return whether the rows are positions or poses without errors that all rows share."""
+    """Return whether the rows of `measured` are positions or poses without errors that all rows share."""
     return isinstance(measured, Positions) and measured.late is None
 
 
@@ -83,7 +83,13 @@ def position_variances(
 ) -> np.ndarray:
     """Return the variance (m,) [m²] of a tool's position, trace J Σ Jᵀ.
 
-    Arguments are those of `calib.geometry.observation.pose_sigmas`.
+    Args:
+        cell: the fitted installation.
+        measured: joint values (m, n), and gravity torques if the model has compliance terms.
+        free: (f,) indices in the parameter vector.
+        covariance: (f, f) covariance Σ of these parameters; J are the derivatives of the position by them.
+        station: index of the station of reference; -1 for the arm's base.
+        tool: index of the tool, one or (m,).
     """
     grouping = _grouped(cell, free)
     single = grouping.single
@@ -132,7 +138,12 @@ class Grouping:
 
 
 def _grouped(cell: Installation, free: np.ndarray) -> Grouping:
-    """Return the parameters `free` (f,) grouped by the chain element that their corrections change."""
+    """Return the parameters `free` (f,) grouped by the chain element that their corrections change.
+
+    Args:
+        cell: the installation.
+        free: (f,) indices in the parameter vector.
+    """
     # numbers of corrections; negative for all other parameters
     numbers = free - sum(layout_counts(cell)[:4])
     is_correction = numbers >= 0

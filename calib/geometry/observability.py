@@ -15,7 +15,7 @@ from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.errors import Finding, Unidentifiable, UsageError, finding, one_of, require
 from calib.estimation.base_columns import ColumnSplit, split_columns
 from calib.estimation.nonlinear import MOST_NUMBERS
-from calib.geometry.installation import Installation, see
+from calib.geometry.installation import Installation, Seen, see
 from calib.geometry.observation import Block, families, layout, observe, prepare, target_jacobian, whitened
 from calib.geometry.weighing import GeometricFit
 from calib.robot.chain import Chain, random_joints
@@ -47,7 +47,7 @@ PLACES = {"station": "the placement of the instrument", "tool": "the mounting of
 
 
 def unidentified(fit: GeometricFit) -> list[Finding]:
-    """Return findings on the parameters and placements that a fit's poses do not identify, and on the rank."""
+    """Return findings on the rank, and on the parameters and placements that the poses of `fit` do not identify."""
     split = fit.split
     if split is None:
         return _loose(fit)
@@ -62,7 +62,12 @@ def unidentified(fit: GeometricFit) -> list[Finding]:
 
 
 def _merged(fit: GeometricFit, split: ColumnSplit) -> list[Finding]:
-    """Return findings on arm parameters that depend linearly on other parameters, grouped by these other parameters."""
+    """Return findings on arm parameters that depend linearly on other parameters, grouped by these other parameters.
+
+    Args:
+        fit: the fit.
+        split: its candidate parameters, split into base parameters and dependent ones.
+    """
     table = layout(fit.start)
     # per group: what they merge with, and their names
     groups: dict[object, tuple[list[str], list[str]]] = {}
@@ -91,7 +96,7 @@ def _merged(fit: GeometricFit, split: ColumnSplit) -> list[Finding]:
 
 
 def _at_nominal(fit: GeometricFit) -> list[Finding]:
-    """Return a finding on base parameters of the arm that the data determine hardly better than the prior does."""
+    """Return a finding on base parameters of the arm in `fit` that the data determine hardly better than the prior."""
     if fit.prior is None:
         return []
     table = layout(fit.start)
@@ -110,7 +115,11 @@ def _at_nominal(fit: GeometricFit) -> list[Finding]:
 
 
 def _loose(fit: GeometricFit) -> list[Finding]:
-    """Return findings on tools whose placement is poorly determined, with the station with which it is correlated."""
+    """Return findings on tools whose placement is poorly determined, with the station with which it is correlated.
+
+    Args:
+        fit: the fit, whose covariance is examined.
+    """
     estimate = fit.estimate
     index = {name: k for k, name in enumerate(estimate.names)}
     findings: list[Finding] = []
@@ -154,6 +163,9 @@ def _orientation_range(fit: GeometricFit) -> float | None:
     """Return the range that contains 95 % of the flange's orientations [deg].
 
     None where no poses were measured by an instrument.
+
+    Args:
+        fit: the fit, whose blocks contain the measured poses.
     """
     q = [block.measured.q for block in fit.blocks if block.measured.has_instrument]
     if not q:
@@ -169,6 +181,11 @@ def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.
     Rows are divided by their stated sigmas relative to the sigmas' median. Orientation rows are multiplied by a typical
     length of the arm, which makes them comparable with position rows. If W has more than `MOST_NUMBERS` numbers, the R
     factor of its QR decomposition is returned instead, whose columns have the same linear dependences.
+
+    Args:
+        cell: the installation of arm, stations and tools.
+        blocks: the prepared measurements.
+        columns: (c,) indices in the full parameter vector.
     """
     rows: list[np.ndarray] = []
     for block in blocks:
@@ -191,7 +208,7 @@ def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.
 
 
 def _reach(cell: Installation) -> float:
-    """Return a typical length of the arm [m]: the sum of the constant lengths along its chain."""
+    """Return a typical length of the arm in `cell` [m]: the sum of the constant lengths along its chain."""
     lengths = 0.0
     offsets = 0.0
     for element in cell.chain.elements:
@@ -209,6 +226,10 @@ def _preference(cell: Installation, columns: np.ndarray) -> list[np.ndarray]:
     cannot be distinguished from the placements (those before the first joint, the last joint's offset) are then
     represented by the placements, and the arm keeps its nominal values. Rotations are before translations so that, at
     parallel axes, Hayati's β is preferred to an offset along the axes.
+
+    Args:
+        cell: the installation.
+        columns: indices in the full parameter vector; the groups are positions in this array.
     """
     order = (("station", "tool", "optics"), ("offset",), ("rad",), ("m",), ("deflection",))
     return [np.flatnonzero(np.isin(families(cell)[columns], group)) for group in order]
@@ -225,7 +246,7 @@ def base_columns(
         cell: the installation.
         blocks: prepared measurements.
         columns: (c,) indices of the candidate parameters.
-        tolerance: relative size below which a column is treated as dependent.
+        tolerance: norm of a column's independent part, relative to the column, below which it counts as dependent.
     """
     return split_columns(observation_matrix(cell, blocks, columns), _preference(cell, columns), tolerance)
 
@@ -239,31 +260,59 @@ class Observation:
         full: True: positions and orientations are measured (six rows per target); False: positions only (three rows).
         free: (p,) indices of the identifiable parameters in the full vector.
         sigmas: standard deviations of a position [m] and of an orientation [rad].
+        reference: whether a frame at the arm's base is measured beside the target, with the same sigmas, so that the
+            noise of both counts.
     """
 
     cell: Installation
     full: bool
     free: np.ndarray
     sigmas: tuple[float, float] = (SIGMA_POSITION, SIGMA_ORIENTATION)
+    reference: bool = False
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
-        sigma_position, sigma_orientation = self.sigmas
         rows = []
         for number in range(len(self.cell.tools)):
             seen = see(self.cell, q, 0, number)
             jacobian = target_jacobian(self.cell, seen, self.free, 0, np.full(len(q), number))
-            rows.append(jacobian[:, :3] / sigma_position)
+            sigma = self._sigma(seen.point)
+            rows.append(jacobian[:, :3] / sigma[:3])
             if self.full:
-                rows.append(jacobian[:, 3:] / sigma_orientation)
+                rows.append(jacobian[:, 3:] / sigma[3:])
         return np.concatenate(rows, axis=1).transpose(2, 1, 0)
 
+    def _sigma(self, point: np.ndarray) -> np.ndarray:
+        """Return the standard deviations (6, m) of positions [m] and orientations [rad] of a target.
+
+        With a reference frame, σ_x² = 2 σ_p² + σ_r² (l_y² + l_z²) and so on, l the target seen from the arm's base.
+
+        Args:
+            point: (3, m) positions of the target [m].
+        """
+        sigma = np.repeat(self.sigmas, 3)[:, None] * np.ones(point.shape[1])
+        if not self.reference:
+            return sigma
+        squares = 2.0 * sigma**2
+        squares[:3] += self.sigmas[1] ** 2 * (np.sum(point**2, axis=0) - point**2)
+        return np.sqrt(squares)
+
     def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the position of the first target (m, 3) [m] and its unwhitened Jacobian (m, 3, p)."""
-        point = see(self.cell, q).point.T
-        return point, self(q)[:, :3] * self.sigmas[0]
+        """Return the position of the first target (m, 3) [m] and its unwhitened Jacobian (m, 3, p).
+
+        Args:
+            q: (m, n) joint values [rad or m].
+        """
+        point = see(self.cell, q).point
+        sigma = self._sigma(point)[:3]
+        return point.T, self(q)[:, :3] * sigma.T[:, :, None]
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian J, in closed form."""
+        """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian J, in closed form.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+            G: (m, rows, p) weights of the entries of J.
+        """
         chain = self.cell.chain
         count = len(chain.elements)
         # element of each parameter; -1 for the station, behind the last element for tools
@@ -277,13 +326,30 @@ class Observation:
         for number in range(len(self.cell.tools)):
             seen = see(self.cell, q, 0, number)
             columns = target_jacobian(self.cell, seen, self.free, 0, np.full(len(q), number))
+            sigma = self._sigma(seen.point)[:rows]
             weight = np.zeros(columns.shape)
-            for start, sigma in zip(range(0, rows, 3), self.sigmas):
-                row = rows * number + start
-                weight[:, start : start + 3] = weights[:, row : row + 3] / sigma
+            weight[:, :rows] = weights[:, rows * number : rows * (number + 1)] / sigma
             elements = element_jacobian(chain, seen.walked, seen.point)
             result += twist_product(chain, elements, columns, places, weight)
+            if self.reference:
+                result -= self._noise_product(seen, columns, weight, sigma)
         return result.T
+
+    def _noise_product(self, seen: Seen, columns: np.ndarray, weight: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+        """Return the part (n, m) of `product` from the growth of noise with the distance to the reference frame.
+
+        Args:
+            seen: the target at the m postures.
+            columns: (p, 6, m) Jacobian.
+            weight: (p, 6, m) weights of the Jacobian, divided by the sigmas.
+            sigma: (rows, m) standard deviations.
+        """
+        # of a relative change of σ_x, σ_y, σ_z
+        share = np.sum(weight[:, :3] * columns[:, :3], axis=0) / sigma[:3] ** 2
+        # σ_x dσ_x = σ_r² (l_y dl_y + l_z dl_z)
+        pull = self.sigmas[1] ** 2 * seen.point * (share.sum(axis=0) - share)
+        velocities = joint_jacobian(self.cell.chain, seen.walked, seen.point)[:, :3]
+        return np.einsum("mxn,xm->nm", velocities, pull)
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,6 +379,10 @@ class TargetJacobian:
 def targets_of(chain: Chain, tools: Sequence[Sequence[float]] = ()) -> Installation:
     """Return the arm with targets at the positions `tools` (3,) [m] in the tip's frame; empty for one target at the
     tip.
+
+    Args:
+        chain: the arm.
+        tools: positions of the targets.
     """
     positions = [np.asarray(tool, dtype=float) for tool in tools] or [np.zeros(3)]
     names = ("tool",)
@@ -323,7 +393,11 @@ def targets_of(chain: Chain, tools: Sequence[Sequence[float]] = ()) -> Installat
 
 
 def observation(
-    cell: Installation, kind: str = "pose", sigmas: tuple[float, float] | None = None, seed: int = 0
+    cell: Installation,
+    kind: str = "pose",
+    sigmas: tuple[float, float] | None = None,
+    seed: int = 0,
+    reference: bool = False,
 ) -> Observation:
     """Return the observation Jacobian of a nominal arm, for the parameters that random postures can identify.
 
@@ -332,6 +406,7 @@ def observation(
         kind: kind of measurement, ``pose`` or ``position``.
         sigmas: standard deviations of a position [m] and an orientation [rad]; None for the defaults.
         seed: seed of the postures.
+        reference: whether a frame at the arm's base is measured beside the target.
 
     Raises:
         UsageError: an unknown kind.
@@ -349,13 +424,19 @@ def observation(
         columns = np.setdiff1d(columns, turns)
     split = base_columns(cell, blocks, columns)
     require(split.rank, f"robot '{cell.chain.name}': no parameter affects the measured quantities", Unidentifiable)
-    return Observation(cell, full, columns[split.kept], sigmas or (SIGMA_POSITION, SIGMA_ORIENTATION))
+    return Observation(cell, full, columns[split.kept], sigmas or (SIGMA_POSITION, SIGMA_ORIENTATION), reference)
 
 
 def _measured(q: np.ndarray, cell: Installation, number: int, full: bool) -> Positions:
     """Return noise-free measurements of target `number` at joint values q (m, n).
 
     Orientations are included if `full`.
+
+    Args:
+        q: (m, n) joint values [rad or m].
+        cell: the installation, whose predictions are the measurements.
+        number: index of the target.
+        full: whether orientations are measured, too.
     """
     poses = see(cell, q, 0, np.full(len(q), number)).poses()
     quaternion = None

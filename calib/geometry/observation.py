@@ -75,7 +75,11 @@ class ParameterLayout:
 
 
 def layout(cell: Installation) -> ParameterLayout:
-    """Return names, units and kinds of all parameters of an installation."""
+    """Return names, units and kinds of all parameters of an installation.
+
+    Args:
+        cell: installation of arm, stations, tools, optics and deflection.
+    """
     chain = cell.chain
     frame_names, frame_units = [], []
     for frame in (*cell.station_names, *cell.tool_names):
@@ -95,6 +99,9 @@ def families(cell: Installation) -> np.ndarray:
     """Return the family of each parameter (p,).
 
     It is ``offset`` for joint offsets, the unit for other arm elements, and the kind for all other parameters.
+
+    Args:
+        cell: the installation, with p parameters.
     """
     table = layout(cell)
     result = list(table.kinds)
@@ -107,6 +114,11 @@ def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installati
     """Return the installation with `change` (f,) added to the parameters `free` (f,).
 
     Placements are displaced by rigid motions, so that they remain valid transforms.
+
+    Args:
+        cell: the installation.
+        free: (f,) indices in the full parameter vector.
+        change: (f,) changes [m or rad, or the unit of the parameter].
     """
     counts = layout_counts(cell)
     full = np.zeros(sum(counts))
@@ -138,7 +150,7 @@ def _displaced(placements: np.ndarray, displacements: np.ndarray) -> np.ndarray:
 
 
 def layout_counts(cell: Installation) -> tuple[int, int, int, int, int]:
-    """Return the number of parameters of each kind, in the order of `KINDS`."""
+    """Return the number of parameters of each kind in the installation `cell`, in the order of `KINDS`."""
     stations = 6 * len(cell.stations)
     tools = 6 * len(cell.tools)
     return len(cell.chain.elements), stations, tools, len(cell.optics), len(cell.deflection.terms)
@@ -148,6 +160,9 @@ def parameter_values(cell: Installation) -> np.ndarray:
     """Return the full parameter vector.
 
     The six parameters of a placement are zero, since they are displacements from the present placement.
+
+    Args:
+        cell: the installation.
     """
     _, stations, tools, _, _ = layout_counts(cell)
     terms = np.asarray(cell.deflection.coefficients)
@@ -158,6 +173,10 @@ def fixed_parameters(start: Installation, options: FitOptions) -> np.ndarray:
     """Return the indices of parameters fixed at their nominal values: those in ``fix``, or all but those in ``free``.
 
     The option ``free`` refers to the arm only; placements are always fitted.
+
+    Args:
+        start: the installation from which the fit starts.
+        options: options of the fit, with the names in ``fix`` or ``free``.
     """
     table = layout(start)
     fixed = table.find(options.fix)
@@ -171,6 +190,10 @@ def stated_prior(start: Installation, options: FitOptions) -> np.ndarray | None:
     """Return the prior standard deviations in the options for the full parameter vector; infinite where none is stated.
 
     None if the options state no prior.
+
+    Args:
+        start: the installation from which the fit starts.
+        options: options of the fit, with standard deviations by parameter name.
     """
     if not options.prior:
         return None
@@ -206,6 +229,10 @@ def prepare(cell: Installation, measured: Sequence[PoseMeasurements]) -> list[Bl
 
     Stations and tools are found by name.
 
+    Args:
+        cell: the installation.
+        measured: blocks of measurements, one per file, station and kind.
+
     Raises:
         UsageError: the installation does not have a station or tool of that name.
     """
@@ -223,7 +250,13 @@ def prepare(cell: Installation, measured: Sequence[PoseMeasurements]) -> list[Bl
 
 
 def rows_of(cell: Installation, block: Block, rows: np.ndarray) -> Block:
-    """Return the block with only the given rows, and with the deflection's basis functions evaluated at these rows."""
+    """Return the block with only the given rows, and with the deflection's basis functions evaluated at these rows.
+
+    Args:
+        cell: the installation, which defines the basis functions.
+        block: the prepared measurements.
+        rows: row numbers, or a mask (m,).
+    """
     measured = take(block.measured, rows)
     bases = None
     if cell.deflection.terms:
@@ -236,12 +269,21 @@ def rows_of(cell: Installation, block: Block, rows: np.ndarray) -> Block:
 
 
 def _divided(measured: PoseMeasurements) -> bool:
-    """Return whether a block is evaluated in pieces: it is long, and its rows do not depend on each other."""
+    """Return whether a block is evaluated in pieces: it is long, and its rows do not depend on each other.
+
+    Args:
+        measured: the block of measurements.
+    """
     return len(measured) > PIECE and isinstance(measured, Positions)
 
 
 def pieces(cell: Installation, block: Block) -> Iterator[Block]:
-    """Yield a block in pieces: a long block of positions or poses in pieces of at most `PIECE` rows, others whole."""
+    """Yield a block in pieces: a long block of positions or poses in pieces of at most `PIECE` rows, others whole.
+
+    Args:
+        cell: the installation, which defines the basis functions of the deflection.
+        block: the prepared measurements.
+    """
     if not _divided(block.measured):
         yield block
         return
@@ -276,17 +318,33 @@ def sampled(measured: Sequence[PoseMeasurements], poses: int, seed: int = 0) -> 
 
 
 def positions(cell: Installation, block: Block) -> np.ndarray:
-    """Return the predicted target positions (3, m) [m] of a block's rows, in the instrument's frame."""
+    """Return the predicted target positions (3, m) [m] of a block's rows, in the instrument's frame.
+
+    Args:
+        cell: the installation.
+        block: the prepared measurements of m rows.
+    """
     return np.concatenate([predict(cell, piece).point for piece in pieces(cell, block)], axis=1)
 
 
 def predict(cell: Installation, block: Block) -> Seen:
-    """Return the predicted targets of the rows of a block, or of a piece of a block, in the instrument's frame."""
+    """Return the predicted targets of the rows of a block, or of a piece of a block, in the instrument's frame.
+
+    Args:
+        cell: the installation.
+        block: the prepared measurements.
+    """
     return see(cell, block.measured.q, block.station, block.tool, block.bases, block.displacements)
 
 
 def observe(cell: Installation, block: Block, free: np.ndarray) -> list[ResidualPart]:
-    """Return the residual parts of a block with their Jacobian with respect to the parameters `free` (f,)."""
+    """Return the residual parts of a block with their Jacobian with respect to the parameters `free` (f,).
+
+    Args:
+        cell: the installation.
+        block: the prepared measurements.
+        free: (f,) indices in the full parameter vector.
+    """
     observed = [_observe(cell, piece, free) for piece in pieces(cell, block)]
     if len(observed) == 1:
         return observed[0]
@@ -328,7 +386,7 @@ def whitened(
 def target_jacobian(
     cell: Installation, seen: Seen, free: np.ndarray, station: int, tool: np.ndarray, bases: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return [v; ω] of the targets per unit of each fitted parameter, (f, 6, m).
+    """Return velocity and angular velocity [v; ω] of the targets per unit of each fitted parameter, (f, 6, m).
 
     Args:
         cell: the installation.
@@ -370,7 +428,11 @@ def target_jacobian(
 def _station_column(column: np.ndarray, placement: np.ndarray, seen: Seen, axis: int) -> None:
     """Fill `column` (6, m) with the targets' [v; ω] per unit displacement of a station.
 
-    The displacement is along or about one of the station's axes, given by `axis`.
+    Args:
+        column: (6, m) array to fill.
+        placement: (4, 4) pose of the arm's base in the station's frame.
+        seen: the predicted targets.
+        axis: 0 to 2 for a displacement along, 3 to 5 for a rotation about x, y, z of the placement.
     """
     direction = placement[:3, axis % 3]
     if axis < 3:
@@ -390,6 +452,8 @@ def pose_sigmas(
     tool: np.ndarray | int = 0,
 ) -> np.ndarray:
     """Return standard deviations (m, 2) of a tool's position [m] and orientation [rad]: sqrt(trace J Σ Jᵀ) of each.
+
+    J are the derivatives of position or orientation by the parameters.
 
     Args:
         cell: the fitted installation.

@@ -88,12 +88,12 @@ class RepeatedPoses:
 
     @stored
     def orientation_repeatability_deg(self) -> MeanAndMax | None:
-        """Orientation repeatability RP, the largest of three axes, mean and maximum [deg]."""
+        """Orientation repeatability RP, the largest of three axes, mean and maximum [deg]; None if not measured."""
         return _sizes([max(pose.repeatability_deg) for pose in self.each if pose.repeatability_deg])
 
     @stored
     def orientation_accuracy_deg(self) -> dict[str, MeanAndMax | None]:
-        """Orientation accuracy AP of each arm, mean and maximum [deg]."""
+        """Orientation accuracy AP of each arm, mean and maximum over the poses [deg]; None if not measured."""
         return {
             "nominal": _sizes([_norm(pose.nominal_deg) for pose in self.each if pose.nominal_deg]),
             "calibrated": _sizes([_norm(pose.calibrated_deg) for pose in self.each if pose.calibrated_deg]),
@@ -101,7 +101,7 @@ class RepeatedPoses:
 
     @stored
     def multidirectional_mm(self) -> MeanAndMax | None:
-        """Multidirectional variation vAP of the position, mean and maximum [mm]."""
+        """Multidirectional variation vAP of the position, mean and maximum [mm]; None if not measured."""
         return _sizes([pose.multidirectional_mm for pose in self.each if pose.multidirectional_mm is not None])
 
 
@@ -197,7 +197,13 @@ class CommandedPose:
 
 
 def _command(cell: Installation, block: Block, rows: np.ndarray) -> CommandedPose:
-    """Return the pose that an arm predicts for the mean joint values of some rows of a block."""
+    """Return the pose that an arm predicts for the mean joint values of some rows of a block.
+
+    Args:
+        cell: the installation of the arm, its station and its tool.
+        block: the prepared measurements.
+        rows: row numbers in the block.
+    """
     seen = predict(cell, rows_of(cell, block, rows))
     rotations = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0))
     return CommandedPose(cell.stations[block.station][:3, :3], seen.point.mean(axis=1), rotations.mean())
@@ -206,7 +212,13 @@ def _command(cell: Installation, block: Block, rows: np.ndarray) -> CommandedPos
 def _repeated_pose(
     measured: Positions, rows: np.ndarray, nominal: CommandedPose, calibrated: CommandedPose
 ) -> RepeatedPose:
-    """Return accuracy and repeatability of one pose from its rows and the pose that each arm predicts."""
+    """Return accuracy and repeatability of one pose from its rows and the pose that each arm predicts.
+
+    Args:
+        measured: the block of measurements.
+        rows: row numbers of the pose's cycles.
+        nominal, calibrated: pose predicted by the nominal and by the calibrated arm.
+    """
     points = measured.position[rows]
     variation = _variation(points, _directions(measured, rows))
     result = RepeatedPose(
@@ -238,6 +250,10 @@ def _directions(measured: Positions, rows: np.ndarray) -> np.ndarray:
     """Return each row's direction of approach (k, 3), from the previous row of the file; NaN where that row is missing.
 
     Both positions are the measured ones; their errors are small against the distance between the two rows.
+
+    Args:
+        measured: the block of measurements.
+        rows: (k,) row numbers in the block.
     """
     result = np.full((len(rows), 3), np.nan)
     index = {int(number): row for row, number in reversed(list(enumerate(measured.rows)))}
@@ -253,7 +269,14 @@ def _directions(measured: Positions, rows: np.ndarray) -> np.ndarray:
 
 
 def _variation(points: np.ndarray, directions: np.ndarray) -> float:
-    """Return vAP [m] of points (k, 3) approached from directions (k, 3); NaN for fewer than two directions."""
+    """Return the multidirectional variation vAP [m] of points approached from several directions.
+
+    It is the largest distance between the means of points with different directions; NaN for fewer than two directions.
+
+    Args:
+        points: (k, 3) positions [m].
+        directions: (k, 3) direction of approach of each point; NaN where unknown.
+    """
     remaining = np.flatnonzero(~np.isnan(directions[:, 0]))
     centres: list[np.ndarray] = []
     while len(remaining):
@@ -317,7 +340,12 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasureme
 
 
 def _measured_again(fit: Sequence[PoseMeasurements], unseen: PoseMeasurements) -> np.ndarray:
-    """Return a mask (m,) of the rows of `unseen` whose joint values are those of a fitted row."""
+    """Return a mask (m,) of the rows of `unseen` whose joint values are those of a fitted row.
+
+    Args:
+        fit: the fitted blocks.
+        unseen: a block of m held-out rows.
+    """
     fitted = [block.q for block in fit if type(block) is type(unseen) and block.has_instrument]
     if not fitted:
         return np.zeros(len(unseen), dtype=bool)
@@ -329,13 +357,21 @@ def _marks(block: PoseMeasurements) -> list[bytes]:
     """Return a key for each row: its joint values and measured numbers, rounded to 12 decimals.
 
     Equal rows have equal keys.
+
+    Args:
+        block: the measurements.
     """
     table = np.column_stack([block.q, block.tool.astype(float), block.measured])
     return [row.tobytes() for row in np.round(table, 12) + 0.0]
 
 
 def _row_numbers(block: PoseMeasurements, mask: Sequence[bool] | np.ndarray) -> list[int]:
-    """Return the row numbers in the file of the rows in a mask (m,), each once."""
+    """Return the row numbers in the file of the rows in a mask (m,), each once.
+
+    Args:
+        block: the measurements.
+        mask: (m,) the wanted rows.
+    """
     rows = block.rows[np.array(mask, dtype=bool)]
     return [int(row) for row in dict.fromkeys(rows)]
 

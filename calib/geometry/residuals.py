@@ -38,7 +38,11 @@ class CommonNoise(Protocol):
         ...
 
     def near(self, noise: Self) -> bool:
-        """Return whether two noise estimates agree, so that the fit need not be repeated."""
+        """Return whether two noise estimates agree, so that the fit need not be repeated.
+
+        Args:
+            noise: noise estimated in another pass.
+        """
         ...
 
     def unweighted(self, images: int) -> Self:
@@ -78,7 +82,9 @@ class ResidualPart:
     def fill(self, residual: np.ndarray, matrix: np.ndarray, scale: np.ndarray) -> None:
         """Write residuals to `residual` (height,) and the Jacobian to `matrix` (f, height), both divided by `scale`.
 
-        The scale is broadcast to the shape of `value`.
+        Args:
+            residual, matrix: arrays to write.
+            scale: standard deviation of each residual, broadcast to the shape of `value`.
         """
         residual[:] = (self.value / scale).ravel()
         np.divide(self.jacobian, scale, out=matrix.reshape(self.jacobian.shape))
@@ -116,15 +122,19 @@ class ResidualPart:
         """Return the errors that rows share, estimated from the residuals; None for kinds without shared errors.
 
         Args:
-            sigma: (rows, m) standard deviations.
+            sigma: (rows, m) standard deviations of the residuals, in their unit.
             unknowns: number of parameters fitted to the residuals.
-            loss, scale: robust loss of the fit, and its constant.
+            loss, scale: robust loss of the fit, and its constant in sigmas (None: its default).
             start: True at the start of a fit, when the residuals do not yet show their common errors.
         """
         return None
 
     def alone(self, sigma: np.ndarray) -> np.ndarray:
-        """Return the residuals (rows, m) without the errors that rows share."""
+        """Return the residuals (rows, m) without the errors that rows share.
+
+        Args:
+            sigma: (rows, m) standard deviations of the residuals, in their unit.
+        """
         return self.value
 
 
@@ -158,7 +168,7 @@ def parts(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[
     Args:
         measured: the block, m rows.
         seen: the predicted targets.
-        jacobian: (f, 6, m), [v; ω] of the targets per unit of each fitted parameter.
+        jacobian: (f, 6, m), velocity and angular velocity [v; ω] of the targets per unit of each fitted parameter.
 
     Raises:
         MeasurementError: no function is registered for the type.
@@ -168,7 +178,16 @@ def parts(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[
 
 @parts.register
 def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
-    """Return the residuals of poses, r = [y - p; log(R_y Rᵀ)], measured against predicted; d log = J_r⁻¹(r) ω."""
+    """Return the residuals of poses: y - p of positions, log(R_y Rᵀ) of orientations.
+
+    y, R_y are measured and p, R predicted. The derivative of the logarithm is d log = J_r⁻¹(r) ω
+    (`inverse_right_jacobian`).
+
+    Args:
+        measured: the block, m rows.
+        seen: the predicted targets.
+        jacobian: (f, 6, m), [v; ω] of the targets per unit of each fitted parameter.
+    """
     predicted = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0))
     turn = (Rotation.from_quat(measured.quaternion) * predicted.inv()).as_rotvec().T
     angular = inverse_right_jacobian(turn, jacobian[:, 3:])
@@ -181,7 +200,13 @@ def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[ResidualPar
 
 @parts.register
 def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
-    """Return the residuals of positions, r = y - p (measured minus predicted), without errors that all rows share."""
+    """Return the residuals of positions, r = y - p (measured minus predicted), without errors that all rows share.
+
+    Args:
+        measured: the block, m rows.
+        seen: the predicted targets.
+        jacobian: (f, 6, m), [v; ω] of the targets per unit of each fitted parameter.
+    """
     value = measured.position.T - seen.point
     linear = jacobian[:, :3]
     shared = 0
@@ -200,7 +225,13 @@ def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[Res
 
 @parts.register
 def _distance(measured: Distances, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
-    """Return the residuals of distances, r = L - |p_a - p_b|, for the two rows of each pair."""
+    """Return the residuals of distances, r = L - |p_a - p_b|, for the two rows of each pair.
+
+    Args:
+        measured: the block of m rows, with the measured distances L.
+        seen: the predicted targets, p_a and p_b in the two rows of a pair.
+        jacobian: (f, 6, m), [v; ω] of the targets per unit of each fitted parameter.
+    """
     first, second = _pairs(measured)
     gap = seen.point[:, first] - seen.point[:, second]
     length = np.linalg.norm(gap, axis=0)
@@ -214,7 +245,11 @@ def _distance(measured: Distances, seen: Seen, jacobian: np.ndarray) -> list[Res
 
 
 def _pairs(measured: Distances) -> tuple[np.ndarray, np.ndarray]:
-    """Return the row indices of the first and second pose of each pair."""
+    """Return the row indices of the first and second pose of each pair.
+
+    Args:
+        measured: distances, one per pair of rows.
+    """
     order = np.argsort(measured.group, kind="stable")
     groups, counts = np.unique(measured.group, return_counts=True)
     wrong = np.flatnonzero(counts != 2)
@@ -227,7 +262,13 @@ def _pairs(measured: Distances) -> tuple[np.ndarray, np.ndarray]:
 
 @parts.register
 def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
-    """Return the residuals of sockets: group mean minus p, and L - |mean_a - mean_b| for known socket distances L."""
+    """Return the residuals of sockets: group mean minus p, and L - |mean_a - mean_b| for known socket distances L.
+
+    Args:
+        measured: the block of m rows, with the socket of each.
+        seen: the predicted targets p; mean is their mean over the rows at one socket.
+        jacobian: (f, 6, m), [v; ω] of the targets per unit of each fitted parameter.
+    """
     groups, group_of_row, counts = np.unique(measured.group, return_inverse=True, return_counts=True)
     rows = np.arange(len(measured))
     average = np.zeros((len(measured), len(groups)))
@@ -262,6 +303,11 @@ def _fitted(measured: Planes | Bars, seen: Seen, jacobian: np.ndarray) -> list[R
     """Return the residuals against a plane (normal n) or a ball bar's centre c, fitted to each group of rows.
 
     For planes r = -n · (p - mean); for bars r = L - |p - c|.
+
+    Args:
+        measured: the block of m rows, with the plane or the bar (of length L) of each.
+        seen: the predicted targets p.
+        jacobian: (f, 6, m), [v; ω] of the targets per unit of each fitted parameter.
     """
     value = np.zeros(len(measured))
     slope = np.zeros((len(jacobian), len(measured)))
@@ -320,8 +366,13 @@ def _project(rows: np.ndarray, nuisance: np.ndarray) -> np.ndarray:
 def inverse_right_jacobian(turn: np.ndarray, angular: np.ndarray) -> np.ndarray:
     """Return J_r⁻¹(r) ω for rotation vectors r (3, m) and angular velocities (f, 3, m).
 
-    J_r⁻¹(r) = I + [r]×/2 + (1/θ² - (1 + cos θ)/(2 θ sin θ)) [r]×²  (Chirikjian 2012, vol. 2, eq. 10.86). Since log(R_y
-    (exp(ω) R)ᵀ) = log(exp(r) exp(-ω)), a rotation ω of the prediction changes the residual by -J_r⁻¹(r) ω.
+    J_r⁻¹(r) = I + [r]×/2 + (1/θ² - (1 + cos θ)/(2 θ sin θ)) [r]×²  with θ = |r| (Chirikjian 2012, vol. 2, eq. 10.86).
+    Since log(R_y (exp(ω) R)ᵀ) = log(exp(r) exp(-ω)), a rotation ω of the prediction changes the residual by -J_r⁻¹(r)
+    ω.
+
+    Args:
+        turn: r (3, m), rotation vectors [rad].
+        angular: ω (f, 3, m), angular velocities per unit of f parameters.
     """
     theta = np.linalg.norm(turn, axis=0)
     if theta.max(initial=0.0) < 1e-9:

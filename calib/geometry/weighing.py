@@ -213,7 +213,13 @@ def calibrated_chain(
 
 
 def _corrected_covariance(fit: GeometricFit, chain: Chain, merged: Installation) -> np.ndarray:
-    """Return the covariance of a chain's elements and its corrections; zero for parameters that were not fitted."""
+    """Return the covariance of a chain's elements and its corrections; zero for parameters that were not fitted.
+
+    Args:
+        fit: the fit with joint corrections.
+        chain: the fitted geometry.
+        merged: its installation with earlier and fitted corrections in one field (`Installation.merged`).
+    """
     names = (*chain.names, *merged.deflection.names(chain))
     source, target = [], []
     for number, name in enumerate(fit.estimate.names):
@@ -328,6 +334,10 @@ class Weigher:
         """Set `noise` from the weighted residuals of all parts.
 
         Errors shared by the rows of an image have their own noise model, and are excluded.
+
+        Args:
+            rows: number of measured numbers.
+            share: degrees of freedom per measured number.
         """
         squares = 0.0
         for piece in self.pieces:
@@ -361,7 +371,12 @@ class Weigher:
         return replace(solution, factor=solution.factor / common, cost=solution.cost / common**2)
 
     def _steady(self, before: list[Piece], noises: list[CommonNoise | None]) -> bool:
-        """Return whether robust weights, shared noises and the prior's weight are nearly those of the last pass."""
+        """Return whether robust weights, shared noises and the prior's weight are nearly those of the last pass.
+
+        Args:
+            before: residual parts of the last pass, with their robust weights.
+            noises: for each part, the shared noise of the last pass; None for a part without.
+        """
         for piece, earlier in zip(self.pieces, before):
             change = np.abs(piece.weight - earlier.weight).max(initial=0.0)
             if not change < MAX_CHANGE:
@@ -375,13 +390,20 @@ class Weigher:
         """Return the fit of the last pass with the weights of that pass.
 
         It is used where new sigmas would still change the estimate after the last pass.
+
+        Args:
+            solution: result of the last pass.
         """
         self.pieces = self.pieces_of_pass
         self.noise = self.noise_of_pass
         return self.result(solution)
 
     def _resting(self, solution: Solution) -> float:
-        """Return the effective number of parameters that are determined by their prior: Σ σ² / σ_prior²."""
+        """Return the effective number of parameters that are determined by their prior: Σ σ² / σ_prior².
+
+        Args:
+            solution: result of a pass.
+        """
         if self.prior is None:
             return 0.0
         return float(np.sum(np.diag(covariance(solution.factor)) * self._precision()))
@@ -396,12 +418,19 @@ class Weigher:
         """Return the prior's residuals (f,) for an installation, each multiplied by the root of its precision.
 
         Zero for parameters without a prior.
+
+        Args:
+            state: the installation.
         """
         change = parameter_values(self.nominal) - parameter_values(state)
         return change[self.free] * np.sqrt(self._precision())
 
     def linearise(self, state: Installation) -> Reduced:
-        """Return the whitened least-squares problem at an installation, with the prior, reduced by QR decomposition."""
+        """Return the whitened least-squares problem at an installation, with the prior, reduced by QR decomposition.
+
+        Args:
+            state: the installation at which derivatives are computed.
+        """
         prior_rows = list[Rows]()
         statistics = list[Gram]()
         if self.prior is not None:
@@ -496,19 +525,38 @@ class Weigher:
 
 
 def _rows(cell: Installation, free: np.ndarray, blocks: list[Block], pieces: list[Piece]) -> Iterator[Rows]:
-    """Yield the residuals of all blocks and their Jacobians, whitened with the sigmas and weights in `pieces`."""
+    """Yield the residuals of all blocks and their Jacobians, whitened with the sigmas and weights in `pieces`.
+
+    Args:
+        cell: the installation at which derivatives are computed.
+        free: (f,) indices of the fitted parameters.
+        blocks: the prepared measurements.
+        pieces: residual parts of all blocks, with sigmas and weights.
+    """
     for number, block in enumerate(blocks):
         noises = [piece.part.noise for piece in pieces if piece.block == number]
         yield from whitened(cell, block, free, _scales(pieces, number), noises)
 
 
 def _scales(pieces: list[Piece], number: int) -> list[np.ndarray]:
-    """Return the divisors (rows, m) of a block's residual parts: sigma over the root of the robust weight."""
+    """Return the divisors (rows, m) of a block's residual parts: sigma over the root of the robust weight.
+
+    Args:
+        pieces: residual parts of all blocks.
+        number: index of the block.
+    """
     return [piece.sigma / np.sqrt(piece.weight) for piece in pieces if piece.block == number]
 
 
 def _sigma(part: ResidualPart, share: float, start: bool, robustly: bool) -> np.ndarray:
-    """Return the standard deviations (rows, m) of a part: stated in the file, or estimated from the residuals."""
+    """Return the standard deviations (rows, m) of a part: stated in the file, or estimated from the residuals.
+
+    Args:
+        part: residuals in m or rad.
+        share: degrees of freedom per measured number; the estimated variance is divided by it.
+        start: True before the first pass: a typical value is returned in place of an estimate.
+        robustly: True estimates from the median of the residuals, False from their rms.
+    """
     if part.sigma is not None:
         return part.sigma
     if start:
@@ -521,5 +569,10 @@ def _sigma(part: ResidualPart, share: float, start: bool, robustly: bool) -> np.
 
 
 def _size(part: ResidualPart, sigma: np.ndarray) -> np.ndarray:
-    """Return the size (m,) of each row's residual in sigmas, rms over its components, without noise that rows share."""
+    """Return the size (m,) of each row's residual in sigmas, rms over its components, without noise that rows share.
+
+    Args:
+        part: residuals of m rows.
+        sigma: (rows, m) standard deviations of the residuals, in their unit.
+    """
     return np.sqrt(np.mean((part.alone(sigma) / sigma) ** 2, axis=0))

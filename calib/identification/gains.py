@@ -135,6 +135,8 @@ def identify_gains(
 ) -> DriveGains:
     """Return the drive gains estimated from R factors of [W P | i], one group per joint.
 
+    W are the columns of the robot's base parameters, P those of the payload's parameters, i the currents.
+
     Args:
         currents: R factors with the columns of a model with payload, and the currents as target.
         payload: parameters of known value (a payload's mass, its centre of mass), in SI units.
@@ -232,7 +234,8 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
     that diverged most counts as not identified.
 
     Args:
-        data: R factors of [W i] by time block and joint, group = block · joints + joint.
+        data: R factors of [W i] (columns of the base parameters, and currents) by time block and joint, group = block ·
+            joints + joint.
         joints: number of joints.
         inflation: (joints,) variance inflation, i.e. number of rows that count as one.
         reference: joint whose gain is 1, from 0.
@@ -276,7 +279,16 @@ def _jackknife(
     reference: int,
     unidentified: tuple[int, ...],
 ) -> np.ndarray:
-    """Return jackknife standard deviations of the log gains (joints,); zero with fewer than three time blocks."""
+    """Return jackknife standard deviations of the log gains (joints,); zero with fewer than three time blocks.
+
+    Args:
+        data: R factors by time block and joint.
+        blocks: numbers of the time blocks, each omitted in turn.
+        fit: gains from all blocks, with which each search starts.
+        inflation: (joints,) variance inflation.
+        reference: joint whose gain is 1, from 0.
+        unidentified: joints whose gain is fixed at 1.
+    """
     joints = len(fit.gains)
     if len(blocks) <= 2:
         return np.zeros(joints)
@@ -337,7 +349,14 @@ def _start(columns: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.nda
 
 
 def _parameters(columns: np.ndarray, load: np.ndarray, current: np.ndarray, gains: np.ndarray) -> np.ndarray:
-    """Return the least-squares parameters (p,) for given gains (n,)."""
+    """Return the least-squares parameters (p,) for given gains (n,).
+
+    Args:
+        columns: (n, rows, p) W, R factor of each joint.
+        load: (n, rows) torques of the known parameters.
+        current: (n, rows) currents.
+        gains: (n,) torque per current.
+    """
     matrix = columns / gains[:, None, None]
     target = current - load / gains[:, None]
     flat = matrix.reshape(-1, columns.shape[2])

@@ -26,7 +26,7 @@ from calib.identification.methods.least_squares import LeastSquares
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
 from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
-from calib.identification.registry import METHODS, method_named
+from calib.identification.registry import METHODS, TAKING_FUNCTIONS, method_named, under_constraints
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
 from calib.identification.standstill import (
@@ -153,7 +153,8 @@ def identify_model(
     Args:
         model: model of a serial chain, or any other `RegressorModel`.
         cases: training recordings, with the torques of the model's rows as targets.
-        settings: settings of the identification; drives, payloads and gravity are taken from `model`.
+        settings: settings of the identification, whose drives, payloads and gravity are ignored (`model` has its own);
+            None: the defaults.
         nominal: the same model on the geometry on which base columns are chosen; None: `model`.
         states: states at which base columns are compared; None: random states of the model.
         cad: the bodies' parameters from the robot's description; None if it has no masses.
@@ -171,6 +172,8 @@ def identify_model(
     require(cases, "no recording to identify the model from: give at least one", UsageError)
     method = method_named(settings.method)
     settings = require_usable(settings, method)
+    method, constraints = under_constraints(method, settings.constraints)
+    settings = replace(settings, constraints=constraints)
     _require_constrainable(method, settings)
     _require_motion(cases)
     noise = _repeats_noise(cases, settings)
@@ -252,7 +255,7 @@ def _first_fit(
         rows: rows of all recordings.
         find: function of the rows that returns their prior.
         takes_prior: whether to use a prior.
-        noise: (rows,) stated torque noise; None: from the residuals.
+        noise: (rows,) stated standard deviation of the torque noise, up to a common factor; None: from the residuals.
     """
     if takes_prior:
         prior = find(rows)
@@ -263,7 +266,13 @@ def _first_fit(
 def _left_out_error(
     fitted: _Fitted, reference_rows: Sequence[ObservationRows], settings: IdentificationSettings
 ) -> float:
-    """Return the cross-validated squared error of a first fit on the reference rows of held-out time blocks."""
+    """Return the cross-validated squared error of a first fit on the reference rows of held-out time blocks.
+
+    Args:
+        fitted: rows with a treatment of standstills, their prior and first fit.
+        reference_rows: the same samples with their standstills marked; the error is that of their rows in motion.
+        settings: settings, which exclude torques of another unit.
+    """
     rows, prior, first = fitted
     prior_rows = None
     if prior is not None:
@@ -303,7 +312,12 @@ def _weighed_after_standstills(
 
 
 def _terms_of(model: RegressorModel, base: Base) -> list[DriveTerm | None]:
-    """Return the drive term of each base parameter; None for parameters of bodies."""
+    """Return the drive term of each base parameter; None for parameters of bodies.
+
+    Args:
+        model: the model.
+        base: its base parameters.
+    """
     terms: list[DriveTerm | None] = []
     for column in base.kept:
         if column < model.inertial:
@@ -322,6 +336,14 @@ def _observed(
     method: Method,
 ) -> tuple[list[ObservationRows], list[ObservationRows]]:
     """Return the rows of all cases in the base columns with numbered time blocks, without and with marked standstills.
+
+    Args:
+        model: the model.
+        base: its base parameters.
+        cases: recordings.
+        decimator: filter and decimation of the rows.
+        settings: settings: number of time blocks, smoothing of the Coulomb sign.
+        method: the method; standstills are marked only for least squares.
 
     Raises:
         MeasurementError: if there are fewer rows than twice the number of base parameters.
@@ -350,7 +372,15 @@ def _identified(
     settings: IdentificationSettings,
     say: Progress,
 ) -> Identification[RegressorModel]:
-    """Return the identification of a problem by a method: estimate, simulated loop, ripple, essential parameters."""
+    """Return the identification of a problem by a method: estimate, simulated loop, ripple, essential parameters.
+
+    Args:
+        problem: data and settings of the estimation.
+        method: the method.
+        friction: selected friction terms.
+        settings: settings of the identification.
+        say: function that is called with a short text at each stage.
+    """
     model = problem.model
     base = problem.base
     cases = problem.cases
@@ -393,7 +423,13 @@ def _identified(
 
 
 def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:
-    """Return random states of a chain's model within the chain's joint limits."""
+    """Return random states of a chain's model within the chain's joint limits.
+
+    Args:
+        chain: the arm.
+        model: its model.
+        seed: seed of random numbers.
+    """
     lower, upper = chain.sampling_limits()
     return bases.random_samples(model, seed=seed, lower=lower, upper=upper)
 
@@ -414,7 +450,7 @@ def find_base(
 
 
 def _torque_limits(chain: Chain) -> np.ndarray | None:
-    """Return the joints' torque limits (n,) from the robot's description; None if any limit is missing."""
+    """Return the torque limits (n,) [N m or N] of the joints of `chain`; None if any limit is missing."""
     limits = np.array([joint.effort for joint in chain.joints])
     usable = np.isfinite(limits) & (limits > 0.0)
     return limits if usable.all() else None
@@ -439,6 +475,17 @@ def _richer_friction(
     """Return the friction terms selected on held-out time, and for each case the transmitted torques (N, n).
 
     Load-dependent friction depends on the transmitted torques; these are None if no tested term needs them.
+
+    Args:
+        model: the model with standard friction.
+        base: its base parameters.
+        rows: rows of all cases.
+        cases: recordings.
+        decimator: filter and decimation of the rows.
+        first: first fit, which gives row weights and predicts transmitted torques.
+        prior: prior of the base parameters; None without one.
+        settings: settings of the identification.
+        progress: function that is called with a short text at each step; None: not called.
     """
     loads: list[np.ndarray | None] = [None] * len(cases)
     if not _has_drives(model):
@@ -477,6 +524,12 @@ def _with_ripple(
     """Return the model with gear ripple identified from its residuals, and the ripple of all joints.
 
     Without a request in the settings, the model is unchanged and there is no ripple.
+
+    Args:
+        dynamics: the identified model.
+        cases: recordings.
+        settings: settings of the identification.
+        say: function that is called with a short text.
     """
     model = dynamics.model
     if not _has_drives(model) or not model.torque_rows.motors_alone or settings.friction not in ("auto", "ripple"):
@@ -495,7 +548,13 @@ def _with_ripple(
 def _with_payloads(
     dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings
 ) -> Dynamics[RegressorModel]:
-    """Return the model with known parameters set for payloads that are in no training recording."""
+    """Return the model with known parameters set for payloads that are in no training recording.
+
+    Args:
+        dynamics: the identified model.
+        cases: training recordings.
+        settings: settings, with known masses of payloads.
+    """
     model = dynamics.model
     values = np.array(dynamics.values)
     for label, payload in settings.payloads.items():
@@ -512,6 +571,10 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
 
     If this gives more than ``settings.samples`` rows, only every second, third, … row is used. The band is not reduced:
     long recordings have redundant rows, but fast motion is identified only in a wide band.
+
+    Args:
+        cases: recordings.
+        settings: settings, with the largest number of rows.
 
     Raises:
         MeasurementError: if the sampling rates of the cases differ.
@@ -530,6 +593,10 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
 
 def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
     """Return the torque noise (rows,) from repetitions of the motion, rms over the cases; None if not requested.
+
+    Args:
+        cases: recordings that are averages over repetitions.
+        settings: settings, which request this noise by `weights`.
 
     Raises:
         UsageError: for a method other than WLS, or rows other than motor torques.
@@ -565,6 +632,12 @@ def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> n
 def _takes_prior(method: Method, model: RegressorModel, settings: IdentificationSettings, source: str) -> bool:
     """Return whether the parameters get a prior: it is requested, and method and model support it.
 
+    Args:
+        method: the method.
+        model: the model.
+        settings: settings, which request the prior.
+        source: source of the prior, ``cad`` or ``sizes``.
+
     Raises:
         UsageError: if a CAD prior is requested, but the description has no masses.
     """
@@ -574,7 +647,12 @@ def _takes_prior(method: Method, model: RegressorModel, settings: Identification
 
 
 def _essential(fit: MethodEstimate, settings: IdentificationSettings) -> Elimination | None:
-    """Return the elimination to the essential parameters; None if it is not requested."""
+    """Return the elimination to the essential parameters; None if it is not requested.
+
+    Args:
+        fit: the estimate of base parameters and friction.
+        settings: settings: rule of the elimination, parameters to keep and to drop.
+    """
     if settings.essential == "none":
         return None
     data, std, inflation = fit.testable()
@@ -587,7 +665,7 @@ def _essential(fit: MethodEstimate, settings: IdentificationSettings) -> Elimina
 
 
 def _require_constrainable(method: Method, settings: IdentificationSettings) -> None:
-    """Raise a UsageError for constraints that the method does not support."""
+    """Raise a UsageError if the settings contain constraints that the method does not support."""
     if settings.constraints is None or method.takes_constraints:
         return
     supporting = [name for name, candidate in METHODS.items() if candidate.takes_constraints]
@@ -595,6 +673,8 @@ def _require_constrainable(method: Method, settings: IdentificationSettings) -> 
     advice = f"methods that support them: {', '.join(supporting)}"
     if constrained in supporting:
         advice = f"use '{constrained}'"
+    if settings.constraints.by_function:
+        advice = f"methods that do: {', '.join([*TAKING_FUNCTIONS, *supporting])}"
     raise UsageError(f"[constraints]: method '{method.name}' does not support them; {advice}")
 
 

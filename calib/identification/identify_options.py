@@ -73,7 +73,9 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     loaded = "run_load.npz"          # the same motion with the payload
     [loop]                           # the closed loop they came from: see calib.identification.loop
     controller = "identify"
-    [constraints]                    # what parameters must satisfy, for the methods pc-*
+    [constraints]                    # what parameters must satisfy, for the methods pc-*; with a file ols, wls, iv, too
+    file = "constraints.py"          # a Python file that is executed: its function constraints(beta) returns a list of
+                                     # CVXPY constraints: [beta["M3"] >= 2, cp.norm(beta["MX2", "MY2"]) <= 0.3]
     signs = true                     # inertia and friction of drives are not negative
     inertia = 50                     # random postures in which M(q) is positive definite; 0: not asked
     bodies = false                   # of bodies that can exist (pseudo-inertias), in place of M(q) over postures
@@ -104,7 +106,7 @@ from calib.data.signals.motion import FilterOptions
 from calib.dynamics.drives import term
 from calib.dynamics.shapes import SHAPES
 from calib.dynamics.torque_rows import MOTOR, ROWS
-from calib.errors import CalibError, UsageError, refuse_option, refused_as
+from calib.errors import CalibError, UsageError, refuse_option, refused_as, require
 from calib.identification.settings import Choices, Coupling, IdentificationSettings, Payload
 
 USED = 600_000
@@ -223,7 +225,11 @@ class IdentifyOptions:
     source: str = ""
 
     def file_settings(self, path: str | Path) -> FileSettings:
-        """Return the settings of a recording (or a cut of one), including which torques its rows need."""
+        """Return the settings of a recording (or a cut of one), including which torques its rows need.
+
+        Args:
+            path: the recording, as the user stated it.
+        """
         settings = own_table(self.files, parse_cut(str(path))[0]) or self.every
         rows = self.settings.torque_rows
         samples = settings.recording.samples or USED
@@ -241,7 +247,15 @@ def read_options(path: str | Path | None = None) -> IdentifyOptions:
     """
     if path is None:
         return IdentifyOptions()
-    return parse_options(read_toml(path), str(path))
+    options = parse_options(read_toml(path), str(path))
+    constraints = options.settings.constraints
+    if constraints is None or not constraints.file:
+        return options
+    file = str((Path(path).parent / constraints.file).resolve())
+    constraints = replace(constraints, file=file)
+    # an error of the file is told before recordings are read
+    require(callable(constraints.function), f"{file}: no function", UsageError)
+    return replace(options, settings=replace(options.settings, constraints=constraints))
 
 
 def parse_options(table: Mapping[str, object], source: str = "options") -> IdentifyOptions:

@@ -34,6 +34,11 @@ def with_link_motion(robot: CalibratedChain, case: Case, settings: Identificatio
     """Return a case with the motion of its links (`Case.link`) according to the robot's joint corrections.
 
     Without joint corrections, or if the settings ignore them, the case is returned unchanged.
+
+    Args:
+        robot: the calibrated robot, with or without joint corrections.
+        case: the recording, with the motion of the motors.
+        settings: settings, which may ignore corrections (`deflections`).
     """
     simulated = settings.loop is not None or method_named(settings.method).needs_simulation
     rigid = simulated or not settings.deflections or settings.torque_rows == POWER
@@ -56,7 +61,12 @@ def with_link_motion(robot: CalibratedChain, case: Case, settings: Identificatio
 
 
 def joint_terms(chain: Chain, deflection: Deflection) -> Deflection:
-    """Return the correction terms that move joints, which the dynamics use; other terms are omitted."""
+    """Return the correction terms that move joints, which the dynamics use; other terms are omitted.
+
+    Args:
+        chain: the arm, which shows the elements that joints move.
+        deflection: joint corrections of a geometric fit.
+    """
     mask = np.isin(target_elements(chain, deflection), chain.moving)
     return chosen_terms(deflection, mask)
 
@@ -68,7 +78,13 @@ def chosen_terms(deflection: Deflection, mask: np.ndarray) -> Deflection:
 
 
 def bodies_torques(terms: Deflection, case: Case, settings: IdentificationSettings) -> np.ndarray | None:
-    """Return the bodies' low-passed torques (N, n) [N m or N] along a case; None if no correction needs them."""
+    """Return the bodies' low-passed torques (N, n) [N m or N] along a case; None if no correction needs them.
+
+    Args:
+        terms: correction terms that move joints.
+        case: the recording.
+        settings: settings of the identification, with payloads and gravity.
+    """
     if not any(term.basis == "torque" for term in terms.terms) or terms.reference is None:
         return None
     model = make_model(terms.reference, settings)
@@ -91,7 +107,7 @@ def motion_of_bases(terms: Deflection, motion: Motion, torque: np.ndarray | None
     Args:
         terms: E correction terms.
         motion: motion of the joints.
-        torque: (N, n) torques of the bodies; None if no term depends on torque.
+        torque: (N, n) torques of the bodies [N m or N]; None if no term depends on torque.
     """
     result = np.zeros((3, len(terms.terms), len(motion)))
     result[0] = evaluate(terms, motion.q, torque)

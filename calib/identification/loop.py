@@ -126,6 +126,10 @@ class LoopSettings:
     def per_joint(self, key: str, n: int) -> np.ndarray:
         """Return the n values of a key, which has one value for all joints or one per joint.
 
+        Args:
+            key: name of the setting.
+            n: number of joints.
+
         Raises:
             UsageError: for another number of values.
         """
@@ -178,9 +182,9 @@ class LoopController:
         kp, kd, ki: (n,) gains [N m/rad, N m s/rad, N m/(rad s)], with N and m for a prismatic joint; for computed
             torque [1/s², 1/s, 1/s³].
         share: (n,) share of the reference velocity in the velocity loop: 1 in a PD, less in some cascades.
-        limit: (n,) torque limit.
+        limit: (n,) torque limit [N m or N].
         windup: (n,) limit of the error's integral [rad s].
-        ahead: (N, n) feedforward torque at the reference's instants; None: no feedforward.
+        ahead: (N, n) feedforward torque at the reference's instants [N m or N]; None: no feedforward.
         model: (10 B,) standard parameters of the controller's model (computed torque); None: no model.
         delay: control periods from measurement to torque.
         cutoff: cut-off of the low-pass on the measured velocity [Hz]; None: no low-pass.
@@ -235,7 +239,7 @@ class LoopController:
         return replace(self, kp=kp, kd=kd, ki=ki)
 
     def with_feedforward(self, ahead: np.ndarray) -> LoopController:
-        """Return the controller with the feedforward torques `ahead` (N, n), which replace earlier ones."""
+        """Return the controller with the feedforward torques `ahead` (N, n) [N m or N], which replace earlier ones."""
         return replace(self, ahead=frozen(ahead))
 
 
@@ -259,7 +263,11 @@ class ExogeneityTest:
         return self.biased()
 
     def biased(self, level: float = 0.01) -> bool:
-        """Return whether the test shows, at this significance level, that least squares is biased; use IV then."""
+        """Return whether the test shows, at this significance level, that least squares is biased; use IV then.
+
+        Args:
+            level: probability of this result if least squares is unbiased.
+        """
         return self.p < level
 
 

@@ -14,8 +14,10 @@ the joint's torque, friction and motor inertia are in amperes of its own motor, 
 
 ``torques_N.csv``: ``t [s]``, then ``measured_joint1 [N m]`` ... and predicted_ ... of each torque row and the joints
 ``q_joint1 [rad]`` ..., then sigma_ ... of each torque row, the standard deviation expected of measured - predicted
-(1.96 of them hold 95 %), ``extrapolated``, 1 where the motion leaves the training range, and, of recordings without a
-payload, v_ ... a_ ... (the joints' speeds and accelerations, filtered); thinned to about 100 Hz. ``calib identify``
+(1.96 of them hold 95 %), ``extrapolated``, 1 where the motion leaves the training range, nominal_ ... of each torque
+row where the robot's geometry was calibrated (the torque of the model that the same recordings give on the nominal
+geometry), and, of recordings without a payload, v_ ... a_ ... (the joints' speeds and accelerations, filtered); thinned
+to about 100 Hz. ``calib identify``
 writes ``torques_1.csv`` alone, of the first validation recording (without one, of the first to learn from); a session
 writes one per validation recording.
 
@@ -31,7 +33,8 @@ essential), ``condition_number`` (raw, and with columns of unit norm), ``frictio
 ``loop``, ``tracking`` by file (or ``tracking_failure``), ``filters`` by file, ``geometry``, ``warnings`` and the
 findings behind them, ``noticed`` (code, values; `calib explain CODE`), ``verdict``, its ``reason``, and ``code`` and
 ``advice`` of the finding that decided it, ``error_density`` of each row (variance of its errors over the independent
-rows per second), ``seed``, ``schema`` (3; files without one are of earlier versions and are
+rows per second), ``error_growth`` (share of this variance that grows with the variance of the row's torque,
+``torque_variance``, on another motion), ``seed``, ``schema`` (3; files without one are of earlier versions and are
 read, too). No number: null.
 
 Figures: those of the report, as ``plot_torque_N.png`` of every unseen recording in the order given, of those to learn
@@ -210,6 +213,10 @@ def regrouping(base: Base) -> dict[str, dict[str, float]]:
 
 def from_table(chain: Chain, table: ParsedTable) -> Dynamics:
     """Return the model of a chain from a table of `to_table`.
+
+    Args:
+        chain: the arm.
+        table: the content of ``dynamics.json``.
 
     Raises:
         KeyError, TypeError, ValueError, IndexError: for a damaged table.

@@ -133,46 +133,43 @@ class Score:
     band: Number = np.nan
 
     @property
-    def noisy(self) -> bool:
-        """Whether noise would decide the verdict.
+    def floor_dominates(self) -> bool:
+        """Whether most of the squared error is above the identification band, where the motion predicts no torque."""
+        return 2.0 * self.floor_percent**2 > self.counted(in_band=False).total ** 2
 
-        The raw error does not pass, and most of its square is above the identification band, where the motion predicts
-        no torque.
-        """
-        return self.raw.total > PASSING_SHARE and 2.0 * self.floor_percent**2 > self.raw.total**2
+    @property
+    def noisy(self) -> bool:
+        """Whether noise would decide the verdict: the error does not pass, and most of it is above the band."""
+        return self.floor_dominates and self.counted(in_band=False).total > PASSING_SHARE
 
     @property
     def stands(self) -> bool:
         """Whether joints are at rest for a noticeable part of the recording, in addition to reversals."""
         return self.motion_share < 1.0 - REST_SHARE and self.moving.samples > 0
 
-    @property
-    def judged(self) -> PredictionErrors:
-        """Errors that the verdict uses: errors of moving joints, or all errors if no joint is at rest.
+    def counted(self, in_band: bool) -> PredictionErrors:
+        """Return the errors of moving joints, or all errors if no joint is at rest.
 
-        Friction at rest is undetermined, so that errors at rest do not count. In a `noisy` recording the errors in the
-        identification band count, since those above it say nothing about the model.
+        Friction at rest is undetermined, so that errors at rest do not count.
+
+        Args:
+            in_band: whether only errors in the identification band count.
         """
-        if not self.noisy:
+        if not in_band:
             return self.moving if self.stands else self.raw
         if self.stands and self.moving_in_band is not None:
             return self.moving_in_band
         return self.filtered
 
-    def without_floor(self, percent: float) -> float:
-        """Return an unexplained share of the raw torque [%] as this recording is judged: without `floor_percent`.
-
-        Args:
-            percent: unexplained share of the raw torque by another model, such as the exported robot's [%].
-        """
-        if not self.noisy:
-            return percent
-        return float(np.sqrt(max(percent**2 - self.floor_percent**2, 0.0)))
+    @property
+    def judged(self) -> PredictionErrors:
+        """Errors that the verdict uses: in a `noisy` recording those in the identification band."""
+        return self.counted(in_band=self.noisy)
 
     @property
     def above_band(self) -> str:
         """Text on the unexplained share of the torque with all frequencies; empty unless the recording is `noisy`."""
-        return f"{self.raw.total:.2f} %" if self.noisy else ""
+        return f"{self.counted(in_band=False).total:.2f} %" if self.noisy else ""
 
     @property
     def at_rest(self) -> str:
@@ -181,13 +178,13 @@ class Score:
 
 
 def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray) -> float:
-    """Return the standard error of 100 ‖τ - τ̂‖ / ‖τ‖ [%], by a jackknife over blocks of time.
+    """Return the standard error of 100 ‖τ - τ̂‖ / ‖τ‖ [%] (measured τ, predicted τ̂), by a jackknife over time blocks.
 
     Blocks are used because residuals are autocorrelated (Efron and Tibshirani 1993, eq. 11.5, with blocks instead of
     samples: Künsch 1989); ten blocks are our choice.
 
     Args:
-        measured, predicted: (rows, N) torques.
+        measured, predicted: (rows, N) torques τ and τ̂, in one unit.
 
     Returns:
         the standard error; NaN if there are fewer than two samples for each block, or no torque.
@@ -214,10 +211,10 @@ def score(
 
     Args:
         case: the recording.
-        predicted: (N, rows) torques.
+        predicted: (N, rows) predicted torques, in the unit of the recorded ones.
         slow: share of a joint's peak speed below which the joint counts as at rest, or one speed per joint [rad/s or
             m/s]; None: the default of `calib.data.signals.motion.moving`.
-        apart: rows in a different unit, excluded from totals.
+        apart: indices of rows in a different unit, excluded from totals.
     """
     motion = case.motion
     moves = moving(motion) if slow is None else moving(motion, slow)
@@ -315,7 +312,13 @@ def _score_row(
 
 
 def _sums(target: np.ndarray, residual: np.ndarray, selected: np.ndarray) -> tuple[float, float, float]:
-    """Return Σ (τ - τ̂)², Σ τ² and the number of samples, over the selected samples."""
+    """Return Σ (τ - τ̂)², Σ τ² and the number of samples, over the selected samples.
+
+    Args:
+        target: torques τ of all samples.
+        residual: their prediction errors τ - τ̂.
+        selected: mask of the samples to count.
+    """
     residual_square = float(np.sum(residual[selected] ** 2))
     target_square = float(np.sum(target[selected] ** 2))
     return residual_square, target_square, float(selected.sum())
@@ -325,6 +328,10 @@ def _prediction_errors(sums: np.ndarray, apart: Sequence[int]) -> PredictionErro
     """Return prediction errors from sums (rows, 3) of the torque rows: Σ (τ - τ̂)², Σ τ² and number of samples.
 
     The total excludes the rows `apart`.
+
+    Args:
+        sums: one row per torque row.
+        apart: indices of rows in a different unit.
     """
     square, size, count = np.array(sums).T
     same_unit = ~np.isin(np.arange(len(square)), apart)
@@ -342,6 +349,10 @@ def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | N
     """Return the whiteness test of each row of decimated residuals (M, rows), in the longest segment.
 
     The test is None for a row with too few samples or without variation.
+
+    Args:
+        residual: residuals τ - τ̂ at the decimated samples.
+        segment: (M,) number of the gap-free segment of each sample.
     """
     tests: list[Whiteness | None] = []
     for column in residual[longest(segment)].T:
@@ -382,7 +393,11 @@ class Dynamics(Frozen, Generic[Model]):
 def predict(dynamics: Dynamics[RegressorModel], case: Case) -> np.ndarray:
     """Return the predicted torques (N, rows) of a case at the full rate [N m or N]: W(q, v, a) · values.
 
-    W is not computed.
+    The regressor W is not computed.
+
+    Args:
+        dynamics: the model with its parameter values.
+        case: the recording.
     """
     model, motion = dynamics.model, case.motion
     states = segmented_states(model.columns, case)

@@ -100,7 +100,7 @@ class FirstFit(NamedTuple):
     """A first fit of the base parameters, which gives the row weights.
 
     Attributes:
-        std, inflation: (rows,) standard deviation and variance inflation of its residuals.
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation of its residuals.
         values: (b,) base parameters.
         rest_weights: weights of standstills.
     """
@@ -133,7 +133,7 @@ class Prior:
 
     @property
     def rows(self) -> np.ndarray:
-        """The prior as whitened rows (b, b + 1) of [W y]."""
+        """The prior as whitened rows (b, b + 1), to be appended to the rows [W y] of observation matrix and torques."""
         unit = np.sqrt(np.diag(self.covariance))
         lower = np.linalg.cholesky(self.covariance / np.outer(unit, unit))
         inverse = scipy.linalg.solve_triangular(lower, np.diag(1.0 / unit), lower=True)
@@ -199,7 +199,7 @@ def find_prior(
         rows: rows in the base columns, followed by those of additional friction.
         robot: u, the bodies' parameters up to a factor; None: unknown.
         source: source of `robot`: ``cad`` or ``sizes``.
-        noise: (rows,) standard deviation of the torques up to a common factor; None: from the residuals.
+        noise: (rows,) standard deviation of the torques' noise, up to a common factor; None: from the residuals.
         groups: (k,) group of each column of additional friction, which have one size per group; None: there are no such
             columns.
         start: prior with which the search starts, e.g. without additional friction; None: none.
@@ -274,7 +274,7 @@ def first_fit(rows: Sequence[ObservationRows], noise: np.ndarray | None = None) 
 
     Args:
         rows: rows of all recordings.
-        noise: (rows,) standard deviation of the torques up to a common factor; None: from the residuals.
+        noise: (rows,) standard deviation of the torques' noise, up to a common factor; None: from the residuals.
     """
     row_count = rows[0].target.shape[1]
     parts = divided(rows)
@@ -309,8 +309,9 @@ def weighing(
         rows: rows of all recordings.
         data: R factors of the rows, one group per torque row.
         values, covariance: (p,), (p, p) the estimate.
-        std, inflation: (rows,) values with which the estimate was weighted.
-        noise: (rows,) standard deviation of the torques up to a common factor; None: from the residuals.
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation with which the estimate was
+            weighted.
+        noise: (rows,) standard deviation of the torques' noise, up to a common factor; None: from the residuals.
     """
     columns = data.factors[:, :, :-1]
     parameters_of_row = np.einsum("gik,gik->g", columns @ covariance, columns) / (std**2 * inflation)
@@ -334,8 +335,8 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
     for white noise, equal for all joints, is thereby irrelevant.
 
     Args:
-        noise: (rows,) stated noise; None: no noise is stated.
-        std: (rows,) standard deviations of the residuals.
+        noise: (rows,) stated standard deviation of the torques' noise, up to a common factor; None: none is stated.
+        std: (rows,) standard deviations of the residuals [N m or N].
         counts: (rows,) numbers of residuals.
     """
     if noise is None:
@@ -499,6 +500,11 @@ def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.nda
     """Return the standard parameters (B, 10) of rods from each body's frame to the next.
 
     Masses are proportional to length plus thickness, with `total` [kg] as their sum. A payload is a ball of fixed mass.
+
+    Args:
+        chain: the arm, which gives the frames.
+        model: its model, with B bodies.
+        total: sum of the masses [kg].
     """
     bodies = model.bodies
     moves = bodies.coordinates >= 0
@@ -523,6 +529,8 @@ def tempered_prior(
     find: Callable[..., Prior], prior: Prior, rows: Sequence[ObservationRows], regimes: Regimes
 ) -> Prior:
     """Return the prior with the tempering that best predicts held-out ranges of motion.
+
+    Tempering is the prior's weight for the values, relative to its weight for their covariance.
 
     The criterion is the squared error of all rows, in units of their residuals, as geometric mean over the ranges, so
     that a range with large errors for every prior does not dominate. A stronger prior must be better by

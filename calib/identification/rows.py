@@ -117,6 +117,9 @@ def make_case(
 def case_names(paths: Sequence[str]) -> tuple[str, ...]:
     """Return a unique name for each recording: the file's name, with the cut or the folder if needed.
 
+    Args:
+        paths: recordings, each with a cut such as ``@0:9.4`` or without.
+
     Raises:
         UsageError: if the same recording and cut occurs twice.
     """
@@ -135,7 +138,11 @@ def case_names(paths: Sequence[str]) -> tuple[str, ...]:
 
 
 def _file(path: str) -> str:
-    """Return the name of a recording's file, without its folder and cut."""
+    """Return the name of a recording's file, without its folder and cut.
+
+    Args:
+        path: the recording, with or without a cut.
+    """
     from calib.data.recordings.recording import parse_cut
 
     file, *_ = parse_cut(path)
@@ -164,7 +171,7 @@ class ObservationRows:
     Attributes:
         names, units: names and units of the p columns.
         matrix: (M, rows, p) observation matrix W.
-        target: (M, rows) torques y.
+        target: (M, rows) torques y [N m or N].
         present: (M, rows) mask of rows used for training.
         block: (M,) number of the time block, for cross-validation; -1 near a cut between blocks.
         rate: sampling rate [Hz].
@@ -235,6 +242,10 @@ class ObservationRows:
         """Return the rows with the columns (M, rows, k) of drive terms appended.
 
         Columns whose value at rest is unknown are set to zero in standstills.
+
+        Args:
+            terms: k drive terms.
+            columns: their columns, from `observe_terms`.
         """
         if not terms:
             return self
@@ -366,7 +377,7 @@ def observe_terms(
         terms: k drive terms.
         case: the recording.
         decimator: filter and decimation.
-        load: (N, n) transmitted torques; None if no term depends on them.
+        load: (N, n) torques that the gears transmit [N m or N]; None if no term depends on them.
         torque_rows: kind of torques in the rows.
     """
     segment = case.motion.segment
@@ -383,7 +394,10 @@ def observe_terms(
 def term_columns(term: DriveTerm, case: Case, load: np.ndarray | None = None) -> Iterator[tuple[int, np.ndarray]]:
     """Yield each torque row that a drive term acts on, with the term's column (N,) at the full rate.
 
-    `load` (N, n) are the transmitted torques; None if the term does not depend on them.
+    Args:
+        term: the drive term.
+        case: the recording.
+        load: (N, n) torques that the gears transmit [N m or N]; None if the term does not depend on them.
     """
     motion = case.motion
     load_of_joints = None if load is None else load.T
@@ -392,7 +406,12 @@ def term_columns(term: DriveTerm, case: Case, load: np.ndarray | None = None) ->
 
 
 def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:
-    """Return the states (s, N) of friction with hysteresis along a case; they are zero at the start of each segment."""
+    """Return the states (s, N) of friction with hysteresis along a case; they are zero at the start of each segment.
+
+    Args:
+        terms: drive terms; s is 0 if none of them has hysteresis.
+        case: the recording.
+    """
     motion = case.motion
     states = []
     for start, stop in segments(motion.segment):
@@ -401,7 +420,11 @@ def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:
 
 
 def segments(segment: np.ndarray) -> list[tuple[int, int]]:
-    """Return (start, stop) of each run of equal numbers in an array (N,)."""
+    """Return (start, stop) of each run of equal numbers in an array (N,).
+
+    Args:
+        segment: (N,) segment number of each sample.
+    """
     changes = np.flatnonzero(np.diff(segment)) + 1
     edges = np.concatenate([[0], changes, [len(segment)]])
     return list(pairwise(edges.tolist()))
@@ -412,6 +435,10 @@ def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[Observa
 
     Blocks are contiguous, about `count` in all, with at least one per case. Samples within `CUT_MARGIN` of a cut
     between blocks get -1, since the filter's window extends across the cut.
+
+    Args:
+        all_rows: rows of all cases.
+        count: approximate number of blocks.
     """
     total = sum(len(rows.target) for rows in all_rows)
     numbered = []
@@ -477,7 +504,14 @@ def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Tri
 
 
 def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarray) -> np.ndarray:
-    """Return the regressor (N_i, rows, p) for a part of the samples."""
+    """Return the regressor (N_i, rows, p) for a part of the samples.
+
+    Args:
+        model: the model.
+        case: the recording.
+        part: slice of its samples.
+        states: (s, N) states of friction with hysteresis of all samples.
+    """
     motion = case.motion
     q = motion.q[part]
     v = motion.v[part]
@@ -539,7 +573,13 @@ class _HasEnergy(Protocol):
 
 
 def thinned(mask: np.ndarray, segment: np.ndarray, decimator: Decimator) -> np.ndarray:
-    """Return the decimated mask (M, rows), true where more than half of the samples of a mask (N, rows) are true."""
+    """Return the decimated mask (M, rows), true where more than half of the samples of a mask (N, rows) are true.
+
+    Args:
+        mask: (N, rows) mask at the full rate.
+        segment: (N,) number of each sample's segment.
+        decimator: filter and decimation.
+    """
     majority = decimate(mask.astype(float), decimator, segment) > 0.5
     if len(decimator.taps) == 1:
         return majority & mask[kept(segment, decimator)]

@@ -97,7 +97,8 @@ class Choices:
         deflections: whether joint corrections of the fit (compliance, gears, encoders) move the links; never where the
             closed loop is simulated.
         loop: the closed loop in which recordings were made, for instrumental variables.
-        constraints: constraints on parameters for the methods pc-*; None: their defaults.
+        constraints: constraints on parameters for the methods pc-*; None: their defaults. By a function of parameters,
+            or a file of it, also for ols, wls and iv.
     """
 
     passive: Text = ""
@@ -117,7 +118,7 @@ class Choices:
     folds: Annotated[int, Whole(2, 50)] = 6
     deflections: Flag = True
     loop: Annotated[LoopSettings, Checked(check_loop)] | None = None
-    constraints: ConstraintSettings | None = None
+    constraints: Annotated[ConstraintSettings | None, Checked(ConstraintSettings.of)] = None
 
 
 @dataclass(frozen=True)
@@ -147,6 +148,10 @@ class IdentificationSettings(Choices):
 
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
     """Return the model of a chain: bodies, payloads at the tip, and drive terms.
+
+    Args:
+        chain: the arm.
+        settings: settings, with drive terms, payloads and gravity.
 
     Raises:
         UsageError: for settings that do not apply to this chain.
@@ -183,7 +188,12 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
 
 
 def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
-    """Return the bodies of a chain under the stated gravity, with payloads at the tip."""
+    """Return the bodies of a chain under the stated gravity, with payloads at the tip.
+
+    Args:
+        chain: the arm.
+        settings: settings, with gravity and payloads.
+    """
     bodies = bodies_of(chain)
     if settings.gravity is not None:
         bodies = bodies.with_gravity(np.array(settings.gravity))
@@ -195,7 +205,12 @@ def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
 
 
 def _check_joints(n: int, settings: IdentificationSettings) -> None:
-    """Raise a UsageError for couplings or terms of unknown joints, and for a joint coupled with itself."""
+    """Raise a UsageError for couplings or terms of unknown joints, and for a joint coupled with itself.
+
+    Args:
+        n: number of joints.
+        settings: settings, with couplings and terms.
+    """
     for coupling in settings.couplings:
         numbers = [joint + 1 for joint in coupling.joints]
         require(max(numbers) <= n, f"coupling: joints {numbers}: the robot has joints 1 to {n}", UsageError)
@@ -215,6 +230,10 @@ def _check_joints(n: int, settings: IdentificationSettings) -> None:
 
 def require_usable(settings: IdentificationSettings, method: Method) -> IdentificationSettings:
     """Return the settings for a method, with friction = "auto" replaced by its meaning for this method.
+
+    Args:
+        settings: the requested settings.
+        method: the method that will be used.
 
     Raises:
         UsageError: for a missing loop, or torque rows or friction that the method does not support; the message names

@@ -131,7 +131,13 @@ def with_standstills(
 
 
 def _held_rows(model: RegressorModel, n: int, rows: int) -> np.ndarray:
-    """Return the mask (rows,) of torque rows that contain a motor's friction."""
+    """Return the mask (rows,) of torque rows that contain a motor's friction.
+
+    Args:
+        model: the model.
+        n: number of joints.
+        rows: number of torque rows.
+    """
     held = np.zeros(rows, dtype=bool)
     if model.torque_rows.projection is None and rows == model.torque_rows.count(n):
         for joint in range(n):
@@ -140,7 +146,15 @@ def _held_rows(model: RegressorModel, n: int, rows: int) -> np.ndarray:
 
 
 def _acted(acts: Sequence[tuple[int, object]], torque_rows: TorqueRows, side: str, n: int, rows: int) -> np.ndarray:
-    """Return the mask (rows,) of torque rows that a drive term acts on."""
+    """Return the mask (rows,) of torque rows that a drive term acts on.
+
+    Args:
+        acts: pairs (joint, motion) of the drive term.
+        torque_rows: kind of torques in the rows.
+        side: side of the term, ``link`` or ``motor``.
+        n: number of joints.
+        rows: number of torque rows.
+    """
     result = np.zeros(rows, dtype=bool)
     if torque_rows.projection is None:
         for joint, _ in acts:
@@ -156,7 +170,12 @@ def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
 
 
 def _shares(mask: np.ndarray, segment: np.ndarray) -> np.ndarray:
-    """Return the share (M, rows) of each row in its standstill, 1 / number of rows; 0 in motion."""
+    """Return the share (M, rows) of each row in its standstill, 1 / number of rows; 0 in motion.
+
+    Args:
+        mask: (M, rows) mask of rows at rest.
+        segment: (M,) number of each sample's segment; a standstill does not continue in the next segment.
+    """
     result = np.zeros(mask.shape)
     for start, stop in segments(segment):
         for row in range(mask.shape[1]):
@@ -166,7 +185,13 @@ def _shares(mask: np.ndarray, segment: np.ndarray) -> np.ndarray:
 
 
 def _swings(mask: np.ndarray, target: np.ndarray, segment: np.ndarray) -> np.ndarray:
-    """Return the range of the torque (M, rows) in the standstill that contains each row; 0 in motion."""
+    """Return the range of the torque (M, rows) in the standstill that contains each row; 0 in motion.
+
+    Args:
+        mask: (M, rows) mask of rows at rest.
+        target: (M, rows) torques [N m or N].
+        segment: (M,) number of each sample's segment.
+    """
     result = np.zeros(mask.shape)
     for start, stop in segments(segment):
         for row in range(mask.shape[1]):
@@ -203,8 +228,8 @@ class DividedRows:
 
         Args:
             values: (p,) parameters.
-            std, tau: (rows,) standard deviation of the residuals in motion, and number of these residuals that count as
-                one.
+            std, tau: (rows,) standard deviation of the residuals in motion [N m or N], and number of these residuals
+                that count as one.
         """
         count = np.maximum(self.standstills, 1.0)
         friction = np.sum(np.abs(values) * self.coulomb, axis=1)
@@ -232,7 +257,11 @@ class DividedRows:
 
 
 def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
-    """Return separate R factors of rows in motion and of rows at rest."""
+    """Return separate R factors of rows in motion and of rows at rest.
+
+    Args:
+        all_rows: rows of all recordings, with their standstills marked.
+    """
     first = all_rows[0]
     rows = first.target.shape[1]
     moving = standing = swinging = empty(first.names, first.units, rows)
@@ -260,7 +289,12 @@ def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
 
 
 def with_weights(all_rows: Sequence[ObservationRows], weights: RestWeights) -> list[ObservationRows]:
-    """Return the rows with other weights of their standstills."""
+    """Return the rows with other weights of their standstills.
+
+    Args:
+        all_rows: rows of all recordings, with their standstills marked.
+        weights: weights of the standstills.
+    """
     return [replace(part, rest=weights) for part in all_rows]
 
 
@@ -318,6 +352,12 @@ def _travel_since_standstill(
     """Return the travel (M, rows) of each row's joint since its last standstill [rad or m].
 
     It is infinite before the first standstill.
+
+    Args:
+        part: rows of one recording.
+        case: the recording.
+        decimator: filter and decimation of the rows.
+        torque_rows: kind of torques in the rows.
     """
     index = kept(case.motion.segment, decimator)
     segment = case.motion.segment[index]
@@ -369,15 +409,15 @@ def left_out_error(
 ) -> float:
     """Return Σ (τ - τ̂)² of the rows in motion, each time block being predicted by a fit of the other blocks.
 
-    Torque errors are not weighted, as in the errors shown to users. If rows were weighted by their residuals, a joint
-    whose torques are fitted by wrong parameters would dominate.
+    τ are measured and τ̂ predicted torques. Their errors are not weighted, as in the errors shown to users. If rows
+    were weighted by their residuals, a joint whose torques are fitted by wrong parameters would dominate.
 
     Args:
         training: rows with the tested treatment of standstills.
         marked: the same samples with their standstills marked.
-        std, inflation: (rows,) standard deviation and variance inflation of the residuals.
-        prior: whitened rows (k, p + 1) of [W y]; None without a prior.
-        apart: rows in a different unit, excluded from the sum.
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation of the residuals.
+        prior: (k, p + 1) whitened rows of the prior, to be appended to the rows [W y]; None without a prior.
+        apart: indices of torque rows in a different unit, excluded from the sum.
     """
     rows = training[0].target.shape[1]
     data = triangulate(training)

@@ -43,7 +43,7 @@ class Regimes:
 def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator) -> Regimes:
     """Return the products [W y]ᵀ[W y] by range of motion: fast, accelerated, near each end of travel, each direction.
 
-    Standstills are in no range, since friction at rest is undetermined.
+    W is the observation matrix, y are the torques. Standstills are in no range, since friction at rest is undetermined.
 
     Args:
         all_rows: rows of all recordings.
@@ -122,7 +122,7 @@ class CrossValidation:
         data: R factors by time block and torque row.
         rows: number of torque rows per sample.
         blocks: number of time blocks, each held out in turn.
-        std: (rows,) standard deviation of the residuals.
+        std: (rows,) standard deviation of the residuals [N m or N].
         inflation: (rows,) variance inflation, i.e. number of rows that count as one.
         group: (p,) ridge group of each column, -1 for none.
         prior: (k, p + 1) whitened rows of [W y] of a prior; None without one.
@@ -157,7 +157,11 @@ class CrossValidation:
         return self._results[key].copy()
 
     def extrapolated(self, columns: np.ndarray) -> np.ndarray:
-        """Return the squared errors (ranges, rows) in each held-out range of motion, for a model with these columns."""
+        """Return the squared errors (ranges, rows) in each held-out range of motion, for a model with these columns.
+
+        Args:
+            columns: indices of the model's columns.
+        """
         assert self.regimes is not None
         key = b"ranges" + np.asarray(columns, dtype=int).tobytes()
         if key in self._results:
@@ -182,7 +186,12 @@ class CrossValidation:
         return self._results.setdefault(key, np.maximum(result, 0.0))
 
     def _held_out_errors(self, columns: np.ndarray, runs: list[np.ndarray]) -> np.ndarray:
-        """Return the squared errors (blocks, rows) of ridge estimates, each run of blocks predicted from the others."""
+        """Return the squared errors (blocks, rows) of ridge estimates, each run of blocks predicted from the others.
+
+        Args:
+            columns: indices of the model's columns.
+            runs: sets of block numbers, each held out together.
+        """
         index = np.append(columns, self.data.parameters)
         squares = self._squares.take(index, 1).take(index, 2)
         prior_square = self._prior_square(index)
@@ -234,9 +243,9 @@ def estimate(
 
     Args:
         data: R factors, one group per torque row.
-        std, inflation: (rows,) standard deviation and variance inflation of the residuals.
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation of the residuals.
         group: (p,) ridge group of each column; -1 for none.
-        prior: (k, p + 1) whitened rows of [W y] of a prior; None without one.
+        prior: (k, p + 1) whitened rows of a prior, to be appended to the rows [W y]; None without one.
     """
     weight = 1.0 / (std * np.sqrt(inflation))
     weighted = data.factors * weight[:, None, None]
@@ -254,7 +263,12 @@ def estimate(
 
 
 def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
-    """Return a number (p,) that is equal for columns of the same group and unit; -1 for columns without a group."""
+    """Return a number (p,) that is equal for columns of the same group and unit; -1 for columns without a group.
+
+    Args:
+        group: (p,) ridge group of each column; -1 for none.
+        units: unit of each column.
+    """
     distinct, unit = np.unique(units, return_inverse=True)
     return np.where(group < 0, -1, group * len(distinct) + unit)
 

@@ -90,6 +90,8 @@ class Answers:
     Attributes:
         robot: a .urdf, an MDH .toml, a library name, or the folder of an earlier fit.
         instrument: cmm, tracker, tracker6d, mocap, camera, camera-poses, other-pose, other-position, none.
+        reference: a frame on the robot's base is measured beside the target, since instrument and base move against
+            each other.
         tool: x,y,z: approximate position of the target in the tip's frame [m].
         limits: TOML file that describes the cell: instrument or [camera], obstacles, speeds; or
             MoveIt's files (calib formats moveit); none: asked in questions.
@@ -123,6 +125,7 @@ class Answers:
 
     robot: Text | None = None
     instrument: Text | None = None
+    reference: Annotated[bool, Typed("--reference/--no-reference")] | None = None
     tool: Annotated[tuple[Held, Held, Held], Expect("x,y,z in metres, at most 3 m from the flange")] | None = None
     limits: Path | None = None
     mounting: Text | None = None

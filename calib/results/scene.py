@@ -18,6 +18,8 @@ from calib.robot.kinematics import forward, joint_frames
 
 # Positions of the arm per second of motion (our choice).
 FRAMES = 50.0
+# Standard deviations of a normal distribution that contain 95 %.
+SIGMAS = 1.96
 
 
 @runtime_checkable
@@ -82,6 +84,8 @@ class Measured:
         unseen: (m,) whether the row was held out from the fit.
         turned: (m, 3) rotation vector from the calibrated arm's orientation to the measured one, as in
             ``residuals.csv`` [rad]; NaN if no orientation was measured.
+        interval: (m,) radius within which the fit expects 95 % of the calibrated arm's errors [m]; NaN for fitted rows;
+            None: unknown.
     """
 
     q: np.ndarray
@@ -90,6 +94,7 @@ class Measured:
     calibrated: np.ndarray
     unseen: np.ndarray
     turned: np.ndarray
+    interval: np.ndarray | None = None
 
     def arrow_scale(self, chain: Chain | Drawn) -> float:
         """Return a factor (1, 2 or 5 times a power of ten) by which the viewer enlarges error arrows.
@@ -119,6 +124,7 @@ class ErrorSizes:
         q: (m, n) joint values [rad or m].
         nominal, calibrated: (m,) magnitudes of both arms' errors [m]; NaN if the fit does not state them.
         unseen: (m,) whether the row was held out from the fit.
+        interval: (m,) as that of `Measured`.
     """
 
     kind: str
@@ -126,6 +132,7 @@ class ErrorSizes:
     nominal: np.ndarray
     calibrated: np.ndarray
     unseen: np.ndarray
+    interval: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +162,8 @@ class Torques:
         t: (N,) times [s].
         measured, predicted: (N, rows) torques.
         q: (N, n) joint values [rad or m]; None: unknown.
+        sigma: (N, rows) expected standard deviations of measured minus predicted; None: unknown.
+        nominal: (N, rows) torques of the model that was identified on the nominal (CAD) geometry; None: unknown.
     """
 
     name: str
@@ -164,6 +173,50 @@ class Torques:
     measured: np.ndarray
     predicted: np.ndarray
     q: np.ndarray | None
+    sigma: np.ndarray | None = None
+    nominal: np.ndarray | None = None
+
+    @property
+    def band(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Lower and upper bound (N, rows) of the interval that is expected to contain 95 % of the measured torques."""
+        if self.sigma is None:
+            return None
+        return self.predicted - SIGMAS * self.sigma, self.predicted + SIGMAS * self.sigma
+
+
+@dataclass(frozen=True, eq=False)
+class TradeOffs:
+    """Front of trade-offs of a designed motion.
+
+    Attributes:
+        name: name of the motion.
+        objectives: names of the two objectives, each the smaller the better.
+        values: (k, 2) of the front's motions.
+        best: (k,) whether no other motion is better in both.
+        designed: index of the motion that was designed.
+    """
+
+    name: str
+    objectives: tuple[str, ...]
+    values: np.ndarray
+    best: np.ndarray
+    designed: int
+
+    @property
+    def drawn(self) -> np.ndarray:
+        """Return the values (k, 2) scaled to 0 to 1, since the objectives have different units."""
+        low = self.values.min(axis=0)
+        span = np.ptp(self.values, axis=0)
+        return (self.values - low) / np.where(span > 0.0, span, 1.0)
+
+    @property
+    def labels(self) -> list[str]:
+        """Return one text per motion: its number, as of ``--pick``, and its values."""
+        labels = []
+        for number, row in enumerate(self.values, 1):
+            pairs = [f"{name} {value:.4g}" for name, value in zip(self.objectives, row)]
+            labels.append(f"{number}: {', '.join(pairs)}")
+        return labels
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +232,7 @@ class Scene:
         chosen: names and joint values (m, n) of lists of selected poses, in the order of selection.
         played: motions.
         torques: torques of recordings.
+        fronts: fronts of trade-offs of designed motions.
         notes: texts on results that could not be shown.
     """
 
@@ -190,6 +244,7 @@ class Scene:
     chosen: tuple[tuple[str, np.ndarray], ...] = ()
     played: tuple[Played, ...] = ()
     torques: tuple[Torques, ...] = ()
+    fronts: tuple[TradeOffs, ...] = ()
     notes: tuple[str, ...] = ()
 
 

@@ -21,11 +21,11 @@ from calib.geometry import installation
 from calib.geometry.installation import Installation, see
 from calib.identification import model_file
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
-from calib.procedure.excitation import coefficients
+from calib.procedure.excitation import coefficients, stored_front
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.robot_kinds import stage_of
 from calib.result_kinds import refusal
-from calib.results.scene import Drawn, ErrorSizes, Measured, Played, Scene, Torques, Visual
+from calib.results.scene import Drawn, ErrorSizes, Measured, Played, Scene, Torques, TradeOffs, Visual
 from calib.robot import calibrated, library
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.collision import find_mesh, urdf_meshes
@@ -35,6 +35,8 @@ from calib.transforms import invert
 
 # meshes that the viewer shows
 DRAWABLE = (".stl", ".obj", ".dae", ".glb", ".gltf")
+# column of the 95 % intervals in tables of errors, without its unit
+INTERVAL95 = "interval95"
 # of a run that is drawn [Hz] (our choice)
 REHEARSAL_RATE = 10.0
 
@@ -61,7 +63,9 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
     chosen, runs = _plans(pose_files, chain)
     motions = _motions(folder)
     torques = _all_torques(folder, chain)
-    require(measured or sizes or chosen or runs or motions or torques, refusal(folder, "view"), UsageError)
+    fronts, damaged = _fronts(folder)
+    notes += damaged
+    require(measured or sizes or chosen or runs or motions or torques or fronts, refusal(folder, "view"), UsageError)
     if chain is None:
         notes.append("no robot is shown: the folder does not name one; give --robot")
     resolved = folder.resolve()
@@ -74,6 +78,7 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
         chosen=tuple(chosen),
         played=(*runs, *motions),
         torques=tuple(torques),
+        fronts=tuple(fronts),
         notes=tuple(notes),
     )
 
@@ -208,7 +213,14 @@ def _measured(folder: Path, chain: Chain | Drawn | None) -> Measured:
             nominal_cell = replace(after, chain=before.chain)
         nominal[rows] = _points(nominal_cell, q[rows], s, t) @ rotation + T_base_station[:3, 3]
     unseen = np.array(table.texts("set")) != "fit"
-    return Measured(q, seen, nominal, modelled, unseen, turned)
+    return Measured(q, seen, nominal, modelled, unseen, turned, _intervals(table))
+
+
+def _intervals(table: Table) -> np.ndarray | None:
+    """Return the radii (m,) [m] of the rows' 95 % intervals; None in a table of an earlier version."""
+    if INTERVAL95 not in table:
+        return None
+    return table.numbers(INTERVAL95, "length", gaps=True)
 
 
 def _unplaced(folder: Path, chain: Chain | Drawn | None) -> list[ErrorSizes]:
@@ -230,7 +242,7 @@ def _unplaced(folder: Path, chain: Chain | Drawn | None) -> list[ErrorSizes]:
         nominal = part.numbers("nominal size", "length", gaps=True)
         fitted = part.numbers("size", "length", gaps=True)
         unseen = np.array(part.texts("set")) != "fit"
-        result.append(ErrorSizes(kind, _joint_values(part, cell), nominal, fitted, unseen))
+        result.append(ErrorSizes(kind, _joint_values(part, cell), nominal, fitted, unseen, _intervals(part)))
     return result
 
 
@@ -273,7 +285,15 @@ def _with_unseen(fitted: Measured, errors: Path) -> Measured:
         np.concatenate([fitted.calibrated, modelled]),
         np.concatenate([fitted.unseen, np.ones(len(q), dtype=bool)]),
         np.concatenate([fitted.turned, np.full((len(q), 3), np.nan)]),
+        _joined(fitted.interval, _intervals(table)),
     )
+
+
+def _joined(fitted: np.ndarray | None, held_out: np.ndarray | None) -> np.ndarray | None:
+    """Return the intervals of fitted and of held-out rows; None where either is unknown."""
+    if fitted is None or held_out is None:
+        return None
+    return np.concatenate([fitted, held_out])
 
 
 def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.ndarray:
@@ -394,8 +414,24 @@ def _all_torques(folder: Path, chain: Chain | Drawn | None) -> list[Torques]:
         predicted = _columns(table, "predicted", path)
         rows, units = _torque_rows(path.parent, chain, measured.shape[1])
         label = _label(path, folder)
-        result.append(Torques(label, rows, units, _seconds(table), measured, predicted, table.block("q")))
+        extra = {name: table.block(name) for name in ("q", "sigma", "nominal")}
+        result.append(Torques(label, rows, units, _seconds(table), measured, predicted, **extra))
     return result
+
+
+def _fronts(folder: Path) -> tuple[list[TradeOffs], list[str]]:
+    """Return the fronts of trade-offs in a folder and its subfolders, and notes on those that cannot be read."""
+    fronts = []
+    notes = []
+    for path in _below(folder, stored_front.TABLE):
+        try:
+            front = stored_front.read(path.parent).values
+        except CalibError as reason:
+            notes.append(f"{path.parent.name}: no front is shown: {reason}")
+            continue
+        name = path.parent.resolve().name
+        fronts.append(TradeOffs(name, tuple(front.names), front.values, front.best, front.designed))
+    return fronts, notes
 
 
 def _torque_rows(folder: Path, chain: Chain | Drawn | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:

@@ -67,7 +67,13 @@ def _with_space(tree: UrdfTree, source: str, where: str, chain_links: set[str]) 
     """Return the names of the links that take space.
 
     These are links with a mass or a shape, links moved by joints outside the chain, and the links between them and the
-    root.
+    root of the URDF.
+
+    Args:
+        tree: the URDF.
+        source: text of the URDF.
+        where: name of the URDF in messages.
+        chain_links: names of the links of the arm's chain.
     """
     solid = {link for link, body in tree.bodies.items() if body is not None}
     for node in parse(source, where).all("link"):
@@ -84,7 +90,13 @@ def _with_space(tree: UrdfTree, source: str, where: str, chain_links: set[str]) 
 
 
 def _is_beside(tree: UrdfTree, chain_links: set[str], joint: JointTag) -> bool:
-    """Return whether a joint is not on the path from the root to the chain's tip."""
+    """Return whether a joint is not on the path from the root to the chain's tip.
+
+    Args:
+        tree: the URDF.
+        chain_links: names of the links of the arm's chain.
+        joint: a joint of the URDF.
+    """
     before_chain: set[str] = set()
     for link in chain_links:
         before_chain.update(earlier.child for earlier in tree.ancestry(link))
@@ -92,7 +104,13 @@ def _is_beside(tree: UrdfTree, chain_links: set[str], joint: JointTag) -> bool:
 
 
 def _carrier(tree: UrdfTree, link: str, bodies: dict[str, int]) -> str:
-    """Return the last of the chain's moving links on the path from the root to a link; "" if there is none."""
+    """Return the last of the chain's moving links on the path from the root to a link; "" if there is none.
+
+    Args:
+        tree: the URDF.
+        link: name of the link.
+        bodies: name of each moving link of the chain, to its number of moving elements.
+    """
     carriers = [joint.child for joint in tree.ancestry(link) if joint.child in bodies]
     return carriers[-1] if carriers else ""
 
@@ -117,7 +135,13 @@ def _position(tree: UrdfTree, base: str, link: str, carrier: str, posture: Mappi
 
 
 def _still_pose(tree: UrdfTree, link: str, posture: Mapping[str, float]) -> np.ndarray:
-    """Return the pose (4, 4) of a link in its root's frame; joints have the values in `posture`, or else zero."""
+    """Return the pose (4, 4) of a link in its root's frame; joints have the values in `posture`, or else zero.
+
+    Args:
+        tree: the URDF.
+        link: name of the link.
+        posture: values of joints by name [rad or m].
+    """
     result = np.eye(4)
     for joint in tree.ancestry(link):
         displacement = posture.get(joint.name, 0.0) * joint.axis
@@ -130,7 +154,12 @@ def _still_pose(tree: UrdfTree, link: str, posture: Mapping[str, float]) -> np.n
 
 
 def links_of(chain: Chain, source: Path | None) -> Collection[str]:
-    """Return the names of a robot's links: those in its URDF, or, without a URDF, those of the arm's capsules."""
+    """Return the names of a robot's links: those in its URDF, or, without a URDF, those of the arm's capsules.
+
+    Args:
+        chain: the arm, whose capsules have the names of its links.
+        source: file that describes the robot; None if unknown.
+    """
     if source is not None and is_urdf(source):
         return read(text(source)[0], str(source)).bodies
     return (chain.base, *(chain.links or [f"{name}_link" for name in chain.joint_names]), chain.tip)

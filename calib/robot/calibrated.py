@@ -97,7 +97,11 @@ class Deflection:
         return replace(self, coefficients=np.asarray(values, dtype=float))
 
     def names(self, chain: Chain) -> tuple[str, ...]:
-        """Return one name per term for tables, such as ``theta3 per N·m`` or ``theta3 sin 2 q4``."""
+        """Return one name per term for tables, such as ``theta3 per N·m`` or ``theta3 sin 2 q4``.
+
+        Args:
+            chain: the arm, which provides names and kinds of joints and elements.
+        """
         return tuple(_name(term, chain) for term in self.terms)
 
 
@@ -194,7 +198,7 @@ def extra_displacements(
 
 
 def target_elements(chain: Chain, deflection: Deflection) -> np.ndarray:
-    """Return the index (E,) of the element that each term moves."""
+    """Return the index (E,) of the element of `chain` that each term of `deflection` moves."""
     table = {name: k for k, name in enumerate(chain.names)}
     return np.array([table[term.element] for term in deflection.terms], dtype=int)
 
@@ -302,7 +306,8 @@ class CalibratedChain:
     def jacobian(self, q: ArrayLike) -> np.ndarray:
         """Return the tip's Jacobian (m, 6, n) [v; ω] in the base frame at joint values q (m, n) [rad or m].
 
-        The derivatives of joint corrections are not included.
+        v is the velocity of the tip, ω its angular velocity, per unit joint velocity. The derivatives of joint
+        corrections are not included.
 
         Raises:
             CalibError: joint values of a wrong shape.
@@ -323,6 +328,9 @@ def as_calibrated(robot: Chain | CalibratedChain) -> CalibratedChain:
 def read(path: str | Path) -> CalibratedChain:
     """Return the calibrated robot in the folder of a fit or an identification, or in any ``robot.toml``.
 
+    Args:
+        path: the folder, or the file.
+
     Raises:
         RobotError: an invalid file; the message names the file and the error.
     """
@@ -333,6 +341,9 @@ def read_whole(path: str | Path) -> tuple[CalibratedChain, ParsedTable]:
     """Return the calibrated robot, as `read` does, and the extra tables of its file.
 
     `calib.robot.description.EXTRA` names the extra tables.
+
+    Args:
+        path: the folder, or the file.
     """
     path = Path(path)
     if path.is_dir():
@@ -374,8 +385,8 @@ def write(
     Args:
         folder: an existing folder.
         robot: the calibrated robot.
-        tables: further tables of ``robot.toml`` (`calib.robot.description.EXTRA`).
-        record: further entries of the table ``[provenance]``.
+        tables: further tables of ``robot.toml`` (`calib.robot.description.EXTRA`); None for no such tables.
+        record: further entries of the table ``[provenance]``; None for no such entries.
         comment: source of the numbers, written as a comment.
     """
     nominal = None if robot.nominal is None else robot.nominal.values
@@ -408,6 +419,10 @@ def _covariance(path: Path, names: tuple[str, ...]) -> np.ndarray | None:
     """Return the covariance (k, k) of the values `names` from a file; None if the file does not exist.
 
     The covariance is zero for names that the file does not contain.
+
+    Args:
+        path: CSV file of a covariance with names.
+        names: the k names of the wanted values, in order.
     """
     if not path.is_file():
         return None

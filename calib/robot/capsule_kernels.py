@@ -27,7 +27,11 @@ def clear(q, form, fixed, stand, attached, targets, pairs, radii, faces, margin)
     """Return at which joint values q (m, n) all distances of `pairs` and `faces` exceed `margin` [m], (m,) bool.
 
     Args:
-        stand: height [m] of the lower end of the base's capsule. The module's docstring describes the other arguments.
+        q: (m, n) joint values [rad or m].
+        form, fixed, attached, targets, pairs, radii, faces: arrays of the capsule model, described in the module's
+            docstring.
+        stand: height [m] of the lower end of the base's capsule.
+        margin: least distance [m].
     """
     count, moving = len(form), 0
     for k in range(count):
@@ -55,7 +59,14 @@ def clear(q, form, fixed, stand, attached, targets, pairs, radii, faces, margin)
 
 @njit(**OPTIONS)
 def _lines(q, form, fixed, stand, attached, targets, lines):
-    """Write the centre lines of all capsules into `lines`: base, moving bodies, links outside the chain, targets."""
+    """Write the centre lines of all capsules into `lines`: base, moving bodies, links outside the chain, targets.
+
+    Args:
+        q: (n,) joint values of one posture [rad or m].
+        form, fixed, attached, targets: arrays of the capsule model, described in the module's docstring.
+        stand: height [m] of the lower end of the base's capsule.
+        lines: array to write, one row per capsule: start and end (6) [m].
+    """
     r, x, rotated = np.zeros((3, 3)), np.zeros(3), np.empty((3, 3))
     r[0, 0] = r[1, 1] = r[2, 2] = 1.0
     lines[0] = 0.0
@@ -110,6 +121,8 @@ def _carry(r, x, body, attached, lines, first):
         r, x: rotation (3, 3) and origin (3,) of the body's frame in the base.
         body: number of moving elements before the body.
         attached: links outside the chain, as in the module's docstring.
+        lines: array to write, one row per capsule: start and end (6) [m].
+        first: row of the first link.
     """
     for e in range(len(attached)):
         if attached[e, 0] == body:
@@ -123,14 +136,17 @@ def _carry(r, x, body, attached, lines, first):
 
 @njit(**OPTIONS)
 def _put(x, lines, row, first):
-    """Write x (3,) into a row of `lines`, starting at column `first` (numba compiles slices slowly)."""
+    """Write x (3,) into row `row` of `lines`, starting at column `first` (numba compiles slices slowly)."""
     for a in range(3):
         lines[row, first + a] = x[a]
 
 
 @njit(**OPTIONS)
 def _apart(first, second):
-    """Return the distance between two line segments (6,), each given by start and end (Ericson 2005, 5.1.9)."""
+    """Return the distance [m] between the line segments `first` and `second` (6,), each given by start and end.
+
+    The method is that of Ericson (2005), 5.1.9.
+    """
     uu = vv = uv = uw = vw = 0.0
     for a in range(3):
         u, v, w = first[3 + a] - first[a], second[3 + a] - second[a], first[a] - second[a]

@@ -104,6 +104,9 @@ def usual_radius(chain: Chain) -> float:
 
     The radius is a share of the arm's length. A base below the first joint counts at most as long as the longest link,
     so that a pillar does not thicken the arm.
+
+    Args:
+        chain: the arm.
     """
     lines = _lines_of(chain, np.zeros((1, chain.n)), np.empty((0, 3)))
     lengths = np.linalg.norm(lines.end - lines.start, axis=2)[0]
@@ -183,6 +186,9 @@ class Capsules:
         """Return the derivatives (m, pairs, n) of `distances` by the joint values.
 
         They are the relative velocities of the nearest points along the normal.
+
+        Args:
+            q: (m, n) joint values [rad or m].
         """
         lines = self.lines_at(q)
         _, normal, first_point, second_point = self._pair_distances(lines)
@@ -334,7 +340,7 @@ class Capsules:
 def closing_speed(
     chain: Chain, axes: np.ndarray, origins: np.ndarray, normal: np.ndarray, point: np.ndarray, bodies: np.ndarray
 ) -> np.ndarray:
-    """Return the speed (m, P, n) of points along normals, per unit speed of each joint.
+    """Return the speed (m, P, n) of P points along normals in m postures, per unit speed of each joint.
 
     Args:
         chain: the arm.
@@ -379,9 +385,10 @@ def from_chain(
         obstacles: obstacles in the base frame.
         walls: planes that the arm must not cross.
         targets: (T, 3) positions of the measured targets in the tip's frame [m].
-        margin: the least distance that will be required [m]; pairs that are always nearer are excluded.
+        margin: the least distance that will be required [m]; pairs that are nearer in nearly all postures are excluded
+            (`inseparable`).
         within: whether parts of the arm are compared with each other.
-        ignored: pairs of links that are not compared.
+        ignored: pairs of names of links that are not compared.
         beside: links outside the chain, compared with every link that moves relative to them.
         seed: seed of the random postures that determine the excluded pairs.
     """
@@ -448,7 +455,11 @@ def from_chain(
 
 
 def _body_names(chain: Chain) -> list[str]:
-    """Return the names of the base and of the body after each moving element."""
+    """Return the names of the base and of the body after each moving element.
+
+    Args:
+        chain: the arm.
+    """
     links = chain.links
     if not links:
         links = tuple(f"{name}_link" for name in chain.joint_names)
@@ -464,7 +475,14 @@ def _body_names(chain: Chain) -> list[str]:
 
 
 def _lines_of(chain: Chain, q: np.ndarray, targets: np.ndarray, beside: Sequence[Attached] = ()) -> _Lines:
-    """Return the centre lines of base, moving bodies, links outside the chain and targets at joint values q (m, n)."""
+    """Return the centre lines of base, moving bodies, links outside the chain and targets at joint values q (m, n).
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+        targets: (T, 3) positions of the targets in the tip's frame [m].
+        beside: the links outside the chain.
+    """
     walk = sweep(chain, q)
     axes = walk.directions[chain.driven].transpose(2, 0, 1)
     origins = walk.origins[chain.driven].transpose(2, 0, 1)
@@ -487,7 +505,13 @@ def _lines_of(chain: Chain, q: np.ndarray, targets: np.ndarray, beside: Sequence
 
 
 def _attached_ends(chain: Chain, q: np.ndarray, beside: Sequence[Attached]) -> tuple[np.ndarray, np.ndarray]:
-    """Return start and end points (m, E, 3) [m] of the links outside the chain, in the base, at q (m, n)."""
+    """Return start and end points (m, E, 3) [m] of the links outside the chain, in the base, at q (m, n).
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+        beside: the E links.
+    """
     if not beside:
         return np.empty((len(q), 0, 3)), np.empty((len(q), 0, 3))
     base = np.broadcast_to(np.eye(4), (1, len(q), 4, 4))
@@ -502,9 +526,9 @@ def _attached_ends(chain: Chain, q: np.ndarray, beside: Sequence[Attached]) -> t
 
 
 def _nearest(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions (...), from 0 to 1, of the nearest points on the segments a to b and c to d.
+    """Return the positions (...) of the nearest points on the segments a to b and c to d: 0 at a or c, 1 at b or d.
 
-    The ends of the segments are (..., 3).
+    The ends a, b, c, d of the segments are (..., 3).
     """
     u, v, w = b - a, d - c, a - c
     uu = np.maximum((u * u).sum(-1), MIN_SQUARE)
@@ -522,7 +546,7 @@ def _nearest(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tupl
 
 
 def _point_distances(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distances (...) between points (..., 3), and the unit vectors from `start` to `end`."""
+    """Return the distances (...) from points `start` to `end` (..., 3), and the unit vectors in this direction."""
     difference = end - start
     distance = np.linalg.norm(difference, axis=-1)
     return distance, difference / np.maximum(distance, TINY)[..., None]

@@ -30,7 +30,7 @@ MIN_STRETCHED_LENGTH = 0.1
 
 
 def check_gravity(gravity: np.ndarray, where: str = "") -> None:
-    """Raise RobotError for an implausible gravity vector (3,) [m/s²]; the message begins with `where`.
+    """Raise RobotError for an implausible gravity vector (3,) [m/s²]; the message begins with the text `where`.
 
     Raises:
         RobotError: a vector longer than `MAX_GRAVITY`, or not finite.
@@ -256,7 +256,13 @@ class Chain:
 
 
 def random_joints(chain: Chain, count: int, seed: int | np.random.Generator = 0) -> np.ndarray:
-    """Return random joint values (count, n) [rad or m], uniformly distributed within the limits."""
+    """Return random joint values (count, n) [rad or m], uniformly distributed within the limits.
+
+    Args:
+        chain: the arm, which provides the limits (`Chain.sampling_limits`).
+        count: number of poses.
+        seed: seed, or generator of random numbers.
+    """
     lower, upper = chain.sampling_limits()
     return np.random.default_rng(seed).uniform(lower, upper, (count, chain.n))
 
@@ -266,6 +272,10 @@ def element_length(chain: Chain, k: int) -> float:
 
     A URDF's joint origin is a placement followed by zero-valued elements, so that its lengths are in the placement. The
     result is zero for rotations and for elements that a joint moves.
+
+    Args:
+        chain: the arm.
+        k: index of the element.
     """
     element = chain.elements[k]
     if element.axis[0] != "t" or element.joint is not None:
@@ -282,5 +292,8 @@ def element_length(chain: Chain, k: int) -> float:
 
 
 def joint_kinds(chain: Chain) -> list[str]:
-    """Return the URDF type of each joint; in a chain from a URDF, a revolute joint without limits is continuous."""
+    """Return the URDF type of each joint of `chain`.
+
+    In a chain from a URDF, a revolute joint without limits is continuous.
+    """
     return ["continuous" if chain.links and joint.unlimited else joint.kind for joint in chain.joints]

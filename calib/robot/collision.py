@@ -98,7 +98,13 @@ class Collision:
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return the links' distances from the lines of sight to a target, with derivatives.
 
-        Arguments and result are those of `calib.robot.capsules.Capsules.beam`.
+        The result is that of `calib.robot.capsules.Capsules.beam`: distances (m, L) [m] of L links, and derivatives.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+            start: (m, 3) position of the target [m].
+            slope: (m, 3, n) derivative of `start` by the joint values.
+            end: (3,) or (m, 3), position of the instrument in the base frame [m].
         """
         pin, coal = _libraries()
         data = self._model.createData()
@@ -213,9 +219,10 @@ def from_urdf(
         walls: planes that the arm must not cross.
         targets: (T, 3) positions of the measured targets in the tip's frame [m]; each is represented by a thin capsule
             from the tip.
-        margin: the least distance that will be required [m]; pairs that are always nearer are excluded.
+        margin: the least distance that will be required [m]; pairs that are nearer in nearly all postures are excluded
+            (`calib.robot.capsules.inseparable`).
         within: whether parts of the arm are compared with each other.
-        ignored: pairs of links that are not compared.
+        ignored: pairs of names of links that are not compared.
         posture: values of joints outside the chain [rad or m]; all others are zero. None: all are zero.
         seed: seed of the random postures that determine the excluded pairs.
 
@@ -267,7 +274,14 @@ def from_urdf(
 def _add_targets(
     model: NativeModel, geometry: NativeShape, chain: Chain, targets: np.ndarray | Sequence[Sequence[float]]
 ) -> None:
-    """Add thin capsules from the tip to each target to `geometry`; `targets` (T, 3) are in the tip's frame [m]."""
+    """Add thin capsules from the tip to each target to `geometry`; `targets` (T, 3) are in the tip's frame [m].
+
+    Args:
+        model: Pinocchio's model of the arm.
+        geometry: coal's shapes, to which is added.
+        chain: the arm.
+        targets: (T, 3) positions of the targets in the tip's frame [m].
+    """
     _, coal = _libraries()
     for number, position in enumerate(np.asarray(targets, dtype=float).reshape(-1, 3), 1):
         length = float(np.linalg.norm(position))
@@ -322,7 +336,13 @@ def _attach(
 def _surround(
     geometry: NativeShape, base_pose: NativeShape, walls: Sequence[Wall], obstacles: Sequence[Obstacle]
 ) -> None:
-    """Add walls and obstacles to `geometry`, fixed in the world, from their poses in the arm's base."""
+    """Add walls and obstacles to `geometry`, fixed in the world, from their poses in the arm's base.
+
+    Args:
+        geometry: coal's shapes, to which is added.
+        base_pose: pose of the arm's base in the world, as Pinocchio's SE3.
+        walls, obstacles: walls and obstacles in the base frame.
+    """
     pin, coal = _libraries()
 
     def add(name: str, shape: NativeShape, T_base_shape: np.ndarray) -> None:
@@ -342,7 +362,13 @@ def _solid(kind: str, sizes: Sequence[float]) -> NativeShape:
 
 
 def set_still(model: NativeModel, configurations: np.ndarray, posture: Mapping[str, float]) -> None:
-    """Write the values of joints outside the chain [rad or m], by name, into Pinocchio's configurations (m, nq)."""
+    """Write the values of joints outside the chain [rad or m], by name, into Pinocchio's configurations (m, nq).
+
+    Args:
+        model: Pinocchio's model.
+        configurations: (m, nq), changed in place.
+        posture: values of joints outside the chain [rad or m], by name.
+    """
     for name, value in posture.items():
         joint = model.joints[model.getJointId(name)]
         values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
@@ -350,7 +376,13 @@ def set_still(model: NativeModel, configurations: np.ndarray, posture: Mapping[s
 
 
 def _link_pose(model: NativeModel, link: str, posture: Mapping[str, float]) -> NativeShape:
-    """Return the pose of a link in Pinocchio's world; joints have the values in `posture`, or else zero."""
+    """Return the pose of a link in Pinocchio's world; joints have the values in `posture`, or else zero.
+
+    Args:
+        model: Pinocchio's model.
+        link: name of the link.
+        posture: values of joints by name [rad or m].
+    """
     pin, _ = _libraries()
     data = model.createData()
     configuration = pin.neutral(model)[None]
@@ -360,7 +392,14 @@ def _link_pose(model: NativeModel, link: str, posture: Mapping[str, float]) -> N
 
 
 def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], where: str) -> NativeShape | None:
-    """Return the coal shape of a <geometry> node; for an unreadable mesh None, and its name is added to `missing`."""
+    """Return the coal shape of a <geometry> node; for an unreadable mesh None, and its name is added to `missing`.
+
+    Args:
+        node: the XML element; None for a missing one, which has no shape.
+        folders: folders in which meshes are searched.
+        missing: names of unreadable meshes, extended in place.
+        where: name of the link in messages.
+    """
     kind = node.children[0] if node is not None and node.children else None
     if kind is None:
         refuse_robot(where, "<collision> without a shape: add a <geometry>")
@@ -377,7 +416,14 @@ def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], where
 
 
 def _hull(node: Node, folders: Sequence[Path], missing: list[str], where: str) -> NativeShape | None:
-    """Return the scaled convex hull of a mesh file; if it is unreadable None, and its name is added to `missing`."""
+    """Return the scaled convex hull of a mesh file; if it is unreadable None, and its name is added to `missing`.
+
+    Args:
+        node: the XML element <mesh>.
+        folders: folders in which the mesh is searched.
+        missing: names of unreadable meshes, extended in place.
+        where: name of the link in messages.
+    """
     _, coal = _libraries()
     name = node.attributes.get("filename", "")
     path = find_mesh(name, folders)
@@ -395,7 +441,12 @@ def _hull(node: Node, folders: Sequence[Path], missing: list[str], where: str) -
 
 
 def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
-    """Return the file of a mesh that a URDF names (a path, ``file://`` or ``package://``); None if it is not found."""
+    """Return the file of a mesh that a URDF names (a path, ``file://`` or ``package://``); None if it is not found.
+
+    Args:
+        name: the mesh as named in the URDF.
+        folders: folders in which it is searched.
+    """
     if name.startswith("file://"):
         name = name.removeprefix("file://")
     variants = [name]
@@ -440,7 +491,12 @@ def meshes_beside(path: Path) -> dict[str, Path | str]:
 
 
 def urdf_meshes(path: str | Path, tag: str) -> list[tuple[Node, Node, Node]]:
-    """Return each mesh in a URDF's ``<visual>`` or ``<collision>`` elements (`tag`): link, that element, and mesh."""
+    """Return each mesh in a URDF's ``<visual>`` or ``<collision>`` elements (`tag`): link, that element, and mesh.
+
+    Args:
+        path: the URDF.
+        tag: ``visual`` or ``collision``.
+    """
     meshes: list[tuple[Node, Node, Node]] = []
     for link in parse(text(path)[0], str(path)).all("link"):
         for node in link.all(tag):

@@ -163,6 +163,9 @@ def impossible_bodies(chain: Chain) -> tuple[str, ...]:
     A possible body has M > 0 and, about its centre of mass, positive principal moments of which none exceeds the sum of
     the others (triangle inequality; Wensing, Kim and Slotine, 2018, eq. 7). Its radius of gyration and the distance of
     its centre of mass are at most the stretched arm's length L. The whole arm weighs at most `MAX_DENSITY` L³.
+
+    Args:
+        chain: the arm, with the bodies' standard parameters; without them the result is ().
     """
     if chain.inertias is None:
         return ()
@@ -191,7 +194,7 @@ def _impossible(body: np.ndarray, length: float) -> str:
     """Return why a body with standard parameters (10,) is physically impossible; "" if it is possible.
 
     Args:
-        body: the standard parameters.
+        body: standard parameters XX XY XZ YY YZ ZZ MX MY MZ M about the joint's frame.
         length: length of the stretched arm [m].
     """
     mass = float(body[9])
@@ -231,7 +234,12 @@ def read(path: str | Path, propose_beta: bool = True) -> Chain:
 
 
 def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, ParsedTable]:
-    """Return the robot in a file, as `read` does, and the file's extra tables, as `read_extra` does."""
+    """Return the robot in a file, as `read` does, and the file's extra tables, as `read_extra` does.
+
+    Args:
+        path: the file.
+        propose_beta: whether `calib.robot.mdh` adds rotations beta; a file may switch this off itself.
+    """
     table = tables.load(path)
     if "leg" in table or table.get("kind") == "parallel":
         raise RobotError(
@@ -249,7 +257,11 @@ def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, Pars
 
 
 def read_extra(path: str | Path) -> ParsedTable:
-    """Return the extra tables of a robot file (those named in `EXTRA`) as plain dictionaries."""
+    """Return the extra tables of a robot file (those named in `EXTRA`) as plain dictionaries.
+
+    Args:
+        path: the file.
+    """
     return {key: value for key, value in tables.load(path).items() if key in EXTRA}
 
 
@@ -259,7 +271,7 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, object] | None = N
     Args:
         path: the file.
         chain: any chain.
-        extra: further tables by name (those named in `EXTRA`), written unchanged.
+        extra: further tables by name (those named in `EXTRA`), written unchanged; None for no such tables.
         source: source of the numbers, written as a comment.
     """
     tables.check_keys(extra or {}, EXTRA, f"robot '{chain.name}', extra tables")
@@ -303,7 +315,13 @@ def from_elements(table: Mapping[str, object], where: str) -> Chain:
 
 
 def _element(entry: ElementTable, n: int, where: str) -> Element:
-    """Return the element for a parsed table; `n` is the robot's number of joints, and `where` is used in messages."""
+    """Return the element for a parsed table; `n` is the robot's number of joints, and `where` is used in messages.
+
+    Args:
+        entry: the parsed table.
+        n: number of the robot's joints.
+        where: name of the table in messages.
+    """
     if entry.owner > n:
         refuse_robot(where, f"owner {entry.owner} is not an integer from 0 to {n}")
     if entry.joint is not None and entry.joint >= n:

@@ -67,7 +67,7 @@ def _walk(
 
 
 def sweep(chain: Chain, q: np.ndarray, base: np.ndarray | None = None, extra: np.ndarray | None = None) -> Sweep:
-    """Return axes and origins of all elements and the flange poses, in one pass along the chain for all poses.
+    """Return axes and origins of all K elements and the flange poses, in one pass along the chain for all poses.
 
     Args:
         chain: the arm.
@@ -91,8 +91,8 @@ def forward(chain: Chain, q: np.ndarray, extra: np.ndarray | None = None) -> np.
 
     Args:
         chain: the arm.
-        q: joint values.
-        extra: (K, m) displacements added to those of the elements (deflections) [m or rad]; None without.
+        q: (m, n) joint values [rad or m].
+        extra: (K, m) displacements added to those of the chain's K elements (deflections) [m or rad]; None without.
     """
     return sweep(chain, q, extra=extra).poses()
 
@@ -128,13 +128,26 @@ def element_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, index: np.n
 
 
 def jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the tip's Jacobian [v; ω] with respect to the values of all elements (observation Jacobian), (m, 6, K)."""
+    """Return the tip's Jacobian [v; ω] with respect to the values of all elements (observation Jacobian), (m, 6, K).
+
+    v is the velocity of the tip, ω its angular velocity, both in the base frame and per unit of an element's value.
+
+    Args:
+        chain: the arm, with K elements.
+        q: (m, n) joint values [rad or m].
+    """
     walked = sweep(chain, q)
     return element_jacobian(chain, walked, walked.position).transpose(2, 1, 0)
 
 
 def jacobian_product(chain: Chain, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-    """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, 6, K), with J the result of `jacobian`."""
+    """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, 6, K), with J the result of `jacobian`.
+
+    Args:
+        chain: the arm, with K elements.
+        q: (m, n) joint values [rad or m].
+        G: (m, 6, K) weights of the entries of J.
+    """
     walked = sweep(chain, q)
     columns = element_jacobian(chain, walked, walked.position)
     return twist_product(chain, columns, columns, np.arange(len(columns)), G.transpose(2, 1, 0)).T
@@ -145,8 +158,8 @@ def twist_product(
 ) -> np.ndarray:
     """Return Σ_k G_k · ∂J_k/∂q (n, m) for columns J_k = [v; ω] of a Jacobian of the arm.
 
-    Joint e rotates every column of a later element as a whole. For earlier elements (and for its own), it moves the
-    point:
+    v and ω are velocity and angular velocity of a point per unit of an element's value. Joint e rotates every column of
+    a later element as a whole. For earlier elements (and for its own), it moves the point:
 
         ∂J_k = [ω_e × v_k; ω_e × ω_k]  for k after e,   ∂J_k = [ω_k × v_e; 0]  otherwise
 
@@ -199,13 +212,25 @@ def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int |
 
 
 def tip_jacobian(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the tip's Jacobian (m, 6, n) [v; ω] with respect to the joints, at joint values q (m, n)."""
+    """Return the tip's Jacobian (m, 6, n) [v; ω] with respect to the joints, at joint values q (m, n).
+
+    v is the velocity of the tip, ω its angular velocity, both in the base frame and per unit joint velocity.
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+    """
     walked = sweep(chain, q)
     return joint_jacobian(chain, walked, walked.position)
 
 
 def moving_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the frames (moving, m, 4, 4) after all moving elements, including mimic followers, in the base."""
+    """Return the frames (moving, m, 4, 4) after all moving elements, including mimic followers, in the base.
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+    """
     q = shaped(q, (None, chain.n), f"joint values of '{chain.name}'")
     frames = np.zeros((len(chain.driven), len(q), 4, 4))
     frames[..., 3, 3] = 1.0
@@ -222,6 +247,10 @@ def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the frames (n, m, 4, 4) right after each joint's moving element, in the base.
 
     `Chain.inertias` refers to these frames.
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
     """
     frames = moving_frames(chain, q)
     if np.array_equal(chain.driven, chain.moving):
@@ -266,7 +295,7 @@ def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the cross products of two arrays (K, 3, m) along their middle axis."""
+    """Return the cross products a × b of two arrays (K, 3, m) along their middle axis."""
     x = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
     y = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
     z = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

@@ -143,7 +143,13 @@ class MdhFile(tables.RobotTable):
 
 
 def from_table(table: Mapping[str, object], where: str, propose_beta: bool = True) -> Chain:
-    """Return the chain for a parsed TOML table; `where` names the table in messages."""
+    """Return the chain for a parsed TOML table; `where` names the table in messages.
+
+    Args:
+        table: the parsed table.
+        where: name of the table in messages.
+        propose_beta: whether rotations beta are added to rows with nearly parallel axes; the table may switch this off.
+    """
     file = parse(MdhFile, table, where, RobotError)
     if not file.joint:
         refuse_robot(where, "no [[joint]] rows found; an MDH table needs one per axis")
@@ -307,7 +313,13 @@ def _row(entry: RowTable, next_index: int, where: str) -> Row:
 
 
 def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
-    """Return the MDH row for the elements `group` that share one number; the caller checks order and completeness."""
+    """Return the MDH row for the elements `group` that share one number; the caller checks order and completeness.
+
+    Args:
+        chain: the arm.
+        index: number in the elements' names.
+        group: the elements, in order.
+    """
     values: FieldValues = {element.name.removesuffix(str(index)): element.value for element in group}
     moving = [element for element in group if element.joint is not None]
     if not moving:

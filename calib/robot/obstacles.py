@@ -62,7 +62,12 @@ class Wall:
 
 
 def signed_distance(obstacle: Obstacle, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the signed distances (...) [m] of points (..., 3) from an obstacle, and the outward normals (..., 3)."""
+    """Return the signed distances (...) [m] of points (..., 3) from an obstacle, and the outward normals (..., 3).
+
+    Args:
+        obstacle: the obstacle.
+        points: positions in the arm's base frame [m].
+    """
     rotation = obstacle.placement[:3, :3]
     local = _in_obstacle_frame(obstacle, points)
     if obstacle.kind == "sphere":
@@ -96,7 +101,12 @@ def _in_obstacle_frame(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
 
 
 def _face_distances(obstacle: Obstacle, local: np.ndarray) -> np.ndarray:
-    """Return the signed distances (..., k) [m] of points (..., 3) in the obstacle's frame from its k faces."""
+    """Return the signed distances (..., k) [m] of points (..., 3) in the obstacle's frame from its k faces.
+
+    Args:
+        obstacle: the obstacle; k depends on its kind.
+        local: the points.
+    """
     if obstacle.kind == "box":
         return np.abs(local) - np.array(obstacle.size) / 2
     radius, length = obstacle.size
@@ -106,7 +116,12 @@ def _face_distances(obstacle: Obstacle, local: np.ndarray) -> np.ndarray:
 
 
 def _distance(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
-    """Return the signed distances (...) [m] of points (..., 3) from an obstacle, without normals."""
+    """Return the signed distances (...) [m] of points (..., 3) from an obstacle, without normals.
+
+    Args:
+        obstacle: the obstacle.
+        points: positions in the arm's base frame [m].
+    """
     local = _in_obstacle_frame(obstacle, points)
     if obstacle.kind == "sphere":
         return np.linalg.norm(local, axis=-1) - obstacle.size[0]

@@ -161,14 +161,22 @@ def vector(value: object, count: int, where: str, quantity: str = "") -> np.ndar
 
 
 def placement(table: object, where: str) -> np.ndarray:
-    """Return a transform (4, 4) from a table ``{xyz, rpy}`` [m, rad] or ``{matrix}`` (three or four rows)."""
+    """Return a transform (4, 4) from a table ``{xyz, rpy}`` [m, rad] or ``{matrix}`` (three or four rows).
+
+    Args:
+        table: the parsed TOML table.
+        where: name of the table in messages.
+    """
     if not isinstance(table, Mapping):
         refuse_robot(where, f"expected xyz and rpy, or matrix; found {shown(table)}")
     return config.parse(PlacementTable, table, where, RobotError).transform(where)
 
 
 def placement_table(transform: np.ndarray) -> dict[str, list]:
-    """Return a table that `placement` reads back exactly: xyz and rpy if these are exact, else the matrix."""
+    """Return a table that `placement` reads back exactly as `transform` (4, 4) [m].
+
+    It has xyz [m] and rpy [rad] if these are exact, else the matrix.
+    """
     xyz, rpy = to_xyz_rpy(transform)
     if np.array_equal(from_xyz_rpy(xyz, rpy), transform):
         table = {"xyz": xyz.tolist()}

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib import files
+from calib.data.poses.base_frame import relative_to_base
 from calib.data.poses.measurements import Poses, Positions
 from calib.data.poses.pose_lists import read_poses
 from calib.data.recordings.recording import Recording
@@ -29,7 +30,7 @@ from calib.robot.calibrated import evaluate
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.kinematics import gravity_torques
 from calib.simulation.unmodelled import PositionErrors, displacements, drooping
-from calib.transforms import invert, pose
+from calib.transforms import pose, to_quaternion
 
 # Names of the pose lists that a session plans, each with the name under which its measurement is stored.
 PLANS = (("poses", "measured"), ("validation_poses", "validation_measured"))
@@ -115,32 +116,52 @@ def measure(
         Poses, or positions if the instrument measures points only, with the sigmas that the instrument's maker states.
         These sigmas do not include drift and outliers.
     """
+    measured, bases = measure_frames(cell, q, seed, file, warm)
+    if bases is None:
+        return measured
+    return relative_to_base(measured, bases[:, :3, 3], to_quaternion(bases))
+
+
+def measure_frames(
+    cell: Cell, q: np.ndarray, seed: int | np.random.Generator = 0, file: str = "simulated", warm: float = np.inf
+) -> tuple[Positions, np.ndarray | None]:
+    """Return a simulated measurement of each pose in the instrument's frame, and the base LEDs measured with it.
+
+    The instrument's drift moves both.
+
+    Args:
+        cell, q, seed, file, warm: as of `measure`.
+
+    Returns:
+        Poses or positions, and the measured base frames (m, 4, 4); None without base LEDs.
+    """
     rng = np.random.default_rng(seed)
     instrument = cell.instrument
     true = true_poses(cell, q, warm=warm)
     measured = _noisy(true, instrument, rng)
-    no_lever = np.zeros((len(q), 3))
-    sigma, sigma_rotation = _stated(instrument, no_lever)
+    measured_bases = None
     if instrument.base_frame is not None:
         base = cell.truth.stations[0] @ instrument.base_frame
         base_poses = np.broadcast_to(base, measured.shape)
         measured_bases = _noisy(base_poses, instrument, rng)
-        measured = invert(measured_bases) @ measured
-        sigma, sigma_rotation = _stated(instrument, measured[:, :3, 3], frames=2)
-    position = measured[:, :3, 3] + _gross_errors(instrument, len(q), rng)
+    drift, outliers = _gross_errors(instrument, len(q), rng)
+    if measured_bases is not None:
+        measured_bases[:, :3, 3] += drift
+    position = measured[:, :3, 3] + drift + outliers
     recorded = np.asarray(q) + rng.normal(0.0, instrument.encoder_sigma, np.shape(q))
     common: FieldValues = {
-        "sigma": sigma,
+        "sigma": np.full((len(q), 3), instrument.position_sigma),
         "station": cell.truth.station_names[0],
         "tool_names": cell.truth.tool_names,
         "file": file,
     }
     joint_names = cell.nominal.joint_names
     if instrument.orientation_sigma is None:
-        return Positions(recorded, joint_names, position, **common)
+        return Positions(recorded, joint_names, position, **common), measured_bases
     turns = Rotation.from_matrix(measured[:, :3, :3])
     quaternion = turns.as_quat(canonical=True)
-    return Poses(recorded, joint_names, position, quaternion, sigma_rotation=sigma_rotation, **common)
+    sigma_rotation = np.full((len(q), 3), instrument.orientation_sigma)
+    return Poses(recorded, joint_names, position, quaternion, sigma_rotation=sigma_rotation, **common), measured_bases
 
 
 def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) -> Positions:
@@ -148,10 +169,14 @@ def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) 
 
     The direction follows from `seed`, so that several series can share it.
     """
+    return replace(measured, position=measured.position + drift_path(len(measured), drift, seed, begin))
+
+
+def drift_path(rows: int, drift: float, seed: int, begin: float = 0.0) -> np.ndarray:
+    """Return the displacements (m, 3) [m] of an instrument that drifts by `drift` [m], from `begin` (0 to 1) to 1."""
     direction = np.random.default_rng([seed, 5]).standard_normal(3)
-    share = np.linspace(begin, 1.0, len(measured))[:, None]
-    displacement = share * direction / np.linalg.norm(direction)
-    return replace(measured, position=measured.position + drift * displacement)
+    share = np.linspace(begin, 1.0, rows)[:, None]
+    return drift * share * direction / np.linalg.norm(direction)
 
 
 def _noisy(poses: np.ndarray, instrument: SimulatedInstrument, rng: np.random.Generator) -> np.ndarray:
@@ -164,26 +189,14 @@ def _noisy(poses: np.ndarray, instrument: SimulatedInstrument, rng: np.random.Ge
     return pose(turns @ poses[:, :3, :3], poses[:, :3, 3] + shift)
 
 
-def _stated(instrument: SimulatedInstrument, lever: np.ndarray, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Return the σ of position [m] and orientation [rad] that the instrument's maker states, each (m, 3).
-
-    Seen from a noisy base frame at the distance l, σ_x² = 2 σ_p² + σ_r² (l_y² + l_z²), and so on.
-    """
-    turning = instrument.orientation_sigma or 0.0
-    squares = lever**2
-    across = squares.sum(axis=1, keepdims=True) - squares
-    sigma = np.sqrt(frames * instrument.position_sigma**2 + turning**2 * across)
-    return sigma, np.full(lever.shape, turning * np.sqrt(frames))
-
-
-def _gross_errors(instrument: SimulatedInstrument, m: int, rng: np.random.Generator) -> np.ndarray:
-    """Return the position errors (m, 3) [m] of m rows from drift and outliers."""
+def _gross_errors(instrument: SimulatedInstrument, m: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return the position errors (m, 3) [m] of m rows from drift, and from outliers."""
     directions = rng.normal(size=(m + 1, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     drift = instrument.drift * np.linspace(0.0, 1.0, m)
     hit = rng.uniform(size=m) < instrument.outlier_share
     outliers = instrument.outlier_size * hit
-    return drift[:, None] * directions[-1] + outliers[:, None] * directions[:-1]
+    return drift[:, None] * directions[-1], outliers[:, None] * directions[:-1]
 
 
 def planned_poses(folder: Path, arm: Chain) -> Iterator[tuple[int, str, np.ndarray]]:
@@ -195,13 +208,16 @@ def planned_poses(folder: Path, arm: Chain) -> Iterator[tuple[int, str, np.ndarr
             yield number, name, read_poses(path, joints)
 
 
-def write_measured(measured: Positions, path: str | Path, degrees: bool = True) -> Path:
+def write_measured(
+    measured: Positions, path: str | Path, degrees: bool = True, bases: np.ndarray | None = None
+) -> Path:
     """Write poses or positions as CSV: joints in deg, positions in mm, as controllers and instruments give them.
 
     Args:
         measured: positions or poses of one target; every joint revolute where `degrees`.
         path: path of the file.
         degrees: False for SI units throughout.
+        bases: (m, 4, 4) base frames measured with every row, in the same frame as `measured`; None without base frame.
     """
     angle = 1.0
     length = 1.0
@@ -224,6 +240,10 @@ def write_measured(measured: Positions, path: str | Path, degrees: bool = True) 
     if isinstance(measured, Poses) and measured.sigma_rotation is not None:
         header += [f"sigma_r{axis} [rad]" for axis in "xyz"]
         columns.append(measured.sigma_rotation)
+    if bases is not None:
+        header += [f"base_{axis} [{length_unit}]" for axis in "xyz"]
+        header += [f"base_q{axis}" for axis in "xyzw"]
+        columns += [length * bases[:, :3, 3], to_quaternion(bases)]
     return files.write_numbers(path, header, np.hstack(columns))
 
 

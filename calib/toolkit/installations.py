@@ -21,6 +21,7 @@ from calib.geometry.observation import (
     step,
     target_jacobian,
 )
+from calib.geometry.weighing import calibrated_chain
 
 __all__ = [
     "DOF",
@@ -33,6 +34,7 @@ __all__ = [
     "Installation",
     "NoOptics",
     "base_columns",
+    "calibrated_chain",
     "check_scale",
     "conditions",
     "differences",

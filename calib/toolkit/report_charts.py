@@ -2,7 +2,19 @@
 
 from calib.procedure.report.charts import Chart, Layer, Panel, box, line, picture, text
 from calib.procedure.report.geometry_figures import error_histogram, error_map, parameter_changes
-from calib.procedure.report.style import AFTER, BEFORE, BROWN, INK, MARK, QUIET
+from calib.procedure.report.style import (
+    AFTER,
+    BEFORE,
+    BROWN,
+    INK,
+    MARK,
+    PAGE_WIDTH,
+    QUIET,
+    log_axis,
+    save,
+    sheet,
+    styled,
+)
 
 __all__ = [
     "AFTER",
@@ -10,6 +22,7 @@ __all__ = [
     "BROWN",
     "INK",
     "MARK",
+    "PAGE_WIDTH",
     "QUIET",
     "Chart",
     "Layer",
@@ -18,7 +31,11 @@ __all__ = [
     "error_histogram",
     "error_map",
     "line",
+    "log_axis",
     "parameter_changes",
     "picture",
+    "save",
+    "sheet",
+    "styled",
     "text",
 ]

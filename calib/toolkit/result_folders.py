@@ -19,7 +19,7 @@ from calib.procedure.robot_kinds import joints_of, stage_of
 from calib.results.result import Result, StoredResult
 from calib.results.result_classes import drawn, open_result
 from calib.results.scene import Drawn as DrawnRobot
-from calib.results.scene import ErrorSizes, Measured, Played, Scene, Torques, skeleton, strips, thinned
+from calib.results.scene import ErrorSizes, Measured, Played, Scene, Torques, TradeOffs, skeleton, strips, thinned
 
 __all__ = [
     "IN_SESSION",
@@ -47,6 +47,7 @@ __all__ = [
     "Shown",
     "StoredResult",
     "Torques",
+    "TradeOffs",
     "UnseenReport",
     "ValidationFolder",
     "ValidationMetrics",

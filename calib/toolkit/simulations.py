@@ -1,14 +1,24 @@
 """Simulation: virtual cells with known truth, and arms in closed loop with their controllers."""
 
 from calib.identification.closed_loop.controllers import Reference
-from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
+from calib.identification.closed_loop.simulation import (
+    Plant,
+    Sensing,
+    SimulatedRun,
+    feed_forward,
+    simulate,
+    tracking_error,
+)
 from calib.identification.loop import LoopController, LoopSettings
 from calib.simulation.camera_cell import CameraCell, limits_of, seen_by_camera, take_pictures
 from calib.simulation.cell import (
     Cell,
     SimulatedInstrument,
+    drift_path,
     measure,
+    measure_frames,
     planned_poses,
+    true_poses,
     wandering,
     write_log,
     write_measured,
@@ -22,7 +32,7 @@ from calib.simulation.truth import TRUTH, share_within, true_base
 from calib.simulation.truth import position_errors as true_position_errors
 from calib.simulation.truth import torque_errors as true_torque_errors
 from calib.simulation.virtual_arm import REST, MovingArm, carrying, moving_arm, play, record, sensed
-from calib.simulation.virtual_cells import perturbed_cell, rigid, virtual_cell
+from calib.simulation.virtual_cells import lwr4plus_cell, perturbed_cell, rigid, virtual_cell
 
 __all__ = [
     "REST",
@@ -38,11 +48,14 @@ __all__ = [
     "SimulatedInstrument",
     "SimulatedRun",
     "carrying",
+    "drift_path",
     "feed_forward",
     "known_plant",
     "known_truth",
     "limits_of",
+    "lwr4plus_cell",
     "measure",
+    "measure_frames",
     "moving_arm",
     "perturbed_cell",
     "planned_poses",
@@ -57,7 +70,9 @@ __all__ = [
     "share_within",
     "simulate",
     "take_pictures",
+    "tracking_error",
     "true_base",
+    "true_poses",
     "true_position_errors",
     "true_torque_errors",
     "virtual_cell",

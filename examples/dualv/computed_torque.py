@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.dynamics import rigid_body
-from calib.identification.closed_loop.controllers import Reference
-from calib.identification.closed_loop.simulation import Sensing, added_inertia
-from calib.identification.loop import LoopController
+from calib.identification.closed_loop.simulation import added_inertia
 from calib.parallel.mechanism.mechanism_simulation import ParallelPlant
 from calib.parallel.mechanism.parallel_model import ParallelModel, along, wrench_regressor
 from calib.parallel.mechanism.velocities import LoopMotion
+from calib.toolkit.simulations import LoopController, Reference, Sensing
 
 
 @dataclass(frozen=True, eq=False)

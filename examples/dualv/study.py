@@ -25,19 +25,17 @@ import matplotlib.pyplot as plt
 import numpy as np
 from computed_torque import ComputedTorque, ParallelRun, simulate
 
-from calib.data.recordings.recording import Recording
-from calib.data.signals.motion import FilterOptions, make_motion
 from calib.estimation.essential import Rule, eliminate
-from calib.estimation.estimate import Estimate
-from calib.identification.identify import Identification, identify_model
-from calib.identification.prediction import predict
-from calib.identification.rows import Case, make_case
-from calib.identification.settings import IdentificationSettings
+from calib.identification.identify import identify_model
 from calib.parallel.excite import ParallelExcitation, design_parallel
 from calib.parallel.mechanism.parallel_model import make_parallel_model, rows_named
 from calib.parallel.mechanism.velocities import distributed, overconstraint
 from calib.parallel.robots import find
 from calib.procedure.excitation.settings import ExcitationSettings
+from calib.toolkit.model_identification import Identification
+from calib.toolkit.recordings import FilterOptions, Recording, make_motion
+from calib.toolkit.statistics import Estimate
+from calib.toolkit.torque_models import Case, IdentificationSettings, make_case, predict
 
 RATE, SECONDS = 1000.0, 6.0  # of a recording: Hz, s
 PAYLOAD = {"M5": 5.37, "MX5": -0.127, "ZZ5": 0.0161}  # truth: mass as weighed, the others as the papers identify them

@@ -27,26 +27,20 @@ import study_options
 import study_tables
 
 from calib import files
-from calib.data.recordings.recording import Recording
 from calib.data.signals.filtering import decimate
-from calib.data.signals.motion import FilterOptions, make_motion
-from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.torque_rows import torque_rows
 from calib.errors import TaskLost
-from calib.geometry.first_guess import install
-from calib.geometry.fit import fit
-from calib.geometry.weighing import calibrated_chain
-from calib.identification.closed_loop.controllers import Reference
-from calib.identification.identify import Identification, chain_states, common_decimator, find_base, identify
-from calib.identification.rows import Case, make_case
-from calib.identification.settings import IdentificationSettings, Payload, make_model
+from calib.identification.identify import chain_states, common_decimator, find_base
 from calib.identification.uncertainty import geometry_uncertainty
-from calib.robot.calibrated import CalibratedChain
-from calib.robot.chain import Chain, random_joints
 from calib.simulation import known_robots
-from calib.simulation.cell import Cell, SimulatedInstrument, measure
-from calib.simulation.known_robots import random_fourier
-from calib.simulation.virtual_cells import lwr4plus_cell
+from calib.toolkit.chains import CalibratedChain, Chain, random_joints
+from calib.toolkit.installations import calibrated_chain, install
+from calib.toolkit.installations import fit_installation as fit
+from calib.toolkit.model_identification import Identification, identify
+from calib.toolkit.recordings import FilterOptions, Recording, make_motion
+from calib.toolkit.sessions import Payload
+from calib.toolkit.simulations import Cell, Reference, SimulatedInstrument, lwr4plus_cell, measure, random_fourier
+from calib.toolkit.torque_models import Case, IdentificationSettings, make_case, make_model, standard_parameters
 from calib.workers import workers
 
 PAYLOAD = "8"

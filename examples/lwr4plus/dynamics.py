@@ -29,19 +29,15 @@ from simulated_arm import TABLE_4, Data, collected, controller, model, nominal_b
 
 from calib import files
 from calib.dynamics import base as bases
-from calib.dynamics.base import Base
-from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.torque_rows import BOTH, MODELS, MOTOR, TorqueRows
+from calib.dynamics.torque_rows import MODELS
 from calib.estimation.essential import Elimination, Rule, eliminate
-from calib.estimation.linear import LinearFit, settled_std, wls
-from calib.identification.closed_loop.controllers import Reference
-from calib.identification.closed_loop.simulation import Plant, feed_forward, tracking_error
-from calib.identification.rows import observe
 from calib.procedure.excitation import coefficients
-from calib.procedure.report.style import AFTER, INK, PAGE_WIDTH, QUIET, save, sheet, styled
-from calib.robot.chain import Chain
 from calib.simulation import lwr4plus
-from calib.simulation.known_robots import random_fourier
+from calib.toolkit.chains import Chain
+from calib.toolkit.report_charts import AFTER, INK, PAGE_WIDTH, QUIET, save, sheet, styled
+from calib.toolkit.simulations import Plant, Reference, feed_forward, random_fourier, tracking_error
+from calib.toolkit.statistics import LinearFit, settled_std, wls
+from calib.toolkit.torque_models import BOTH, MOTOR, Base, IdentificationModel, TorqueRows, observe
 
 REACH = 0.8 * np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
 SPEED = 0.8 * np.deg2rad([110.0, 110.0, 128.0, 128.0, 204.0, 184.0, 184.0])

@@ -42,28 +42,22 @@ from simulated_arm import PAYLOAD, TABLE_4, Data, collected, model, nominal_base
 from calib import files
 from calib.api.motions import ExcitationDesign
 from calib.dynamics import base as bases
-from calib.dynamics.base import Base
-from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.load_cases import LoadCases
-from calib.dynamics.torque_rows import BOTH, MOTOR
-from calib.estimation.linear import settled_std, wls
 from calib.estimation.triangles import combine
-from calib.geometry.first_guess import install
-from calib.geometry.fit import fit
-from calib.geometry.weighing import calibrated_chain
-from calib.identification.closed_loop.controllers import Reference
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.design import Designed, search_motion
 from calib.procedure.excitation.excited_model import excited_model
 from calib.procedure.excitation.inputs import ExcitationInputs, IdentifiableColumns
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
-from calib.procedure.report.style import save
-from calib.robot.chain import Chain, random_joints
 from calib.robot.tables import dumps
 from calib.simulation import lwr4plus
-from calib.simulation.cell import measure
-from calib.simulation.virtual_cells import lwr4plus_cell
+from calib.toolkit.chains import Chain, random_joints
+from calib.toolkit.installations import calibrated_chain, install
+from calib.toolkit.installations import fit_installation as fit
+from calib.toolkit.report_charts import save
+from calib.toolkit.simulations import Reference, lwr4plus_cell, measure
+from calib.toolkit.statistics import settled_std, wls
+from calib.toolkit.torque_models import BOTH, MOTOR, Base, IdentificationModel, LoadCases
 from calib.trajectories.design.objectives import condition_numbers
 from calib.workers.threads import one_blas_thread
 

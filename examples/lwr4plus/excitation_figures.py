@@ -8,10 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from simulated_arm import TABLE_4
 
-from calib.identification.closed_loop.controllers import Reference
-from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, log_axis, sheet, styled
-from calib.robot.chain import Chain
-from calib.robot.kinematics import forward
+from calib.toolkit.chains import Chain, forward
+from calib.toolkit.report_charts import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, log_axis, sheet, styled
+from calib.toolkit.simulations import Reference
 
 
 def paths(chain: Chain, motions: dict[str, Reference]) -> Figure:

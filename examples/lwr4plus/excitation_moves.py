@@ -7,9 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from calib.identification.closed_loop.controllers import Reference
-from calib.robot.chain import Chain
-from calib.robot.kinematics import forward
+from calib.toolkit.chains import Chain, forward
+from calib.toolkit.simulations import Reference
 
 SHARE = 0.9  # of the limits of position, velocity and torque
 INSIDE = np.linspace(0.0, 1.0, 60)

@@ -41,14 +41,11 @@ from matplotlib.figure import Figure
 
 from calib import files
 from calib.dynamics import base, drives
-from calib.dynamics.base import BaseModel
-from calib.dynamics.bodies import bodies_of, standard_parameters
-from calib.dynamics.idim import IdentificationModel
 from calib.procedure.excitation.limits import Points
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS
-from calib.procedure.report.style import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, save, sheet, styled
-from calib.robot.chain import Chain
-from calib.robot.library import load
+from calib.toolkit.chains import Chain, load
+from calib.toolkit.report_charts import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, save, sheet, styled
+from calib.toolkit.torque_models import BaseModel, IdentificationModel, bodies_of, standard_parameters
 from calib.trajectories.constraints import TorqueLimit, box_limits
 from calib.trajectories.design import search
 from calib.trajectories.design.objectives import Excitation, condition_numbers

@@ -21,12 +21,8 @@ import study_options
 import study_tables
 
 from calib import files
-from calib.data.poses.measurements import Positions
 from calib.geometry.accuracy import errors
-from calib.geometry.first_guess import install
-from calib.geometry.fit import GeometricFit, Settings, fit, fit_with_prior, parameter_values, polish_frames
-from calib.geometry.installation import Installation, see
-from calib.geometry.observation import prepare
+from calib.geometry.fit import GeometricFit, Settings, fit_with_prior, parameter_values, polish_frames
 from calib.poses.candidates import draw_candidates
 from calib.poses.continuous.tabu import TabuRule
 from calib.poses.indices import Index, observability
@@ -34,11 +30,13 @@ from calib.poses.select import Method, SearchSettings, Selection, random_baselin
 from calib.poses.space import PoseConstraint, SearchSpace, is_feasible
 from calib.poses.whole_space import bound_over_space
 from calib.robot import mdh
-from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import jacobian, jacobian_product
 from calib.simulation import lwr4plus
-from calib.simulation.cell import SimulatedInstrument, measure, true_poses
-from calib.simulation.virtual_cells import lwr4plus_cell, rigid
+from calib.toolkit.chains import Chain, random_joints
+from calib.toolkit.installations import Installation, install, prepare, see
+from calib.toolkit.installations import fit_installation as fit
+from calib.toolkit.pose_data import Positions
+from calib.toolkit.simulations import SimulatedInstrument, lwr4plus_cell, measure, rigid, true_poses
 from calib.transforms import invert
 
 LIMITS = np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])

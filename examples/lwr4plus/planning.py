@@ -24,13 +24,11 @@ import study_tables
 
 from calib import files
 from calib.dynamics import base, drives
-from calib.dynamics.base import BaseModel
-from calib.dynamics.bodies import bodies_of, standard_parameters
-from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.path_dynamics import PathDynamics, of_standard
 from calib.robot import description, library
-from calib.robot.chain import Chain, random_joints
-from calib.simulation.known_robots import truth
+from calib.toolkit.chains import Chain, random_joints
+from calib.toolkit.simulations import known_truth as truth
+from calib.toolkit.torque_models import BaseModel, IdentificationModel, bodies_of, standard_parameters
 from calib.trajectories.errors import BadInput
 from calib.trajectories.timing.path import Path as JointPath
 from calib.trajectories.timing.path import check_within, spline

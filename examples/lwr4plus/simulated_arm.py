@@ -12,21 +12,27 @@ from functools import cache
 
 import numpy as np
 
-from calib.data.recordings.recording import Recording
-from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
 from calib.dynamics import drives
-from calib.dynamics.base import Base
-from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
-from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.torque_rows import LINK, MOTOR, TorqueRows
 from calib.estimation.triangles import Triangles, absorb, empty
-from calib.identification.closed_loop.controllers import Reference, pd
-from calib.identification.closed_loop.simulation import Plant, Sensing, feed_forward, simulate
-from calib.identification.loop import LoopController
-from calib.identification.rows import Case, make_case, observe
-from calib.robot.chain import Chain
+from calib.identification.closed_loop.controllers import pd
 from calib.simulation import known_robots, lwr4plus
+from calib.toolkit.chains import Chain
+from calib.toolkit.recordings import FilterOptions, Recording, make_motion
+from calib.toolkit.simulations import LoopController, Plant, Reference, Sensing, feed_forward, simulate
+from calib.toolkit.torque_models import (
+    LINK,
+    MOTOR,
+    Base,
+    Case,
+    IdentificationModel,
+    TorqueRows,
+    bodies_of,
+    make_case,
+    observe,
+    standard_parameters,
+    with_payload,
+)
 from calib.transforms import pose
 
 PAYLOAD = "8"

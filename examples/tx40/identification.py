@@ -28,26 +28,22 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.data.recordings.recording import Recording
-from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import base as bases
-from calib.dynamics.base import Base
-from calib.dynamics.idim import IdentificationModel
 from calib.errors import CalibError, NotConverged
 from calib.estimation.essential import Rule, eliminate
-from calib.estimation.linear import LinearFit, subsystem_std
+from calib.estimation.linear import subsystem_std
 from calib.estimation.triangles import collect, combine
 from calib.estimation.whiteness import examine
-from calib.identification.closed_loop.controllers import Reference, identify_controller, pd
+from calib.identification.closed_loop.controllers import identify_controller, pd
 from calib.identification.closed_loop.instrumental import Instrumental, Round, identify_instrumental
 from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
-from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, simulate
-from calib.identification.loop import LoopController
-from calib.identification.methods.constraint_settings import ConstraintSettings
 from calib.identification.methods.parameter_constraints import hold, make_constraints
-from calib.identification.rows import Case, make_case, observe
 from calib.simulation import known_robots
-from calib.simulation.known_robots import random_fourier, trapezoidal
+from calib.simulation.known_robots import trapezoidal
+from calib.toolkit.recordings import FilterOptions, Recording, make_motion
+from calib.toolkit.simulations import LoopController, Plant, Reference, Sensing, SimulatedRun, random_fourier, simulate
+from calib.toolkit.statistics import LinearFit
+from calib.toolkit.torque_models import Base, Case, ConstraintSettings, IdentificationModel, make_case, observe
 
 RATE, EVERY = 5000.0, 5
 FILTERS = FilterOptions(cutoff=50.0, band=20.0, clock="stamps")

@@ -12,15 +12,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.data.recordings.recording import Recording
-from calib.data.signals.motion import FilterOptions, make_motion
-from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.idim import from_chain
-from calib.dynamics.torque_rows import MOTOR, POWER, TorqueRows
-from calib.identification.identify import Identification, chain_states, identify_model
-from calib.identification.rows import Case, make_case
-from calib.identification.settings import IdentificationSettings
-from calib.robot.library import load
+from calib.identification.identify import chain_states, identify_model
+from calib.toolkit.chains import load
+from calib.toolkit.model_identification import Identification
+from calib.toolkit.recordings import FilterOptions, Recording, make_motion
+from calib.toolkit.torque_models import (
+    MOTOR,
+    POWER,
+    Case,
+    IdentificationSettings,
+    TorqueRows,
+    make_case,
+    standard_parameters,
+)
 
 RATE, SECONDS, PERIOD, NOISE = 500.0, 20.0, 10.0, 0.03
 DRIVES = {"Ia": 0.05, "Fv": 2.0, "Fc": 3.0}  # of joint 1; a tenth of them at joint 6

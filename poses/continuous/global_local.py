@@ -11,7 +11,6 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 
-import nlopt
 import numpy as np
 
 from ..continuous.local import FEASIBLE, SHARPNESS, Improved, improved, merit_of, restored
@@ -43,6 +42,8 @@ def mlsl_search(
         evaluations: largest number of evaluations of the index, in MLSL and local search together.
         seconds: limit of processor time [s], for MLSL and local search together.
     """
+    import nlopt
+
     began = time.process_time()
     spent = 0
     best = -np.inf
@@ -93,7 +94,14 @@ def mlsl_search(
 
 
 def _charged(space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None) -> tuple[float, np.ndarray]:
-    """Return the smoothed merit of poses q (m, n), less the penalty for violated constraints, and its gradient."""
+    """Return the smoothed merit of poses q (m, n), less the penalty for violated constraints, and its gradient.
+
+    Args:
+        space: limits, constraints and Jacobian; a violated constraint is penalised quadratically.
+        q: (m, n) joint values [rad or m].
+        index: observability index to maximise.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+    """
     value, gradient = merit_of(space, q, index, existing, SHARPNESS[0])
     broken = np.maximum(constraint_values(space, q), 0.0)
     by_q = np.einsum("mk,mkn->mn", broken, constraint_gradients(space, q))

@@ -58,7 +58,7 @@ def merit_of(
     Args:
         space: provides the Jacobian and its derivative product.
         q: (m, n) poses [rad or m].
-        index: "O1" ... "O5", "cond".
+        index: the observability index O, "O1" ... "O5" or "cond".
         existing: Jacobians (k, rows, p), or stacked (k rows, p), of poses whose information is added but which are not
             changed; None for no such poses.
         sharpness: sharpness of the smoothing, see `calib.poses.indices.merit`; infinite for the index itself.
@@ -167,7 +167,18 @@ def _search(
     sharpness: Sequence[float],
     deadline: float,
 ) -> Improved:
-    """Run all stages from one start and return the best set that satisfies the constraints; ignore the predicate."""
+    """Run all stages from one start and return the best set that satisfies the constraints; ignore the predicate.
+
+    Args:
+        space: limits, constraints, Jacobian.
+        start: (m, n) poses [rad or m].
+        index: observability index to improve.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+        evaluations: largest number of evaluations of index and gradient in all stages together.
+        tolerance: gain of the merit below which the last stage ends (`improved`).
+        sharpness: sharpness of the smoothing in each stage.
+        deadline: value of `time.process_time` [s] at which the search ends.
+    """
     feasible = bool(_keeps(space, start).all())
     best = start
     value = -np.inf
@@ -308,6 +319,11 @@ def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
     """Return poses (m, n) corrected to satisfy the constraints, by Newton steps of least norm within the joint limits.
 
     A pose that still violates a constraint after `steps` steps is returned in its last state.
+
+    Args:
+        space: limits and constraints; its predicate is not checked.
+        q: (m, n) joint values [rad or m].
+        steps: largest number of Newton steps.
     """
     q = np.clip(q, space.lower, space.upper)
     for _ in range(steps if space.constraints else 0):
@@ -336,13 +352,18 @@ def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
 
 
 def _keeps(space: SearchSpace, q: np.ndarray) -> np.ndarray:
-    """Return whether each pose q (m, n) satisfies the constraints, (m,) bool; the predicate is not checked."""
+    """Return whether each pose q (m, n) satisfies the constraints of `space`, (m,) bool; the predicate is ignored."""
     satisfied = constraint_values(space, q) <= FEASIBLE
     return np.asarray(satisfied.all(axis=1))
 
 
 def _with_rows(space: SearchSpace, q: np.ndarray, existing: np.ndarray | None) -> np.ndarray | None:
-    """Return the Jacobian rows (R, p) of the poses q, followed by those of `existing`; `existing` where q is empty."""
+    """Return the Jacobian rows (R, p) of the poses q, followed by those of `existing`; `existing` where q is empty.
+
+    Args:
+        space: provides the Jacobian of the poses q (m, n).
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+    """
     if not len(q):
         return existing
     rows = np.asarray(space.jacobian(q), dtype=float)

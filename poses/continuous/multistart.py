@@ -12,7 +12,14 @@ from ..space import SearchSpace
 
 
 def random_starts(q: np.ndarray, m: int, count: int, seed: int) -> list[np.ndarray]:
-    """Return `count` random sets (m, n) of the candidates q (N, n), each drawn by its own generator."""
+    """Return `count` random sets (m, n) of the candidates q (N, n), each drawn by its own generator.
+
+    Args:
+        q: (N, n) joint values of the candidates [rad or m].
+        m: number of poses in each set, drawn without repetition.
+        count: number of sets.
+        seed: seed from which the generators of all sets are derived.
+    """
     generators = np.random.default_rng(seed).spawn(count)
     return [q[generator.choice(len(q), m, replace=False)] for generator in generators]
 
@@ -39,7 +46,7 @@ def multistart_search(
         seconds: limit of processor time [s]; where it is finite the starts run in this process, one after another,
             until the time is used up.
         map: the builtin, or a parallel map that returns results in order.
-        report: called after each start with its number and result; None for no report.
+        report: called after each start with its index (from 0) and its result; None for no report.
 
     Raises:
         ValueError: no starts.
@@ -86,7 +93,13 @@ def _one(
 
 
 def _in_time(work: Callable[..., Improved], starts: Sequence[np.ndarray], deadline: float) -> Iterator[Improved]:
-    """Yield the results of the searches that begin before `deadline` [s of process time]; the first always runs."""
+    """Yield the results of the searches that begin before `deadline` [s of process time]; the first always runs.
+
+    Args:
+        work: runs the search from one start (m, n).
+        starts: sets (m, n) of poses [rad or m], in the order of the searches.
+        deadline: value of `time.process_time` [s].
+    """
     for number, start in enumerate(starts):
         if number and time.process_time() >= deadline:
             return

@@ -128,6 +128,15 @@ def _newcomer(
     """Return a pose (n,) to add to `poses`, improved by a local search, and the number of evaluations used.
 
     The drawn and the improved pose are added to the tabu list.
+
+    Args:
+        space: limits, constraints, predicate, Jacobian.
+        poses: (n,) joint values of each pose chosen so far, which remain fixed.
+        index: observability index to improve.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+        generator: source of the random poses.
+        listed: the tabu list of poses (n,), extended in place.
+        rule: settings of the tabu search.
     """
 
     def allowed(q: np.ndarray) -> np.ndarray:
@@ -164,7 +173,12 @@ def _newcomer(
 
 
 def _spanning(rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
-    """Return log det(εI + information) (K,) of `rows` with each of K Jacobians added, columns scaled by their rms."""
+    """Return log det(εI + information) (K,) of `rows` with each of K Jacobians added, columns scaled by their rms.
+
+    Args:
+        rows: (R, p) Jacobian rows of the poses chosen so far.
+        jacobians: (K, rows, p) Jacobians of the poses that may be added.
+    """
     mean_squares = (jacobians**2).mean((0, 1))
     scale = np.sqrt(mean_squares)
     scale = np.where(scale > 0, scale, 1.0)
@@ -179,7 +193,15 @@ def _spanning(rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
 def _least_useful(
     space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None, spared: set[int]
 ) -> int:
-    """Return the number of the pose whose removal leaves the largest merit, among the poses not in `spared`."""
+    """Return the index into q of the pose whose removal leaves the largest merit, among the poses not in `spared`.
+
+    Args:
+        space: provides the Jacobian.
+        q: (m, n) poses chosen so far [rad or m].
+        index: observability index of the merit.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+        spared: indices into q of poses that are not removed.
+    """
     jacobians = np.asarray(space.jacobian(q), dtype=float)
     parameters = jacobians.shape[2]
     measured_rows = np.zeros((0, parameters))
@@ -195,7 +217,13 @@ def _least_useful(
 
 
 def _fixed(space: SearchSpace, poses: list[np.ndarray], existing: np.ndarray | None) -> np.ndarray | None:
-    """Return the Jacobian rows (R, p) of `poses` and of those measured before; `existing` where `poses` is empty."""
+    """Return the Jacobian rows (R, p) of `poses` and of those measured before; `existing` where `poses` is empty.
+
+    Args:
+        space: provides the Jacobian.
+        poses: (n,) joint values of each pose [rad or m].
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+    """
     if not poses:
         return existing
     q = np.array(poses)

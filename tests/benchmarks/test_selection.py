@@ -4,7 +4,7 @@ import library_arm
 import pytest
 
 from calib.poses.convex import bound
-from calib.poses.select import select_poses
+from calib.poses.select import SearchSettings, select_poses
 
 CASES = {
     "17 of 2000, pose": (2000, 17, library_arm.jacobian),
@@ -30,3 +30,11 @@ def test_bound(benchmark, case):
     jacobians = function(library_arm.random_poses(count, 0))
     result = benchmark.pedantic(bound, (jacobians, m), rounds=3 if count < 5000 else 1, warmup_rounds=1)
     benchmark.extra_info["gap"] = result.gap
+
+
+@pytest.mark.parametrize("index", ["O3", "O4", "cond"])
+def test_select_by_index(benchmark, index):
+    """Restarts included: their effort is a number of trial sets."""
+    jacobians = library_arm.jacobian(library_arm.random_poses(2000, 0))
+    chosen = benchmark.pedantic(select_poses, (jacobians, 17, SearchSettings(index=index)), rounds=1)
+    benchmark.extra_info.update({"value": chosen.value, "random": chosen.random_baseline})

@@ -11,6 +11,7 @@ import planted_motion as planted
 import pytest
 
 from calib import cli, files
+from calib.data.csv_table import read_table
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.signals.filtering import decimate, design_decimator, spread
 from calib.dynamics import base as bases
@@ -185,6 +186,10 @@ def test_command_carries_covariance_of_fit(tmp_path, capsys):
     assert [row["element"] for row in ranked if row["sigma"]] == ["shoulder", "up"]
     assert {row["element"] for row in ranked} > {"gravity.rx", "turn", "fore"}
     assert (out / "plot_geometries.png").is_file() and (out / "geometries.csv").is_file()
+    torques = read_table(out / "torques_1.csv")
+    measured, predicted, nominal = (torques.block(name) for name in ("measured", "predicted", "nominal"))
+    errors = [np.sqrt(np.mean((measured - torque) ** 2)) for torque in (predicted, nominal)]
+    assert np.abs(nominal - predicted).max() > 0.0 and errors[1] == pytest.approx(errors[0], rel=0.5)
     assert "which geometric errors matter" in capsys.readouterr().out
     kept = calibrated.read(out).covariance
     assert kept is not None and kept[1, 1] == pytest.approx(1e-6), "the identified robot carries it on"

@@ -10,6 +10,7 @@ import pytest
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.dynamics import rigid_body
+from calib.dynamics.torque_rows import DRIVE
 from calib.identification.identify import Identification, identify
 from calib.identification.link_motion import with_link_motion
 from calib.identification.prediction import predict
@@ -109,6 +110,20 @@ def test_stiffness_slope_is_that_of_refits():
     assert np.linalg.norm((slopes[:, 1] - expected) / sigma) < 0.05 * np.linalg.norm(expected / sigma)
     carried = propagate(found, arm, [case])  # the geometry is exact, the springs are not
     np.testing.assert_allclose(carried.sigma_geometry, 1e-5 * np.linalg.norm(slopes, axis=1), rtol=1e-9)
+
+
+def test_drives_alone_feel_no_deflection():
+    """Model 3 (tau_m - tau_l) has no bodies, so that joint corrections do not change its estimate."""
+    t, q, v, a = planted.motion(1)
+    noise = 0.1 * np.random.default_rng(1).normal(size=q.shape)
+    link = rigid_body.inverse_dynamics(planted.model().bodies, planted.INERTIAS.ravel(), q, v, a)
+    names = ("joint1", "joint2", "joint3")
+    log = Recording(t, q, planted.torques(q, v, a) + noise, "torque", names, tau_link=link, file="drives")
+    case = make_case("drives", make_motion(log, FilterOptions(cutoff=40.0, band=8.0)), DRIVE)
+    settings, arm = replace(SETTINGS, torque_rows=DRIVE), robot(sigma=1e-5)
+    found = identify(arm, [case], settings)
+    assert not deflection_sensitivity(found, arm, [case]).any()
+    assert not propagate(found, arm, [case]).sigma_geometry.any()
 
 
 def test_masses_of_springs_survive_the_file(tmp_path):

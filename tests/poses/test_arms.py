@@ -81,9 +81,10 @@ def test_far_local_search_stays_feasible(name, index, file):
 
 @pytest.mark.parametrize("name", [*ARMS, "motley"])
 @pytest.mark.parametrize("kind", ["pose", "position"])
-def test_the_derivative_product_is_exact(name, kind):
+@pytest.mark.parametrize("reference", [False, True])
+def test_the_derivative_product_is_exact(name, kind, reference):
     chain = motley() if name == "motley" else ARMS[name]()
-    seen = observation(targets_of(chain, [(0.05, 0.02, 0.1), (0.0, -0.1, 0.02)]), kind)
+    seen = observation(targets_of(chain, [(0.05, 0.02, 0.1), (0.0, -0.1, 0.02)]), kind, reference=reference)
     rng = np.random.default_rng(3)
     q = rng.uniform(-1, 1, (2, chain.n))
     weights = rng.normal(size=seen(q).shape)

@@ -7,6 +7,7 @@ import library_arm
 import numpy as np
 import pytest
 
+from calib.poses.by_index import merits
 from calib.poses.candidates import draw_candidates
 from calib.poses.convex import bound, certificate
 from calib.poses.design import Pool, best_addition, design_of, gains_of, with_added, with_removed
@@ -127,6 +128,31 @@ def test_other_indices_beat_d_optimal_sets(index):
         assert chosen.value >= start and chosen.value > chosen.random_baseline
 
 
+@pytest.mark.parametrize("index", ["O2", "O3", "O4", "O5", "cond"])
+def test_every_index_finds_the_best_of_all_sets(index):
+    """Without restarts a third of these searches ends at a local optimum."""
+    for seed in range(4):
+        jacobians = np.random.default_rng(seed).normal(size=(13, 2, 6))
+        values = [observability(jacobians[list(members)], index) for members in combinations(range(13), 5)]
+        best = min(values) if index == "cond" else max(values)
+        chosen = select_poses(jacobians, 5, SearchSettings(index=index, seed=seed))
+        assert chosen.value == pytest.approx(best, rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("index", ["O3", "O4"])
+def test_single_singular_values_reach_the_optimum_of_the_arm(index):
+    """7 of 18 poses of the LWR4+, against all 31,824 sets."""
+    jacobians = ARM[:18]
+    squares = jacobians.transpose(0, 2, 1) @ jacobians
+    best = -np.inf
+    everything = np.array(list(combinations(range(18), 7)))
+    for members in np.array_split(everything, 16):
+        best = max(best, merits(squares[members].sum(axis=1), index).max())
+    chosen = select_poses(jacobians, 7, SearchSettings(index=index))
+    assert chosen.value == pytest.approx(np.exp(best), rel=1e-6)
+
+
 def test_o1_selection_does_not_see_units():
     scale = 10.0 ** np.random.default_rng(1).uniform(-3, 3, ARM.shape[2])
     one, other = of_the_arm(), select_poses(ARM * scale, 17)
@@ -221,3 +247,10 @@ def test_bound_is_tight_with_few_candidates(spare):
     if spare <= 2:
         best = max(combinations(range(17 + spare), 17), key=lambda s: log_det_of(few[list(s)]))
         assert tuple(chosen.indices) == best
+
+
+@pytest.mark.parametrize("index", ["cond", "O3"])
+def test_as_many_poses_as_candidates_are_all_of_them(index):
+    """Where every candidate is chosen there is nothing to exchange."""
+    chosen = select_poses(ARM[:20], 20, SearchSettings(index))
+    assert chosen.indices.tolist() == list(range(20))

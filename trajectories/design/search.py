@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
-import nlopt
 import numpy as np
 from scipy.optimize import minimize
 
@@ -19,6 +18,9 @@ from ..basis import Basis
 from ..design.problem import Evaluation, ExcitationProblem, critical_times, evaluate, is_condition, merit, unmet
 from ..design.starts import random_start, shrunk
 from ..errors import NotExciting
+
+if TYPE_CHECKING:
+    import nlopt
 
 Method = Literal["slsqp", "auglag", "mma", "ccsaq"]
 
@@ -397,6 +399,8 @@ class StartSearch:
                 slope[:] = 2 * over @ evaluation.rows
             return float((over**2).sum())
 
+        import nlopt
+
         solver = nlopt.opt(nlopt.LD_LBFGS, len(y))
         solver.set_min_objective(excess)
         solver.set_stopval(1e-8)
@@ -428,6 +432,8 @@ class StartSearch:
             self.scale = 1.0 / max(1.0, float(np.linalg.norm(slope)))
         if method == "slsqp":
             return self._by_scipy(start, last, tolerance * self.scale)[: len(y)]
+        import nlopt
+
         algorithms = {"auglag": nlopt.AUGLAG, "mma": nlopt.LD_MMA, "ccsaq": nlopt.LD_CCSAQ}
         solver = nlopt.opt(algorithms[method], len(start))
         if method == "auglag":
@@ -540,6 +546,8 @@ class StartSearch:
         solver.set_upper_bounds(upper)
 
     def _optimised(self, solver: nlopt.opt, start: np.ndarray) -> np.ndarray:
+        import nlopt
+
         try:
             return np.array(solver.optimize(start))
         except (nlopt.RoundoffLimited, nlopt.runtime_error) as error:  # the best iterate stands

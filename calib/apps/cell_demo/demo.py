@@ -4,7 +4,7 @@ import resource
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from calib.folders import read_estimate
 from calib.records import read_lines
 from calib.toolkit.chains import load, read_calibrated, robot_names
 from calib.toolkit.installations import read_installation
-from calib.toolkit.pose_data import IMAGES
+from calib.toolkit.pose_data import IMAGES, Positions
 from calib.toolkit.sessions import (
     DONE,
     KEPT,
@@ -46,8 +46,9 @@ from calib.toolkit.simulations import (
     Cell,
     MovingArm,
     carrying,
+    drift_path,
     limits_of,
-    measure,
+    measure_frames,
     moving_arm,
     planned_poses,
     play,
@@ -70,6 +71,8 @@ from calib.toolkit.torque_models import read_dynamics
 FIT, VALIDATION, REPEATED = 40, 20, 3
 # how far the simulated instrument wanders over a series [m]
 DRIFT = 10e-6
+# pose of the simulated LEDs in the arm's base, where there are any: beside the foot (our choice)
+BASE_LEDS = np.array([[1.0, 0.0, 0.0, 0.25], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.1], [0.0, 0.0, 0.0, 1.0]])
 # by default; where effects that no model holds are as large as those that some do
 ROBOT, HARD = "tx40", "lwr4plus"
 # little effort, for time
@@ -282,6 +285,8 @@ def _step_to_simulate(session: Session) -> str:
 def _cells_of(session: Session) -> tuple[Cell, CameraCell | None]:
     """Return the session's virtual cell, and this cell with a camera; the second is None for other instruments."""
     cell = virtual_cell(session.settings.robot.given, session.settings.seed)
+    if session.settings.instrument.reference:
+        cell = replace(cell, instrument=replace(cell.instrument, base_frame=BASE_LEDS))
     if session.settings.instrument.measures != IMAGES:
         return cell, None
     camera_cell = seen_by_camera(cell)
@@ -333,12 +338,28 @@ def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
     _mark(session, cell.note)
     for number, name, q in planned_poses(session.folder, cell.nominal):
         noise = np.random.default_rng([seed, number])
-        measured = measure(cell, q, noise, warm=number * FIT)
-        write_measured(wandering(measured, DRIFT, seed), session.path(f"3-measured/{name}.csv"))
+        path = session.path(f"3-measured/{name}.csv")
+        _write_series(*measure_frames(cell, q, noise, warm=number * FIT), path, seed)
         if name == "measured":
             noise = np.random.default_rng([seed, 7])
-            repeated = measure(cell, q[:REPEATED], noise, warm=len(q))
-            write_measured(wandering(repeated, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
+            path = session.path("3-measured/drift.csv")
+            _write_series(*measure_frames(cell, q[:REPEATED], noise, warm=len(q)), path, seed, begin=1.0)
+
+
+def _write_series(measured: Positions, bases: np.ndarray | None, path: Path, seed: int, begin: float = 0.0) -> None:
+    """Write a measured series to the file `path`, in which the instrument drifts from `begin` (0 to 1) to the end.
+
+    Args:
+        measured: poses or positions in the instrument's frame.
+        bases: (m, 4, 4) base frames, which drift alike; None without base LEDs.
+        path: path of the file.
+        seed: seed of the drift's direction.
+        begin: when the series begins.
+    """
+    if bases is not None:
+        bases = bases.copy()
+        bases[:, :3, 3] += drift_path(len(bases), DRIFT, seed, begin)
+    write_measured(wandering(measured, DRIFT, seed, begin), path, bases=bases)
 
 
 def _mark(session: Session, note: str) -> None:

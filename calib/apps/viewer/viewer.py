@@ -20,7 +20,7 @@ from calib import files
 from calib.errors import CalibError, UsageError, command_line, refused_as
 from calib.toolkit.chains import Chain, Joint, joint_frames
 from calib.toolkit.result_folders import DrawnRobot as Drawn
-from calib.toolkit.result_folders import ErrorSizes, Measured, Played, Scene, Torques, drawn, strips, thinned
+from calib.toolkit.result_folders import ErrorSizes, Measured, Played, Scene, Torques, TradeOffs, drawn, strips, thinned
 from calib.transforms import to_quaternion
 
 if TYPE_CHECKING:
@@ -32,6 +32,9 @@ BEFORE = [213, 94, 0]
 AFTER = [0, 130, 90]
 SEEN = [40, 90, 180]
 LIMIT = [200, 60, 60]
+BAND = [150, 200, 180]
+CAD = [140, 90, 170]
+DOMINATED = [170, 170, 170]
 # between one part and the next [s]
 GAP = 1.0
 # that a pose stands still [s]
@@ -131,6 +134,8 @@ def _send(recording: RecordingStream, scene: Scene) -> None:
         start = _played(recording, scene, played, start)
     for torques in scene.torques:
         start = _torques(recording, scene, torques, start)
+    for front in scene.fronts:
+        _front(recording, front)
     _meshes(recording, scene)
 
 
@@ -157,9 +162,21 @@ def about(scene: Scene) -> str:
     for motion in scene.played:
         lines.append(f"motion *{motion.name}*: {motion.t[-1]:.1f} s")
     for torques in scene.torques:
-        lines.append(f"torques *{torques.name}*: measured orange, predicted green, and residuals [N·m, N]")
+        lines.append(_torque_line(torques))
+    for front in scene.fronts:
+        lines.append(f"front of *{front.name}*: motion {front.designed + 1} of {len(front.values)} was designed")
     lines += [f"note: {note}" for note in scene.notes]
     return "\n\n".join(lines)
+
+
+def _torque_line(torques: Torques) -> str:
+    """Return the line on a recording's torques, with the colours of its curves."""
+    curves = ["measured orange", "predicted green"]
+    if torques.sigma is not None:
+        curves.append("expected interval of 95 % light green")
+    if torques.nominal is not None:
+        curves.append("identified on the CAD geometry violet")
+    return f"torques *{torques.name}*: {', '.join(curves)}, and residuals [N·m, N]"
 
 
 def _rms(values: np.ndarray) -> float:
@@ -226,6 +243,7 @@ def _measured(recording: RecordingStream, scene: Scene, measured: Measured, star
         recording.log(f"world/tool/{name}", rr.Points3D(points, radii=0.006, colors=colour), static=True)
         size_mm = 1e3 * np.linalg.norm(errors, axis=1)
         _series(recording, f"errors/{name}", index, size_mm, f"{name} [mm]", colour)
+    _interval(recording, "errors", "pose", start, measured.interval)
     residual_mm = 1e3 * (measured.seen - measured.calibrated)
     for k, axis in enumerate("xyz"):
         _series(recording, f"axes/position/{axis}", index, residual_mm[:, k], f"{axis} in the arm's base [mm]")
@@ -269,12 +287,23 @@ def _sizes(recording: RecordingStream, scene: Scene, sizes: ErrorSizes, start: f
         if len(rows):
             index = _poses("row", count, start, rows)
             _series(recording, f"{entity}/{name}", index, 1e3 * size[rows], f"{name} [mm]", colour)
+    _interval(recording, entity, "row", start, sizes.interval)
     index = _poses("row", count, start)
     if sizes.unseen.any():
         is_unseen = np.where(sizes.unseen, 1.0, 0.0)
         _series(recording, f"{entity}/unseen", index, is_unseen, "1: unseen, 0: fitted", SEEN)
     _arm(recording, scene, index, sizes.q)
     return start + EACH * count + GAP
+
+
+def _interval(recording: RecordingStream, entity: str, counter: str, start: float, interval: np.ndarray | None) -> None:
+    """Log the radii (m,) [m] within which 95 % of the calibrated arm's errors are expected, at rows that have one."""
+    if interval is None:
+        return
+    rows = np.flatnonzero(np.isfinite(interval))
+    if len(rows):
+        index = _poses(counter, len(interval), start, rows)
+        _series(recording, f"{entity}/interval95", index, 1e3 * interval[rows], "95 % expected below [mm]", BAND)
 
 
 def _chosen(
@@ -371,15 +400,34 @@ def _torques(recording: RecordingStream, scene: Scene, torques: Torques, start: 
         _series(recording, f"torques/{part}/measured", index, measured, f"measured [{unit}]", BEFORE)
         _series(recording, f"torques/{part}/predicted", index, predicted, f"predicted [{unit}]", AFTER)
         _series(recording, f"residuals/{part}", index, measured - predicted, f"{name} [{unit}]")
+        if torques.band is not None:
+            for side, bound in zip(("lower", "upper"), torques.band):
+                _series(recording, f"torques/{part}/{side}", index, bound[:, j], f"95 %, {side} [{unit}]", BAND)
+        if torques.nominal is not None:
+            nominal = torques.nominal[:, j]
+            _series(recording, f"torques/{part}/nominal", index, nominal, f"on the CAD geometry [{unit}]", CAD)
     if torques.q is not None:
         samples = thinned(torques.t)
         _arm(recording, scene, [rr.TimeColumn("time", duration=t[samples])], torques.q[samples])
     return float(t[-1]) + GAP
 
 
+def _front(recording: RecordingStream, front: TradeOffs) -> None:
+    """Log a front of trade-offs as labelled points, each objective scaled to 0 to 1; the designed motion is marked."""
+    colours = np.where(front.best[:, None], AFTER, DOMINATED)
+    colours[front.designed] = BEFORE
+    points = front.drawn * [1.0, -1.0]  # the viewer's y axis points down
+    entity = f"front/{_part(front.name)}"
+    motions = rr.Points2D(points, radii=0.02, colors=colours, labels=front.labels)
+    recording.log(f"{entity}/motions", motions, static=True)
+    order = np.flatnonzero(front.best)
+    order = order[np.argsort(points[order, 0])]
+    recording.log(f"{entity}/best", rr.LineStrips2D([points[order]], colors=[AFTER]), static=True)
+
+
 def _part(name: str) -> str:
-    """Return a name, escaped for use as one part of a Rerun entity path."""
-    return rr.escape_entity_path_part(name)
+    """Return a name as one part of a Rerun entity path, with an underscore for each blank."""
+    return rr.escape_entity_path_part(name.replace(" ", "_"))
 
 
 def _series(
@@ -498,6 +546,10 @@ def _blueprint(scene: Scene) -> Any:
         grid = rrb.Grid(*plots, grid_columns=2)
         residuals = rrb.TimeSeriesView(origin="residuals", name="measured minus predicted")
         tabs.append(rrb.Vertical(grid, residuals, row_shares=[3, 1], name="torques"))
+    for front in scene.fronts:
+        axes = " over ".join(reversed(front.objectives))
+        origin = f"front/{_part(front.name)}"
+        tabs.append(rrb.Spatial2DView(origin=origin, name=f"front of {front.name}: {axes}, both scaled"))
     picture = rrb.Spatial3DView(origin="world", name="robot, nominal orange, calibrated green")
     right = rrb.Tabs(*tabs, active_tab=int(bool(scene.measured and scene.chosen)))
     text = rrb.TextDocumentView(origin="about", name="what is shown")

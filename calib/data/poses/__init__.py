@@ -9,6 +9,7 @@ MODELS = ("auto", "frames", "offsets", "geometry", "stiffness", "bending", "coup
 LOSSES = ("auto", "none", "huber", "cauchy")
 IMAGES = "pixels"  # the kind of measurement that images of a board are
 IN_HAND, TO_HAND = "in hand", "to hand"  # the arm carries the camera, or the board
+MEASURED, IGNORED = "measured", "ignored"  # a base frame has to be in a file, or is not read
 JOINTS, CORNERS, BOARD = "joints.csv", "corners.csv", "board.toml"  # files of a folder of images
 MIN_SIGMA = 1e-10  # no instrument's sigma is smaller [m or rad]; our choice
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.controllers.table import as_described
 from calib.data.csv_table import Table
+from calib.data.poses import IGNORED, MEASURED
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import KINDS
 from calib.data.schema import BOUNDS, Column
@@ -31,13 +32,19 @@ SIGMA_ROTATION = Column(
 )
 DISTANCE = Column(("distance",), "length", "distance", BOUNDS.max_length, "mm", positive="a distance must be above 0")
 SIGMA_DISTANCE = Column(("sigma_distance",), "length", "sigma", positive=SIGMA.positive)
-BASE = Column(("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw"))
 LATE = Column(("late_x", "late_y", "late_z"), "speed", "late")
 TIME = Column(("time",), "time", "time")
 LABELS = ("distance", "pair", "bar", "socket", "plane", "tool")
 UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation")
-_FAMILIES = (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION, SIGMA_DISTANCE, BASE, LATE)
-OURS = (*(name for column in _FAMILIES for name in column.names), *LABELS)
+BASE_TIME = "base_time"
+_OF_FRAME = (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION)
+_FAMILIES = (*_OF_FRAME, SIGMA_DISTANCE, LATE)
+OURS = (
+    *(name for column in _FAMILIES for name in column.names),
+    *(f"base_{name}" for column in _OF_FRAME for name in column.names),
+    BASE_TIME,
+    *LABELS,
+)
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
 _NUMBERED_JOINT = re.compile(r"q\d+")
@@ -58,7 +65,12 @@ class Sheet:
     suffixes: tuple[str, ...] = SUFFIXES
 
     def fail(self, message: str, column: str | None = None) -> NoReturn:
-        """Raise MeasurementError about the file; with `column`, about that column."""
+        """Raise MeasurementError about the file; with `column`, about that column.
+
+        Args:
+            message: text of the error; the file's name is prepended.
+            column: the file's name of the column; None: the whole file.
+        """
         self.table.fail(message, column)
 
     def find(self, name: str) -> str:
@@ -98,7 +110,11 @@ class Sheet:
         return column.check(np.stack(values, axis=1), self.table, names)
 
     def joints(self, joints: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-        """Return joint values (m, n) [rad or m], and the file's names of the joint columns."""
+        """Return joint values (m, n) [rad or m], and the file's names of the joint columns.
+
+        Args:
+            joints: names of the robot's n joints, in the robot's order.
+        """
         names = self.find_joints(joints)
         q = self.numbers(names, Column(tuple(joints), "joint", "joints"))
         if self.options.controller:
@@ -106,7 +122,11 @@ class Sheet:
         return q, names
 
     def check_names(self, joints: Sequence[str]) -> None:
-        """Raise MeasurementError if the options map a column name that the toolkit does not know."""
+        """Raise MeasurementError if the options map a column name that the toolkit does not know.
+
+        Args:
+            joints: names of the robot's joints, which the options may map, too.
+        """
         names = (*OURS, *joints, *(f"q{i + 1}" for i in range(len(joints))))
         for name, heading in self.options.columns.items():
             if name not in names and not _TARGET.fullmatch(name):
@@ -126,6 +146,9 @@ class Sheet:
 
         Accepted are the robot's joint names, ``q_<joint name>``, or ``q1`` to ``qn``; the first of these forms that
         occurs in the file is used.
+
+        Args:
+            joints: names of the robot's joints.
         """
         n, table, mapping = len(joints), self.table, self.options.columns
         numbered = tuple(f"q{i + 1}" for i in range(n))
@@ -149,7 +172,12 @@ class Sheet:
         self.fail(f"{message}. Map them in the options' [columns]")
 
     def _refuse_more_joints(self, columns: Sequence[str], n: int) -> None:
-        """Raise MeasurementError for a table with more numbered joint columns than the robot has joints."""
+        """Raise MeasurementError for a table with more numbered joint columns than the robot has joints.
+
+        Args:
+            columns: the file's names of the joint columns that were found.
+            n: number of the robot's joints.
+        """
         if not all(_NUMBERED_JOINT.fullmatch(name) for name in columns):
             return
         for name in self.table.header:
@@ -190,6 +218,10 @@ class Sheet:
 
     def only_family(self, families: Sequence[tuple[str, ...]], names: Sequence[str]) -> tuple[str, ...]:
         """Return the only family of columns that was found in the file, () if none was.
+
+        Args:
+            families: the file's names of the columns of each family that was found.
+            names: the toolkit's names of a family's columns, for messages.
 
         Raises:
             MeasurementError: several families were found.
@@ -234,7 +266,8 @@ class Layout:
         distance: name of the distance column and, if present, of its sigma; () without a distance.
         tool: name of the column with tool labels; "" without one.
         group: names of the columns whose labels together identify a row's group.
-        base: seven names for position and quaternion of a frame on the robot's base, or none.
+        base: three names for the position of a frame on the robot's base, then those of its orientation; or none.
+        base_sigma, base_sigma_rotation: three names each for the sigmas of the base frame, or none.
         late: four names for the target's velocity and the time, or none.
         notes: remarks for the user on how the columns were chosen.
     """
@@ -249,6 +282,8 @@ class Layout:
     tool: str = ""
     group: tuple[str, ...] = ()
     base: tuple[str, ...] = ()
+    base_sigma: tuple[str, ...] = ()
+    base_sigma_rotation: tuple[str, ...] = ()
     late: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -256,11 +291,20 @@ class Layout:
     def used(self) -> frozenset[str]:
         """The file's names of all columns that are read."""
         families = (*self.positions, *self.sigmas, self.orientation, self.sigma_rotation, self.distance, self.group)
-        return frozenset().union(*families, self.joints, self.base, self.late, (self.tool,))
+        return frozenset().union(*families, self.joints, *self.of_base, self.late, (self.tool,))
+
+    @property
+    def of_base(self) -> tuple[tuple[str, ...], ...]:
+        """Names of the columns on the base frame, by family; empty tuples without a base frame."""
+        return self.base, self.base_sigma, self.base_sigma_rotation
 
 
 def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     """Return which columns of a table are read, for a robot with joints of the given names.
+
+    Args:
+        sheet: the table with its options.
+        joints: names of the robot's joints.
 
     Raises:
         MeasurementError: a column is missing, or the options map it to one that the file does not have; the header
@@ -288,6 +332,7 @@ def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
 
 
 def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
+    _refuse_base_alone(sheet)
     columns = sheet.find_joints(joints)
     kind = _find_kind(sheet, columns)
     if kind in LABEL_OF:
@@ -296,11 +341,11 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     if not positions:
         sheet.table.index("x")
     tool = sheet.find("tool")
-    base = sheet.family(BASE.names)
     late = sheet.family(LATE.names)
     if late:
         late = (*late, *TIME.names)
-    layout = Layout(kind, columns, positions, sigmas, tool=tool, base=base, late=late, notes=notes)
+    layout = Layout(kind, columns, positions, sigmas, tool=tool, late=late, notes=notes)
+    layout = _with_base(sheet, layout)
     if kind == "position":
         return layout
     orientation = _find_orientation(sheet, columns)
@@ -317,11 +362,73 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     return replace(layout, orientation=orientation, sigma_rotation=rotation, notes=notes)
 
 
+def _of_base(column: Column) -> list[str]:
+    return [f"base_{name}" for name in column.names]
+
+
+def _refuse_base_alone(sheet: Sheet) -> None:
+    """Raise MeasurementError for a file with base frames and without any target.
+
+    Args:
+        sheet: the table with its options.
+    """
+    base = _of_base(POSITION)
+    is_base = any(sheet.find(name) for name in base)
+    if not is_base or any(sheet.find(label) for label in LABEL_OF.values()):
+        return
+    if not _find_targets(sheet)[0]:
+        sheet.fail(
+            f"contains base frames ({', '.join(base)} …) and no target: a base frame is of use in the row of the "
+            "target that was measured with it; put both into the same rows"
+        )
+
+
+def _with_base(sheet: Sheet, layout: Layout) -> Layout:
+    """Return a layout with the columns of the base frame, if the file has them and the options do not ignore them.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns that are read so far.
+
+    Raises:
+        MeasurementError: a base frame that is incomplete, or missing although the options require it.
+    """
+    if sheet.options.base_frame == IGNORED:
+        return layout
+    position = sheet.family(_of_base(POSITION))
+    orientation = sheet.family(_of_base(QUATERNION)) or sheet.family(_of_base(MATRIX))
+    if not orientation:
+        orientation = sheet.family(_of_base(TURNS))
+        if orientation and not sheet.options.euler:
+            sheet.fail("state in the options what these angles mean: euler = 'xyz fixed', 'vector' …", orientation[0])
+    if not position and not orientation:
+        if sheet.options.base_frame == MEASURED:
+            sheet.fail(
+                "has no base frame: columns base_x, base_y, base_z, base_qx, base_qy, base_qz, base_qw are needed in "
+                "the target's rows, not in a file apart; where it was not measured: reference = false in session.toml, "
+                "or base_frame = 'ignored' in the options"
+            )
+        return layout
+    if not position or not orientation:
+        needed = "base_x, base_y, base_z, and base_qx to base_qw, base_r11 to base_r33, or base_rx, base_ry, base_rz"
+        sheet.fail(f"the base frame is incomplete: it needs {needed}", (position or orientation)[0])
+    return replace(
+        layout,
+        base=(*position, *orientation),
+        base_sigma=sheet.family(_of_base(SIGMA)),
+        base_sigma_rotation=sheet.family(_of_base(SIGMA_ROTATION)),
+    )
+
+
 def _check_one_source(sheet: Sheet, position: Sequence[str], orientation: Sequence[str]) -> None:
     """Raise MeasurementError if position and orientation have columns of different origin: one measured, one plain.
 
     The plain columns may be commanded values. Columns count as measured if their name has such a suffix, or if the
     options map them although the file has plain names too.
+
+    Args:
+        sheet: the table with its options.
+        position, orientation: the file's names of the position's and the orientation's columns.
     """
     rotation_names = {4: QUATERNION.names, 9: MATRIX.names}.get(len(orientation))
     if rotation_names is None:
@@ -360,6 +467,10 @@ def _grouped_layout(sheet: Sheet, kind: str, joints: tuple[str, ...]) -> Layout:
 def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the orientation's columns: four (quaternion), nine (matrix), three (angles), or ().
 
+    Args:
+        sheet: the table with its options.
+        joints: names of the joint columns, which are not angles of an orientation.
+
     Raises:
         MeasurementError: three angles whose convention the options do not define.
     """
@@ -378,6 +489,10 @@ def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of three angle columns, in upper or lower case, that are not joints; () without such columns.
 
     Names of one small letter (a, b, c) count as angles only if the options define the convention of the angles.
+
+    Args:
+        sheet: the table with its options.
+        joints: names of the joint columns, which are not angles of an orientation.
     """
     standard_names = ANGLES[0]
     if any(name in sheet.options.columns for name in standard_names):
@@ -418,6 +533,9 @@ def _find_targets(sheet: Sheet) -> tuple[tuple, tuple, tuple[str, ...]]:
     """Return names of positions and sigmas of each target, and notes.
 
     The targets are the one without a number (x y z) if there is one, otherwise x1 y1 z1, x2 y2 z2, ….
+
+    Args:
+        sheet: the table with its options.
     """
     all_names = (*sheet.table.header, *sheet.options.columns)
     marks = sorted({int(name[1:]) for name in all_names if re.fullmatch(r"[xyz]\d+", name)})

@@ -94,6 +94,9 @@ def translated(path: str | Path) -> InstrumentExport | None:
     """Return an instrument's file as the text of a CSV table.
 
     None if the file is a CSV table already, or has no positions.
+
+    Args:
+        path: the file.
     """
     with open(path, "rb") as file:
         beginning = file.read(HEAD)
@@ -233,7 +236,12 @@ def _split(line: str, separator: str) -> list[str]:
 
 
 def _rows(lines: Sequence[str], grid: Grid) -> Iterator[list[str]]:
-    """Yield the cells of the rows of numbers, with points as decimal marks."""
+    """Yield the cells of the rows of numbers, with points as decimal marks.
+
+    Args:
+        lines: all lines of the text.
+        grid: position of the numbers in the text.
+    """
     for line in lines:
         if not _is_content(line):
             continue
@@ -249,6 +257,9 @@ def _columns(grid: Grid) -> tuple[list[str], list[str], bool]:
     """Return the toolkit's name and the unit of each column, and whether any name or unit differs from the file's.
 
     The name is "" for a column that is left out.
+
+    Args:
+        grid: position of the numbers in the text, with the cells above them.
     """
     above, width = list(grid.above), len(grid.cells)
     units = [""] * width
@@ -273,7 +284,11 @@ def _columns(grid: Grid) -> tuple[list[str], list[str], bool]:
 
 
 def _is_ours(names: Sequence[str]) -> bool:
-    """Return whether the position columns already have names that the toolkit reads."""
+    """Return whether the position columns already have names that the toolkit reads.
+
+    Args:
+        names: the file's names of the columns.
+    """
     suffixes = (*SUFFIXES, "1")
     return any({f"x{suffix}", f"y{suffix}", f"z{suffix}"} <= set(names) for suffix in suffixes)
 
@@ -282,6 +297,9 @@ def _unnamed(grid: Grid) -> tuple[list[str], list[str]]:
     """Return names and units for columns without names: up to three texts, then x, y, z.
 
     Both lists are empty if the first cell is not a text.
+
+    Args:
+        grid: position of the numbers in the text.
     """
     numeric = grid.numeric
     texts = numeric.index(True)

@@ -14,6 +14,8 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
     tool = "ball"                    # the tool's (reflector's) name
     check_limits = true              # refuse joint values outside the robot's limits
     planned = "poses.csv"            # of a file without joints: the poses driven, in this order or found by geometry
+    base_frame = "auto"              # a frame on the base in columns base_x …: used where it is there; "measured": it
+                                     # must be there; "ignored": the target is seen from the instrument
     socket_distance = 0.05           # between two sockets of the same fixture position
     socket_pairs = [["0", "1"]]      # which sockets that joins, where there are more than two
     model = "auto"                   # or the largest model of the ladder to fit; all names: below
@@ -54,7 +56,7 @@ from typing import Annotated
 
 from calib.config import inherited, own_table, parse, read_toml, strict
 from calib.config_types import Expect, Flag, Hidden, Label, Name, Names, OneOf, Positive, Real, Spread
-from calib.data.poses import IN_HAND, MIN_SIGMA, TO_HAND, Loss, Model
+from calib.data.poses import IGNORED, IN_HAND, MEASURED, MIN_SIGMA, TO_HAND, Loss, Model
 from calib.data.poses.measurements import KINDS
 from calib.errors import refuse_option, suggestion
 from calib.units import ANGLES, LENGTHS
@@ -116,6 +118,7 @@ class FileOptions:
         units: the toolkit's name of a column, or a family of columns → its unit.
         where: column → texts; only rows with one of these texts are used.
         planned: CSV of the poses that were to be measured, for a file without joints.
+        base_frame: whether the target is seen from the base frame that the file's columns ``base_`` contain.
     """
 
     kind: Annotated[str, OneOf(tuple(KINDS))] = ""
@@ -135,6 +138,7 @@ class FileOptions:
     socket_pairs: Annotated[tuple[tuple[Label, Label], ...], Expect('pairs of socket labels, [["0", "1"]]')] = ()
     check_limits: Flag = True
     planned: Name = ""
+    base_frame: Annotated[str, OneOf(("auto", MEASURED, IGNORED))] = "auto"
     camera: CameraOptions = field(default_factory=CameraOptions)
 
 
@@ -185,7 +189,12 @@ def parse_options(table: Mapping[str, object], source: str = "options") -> FitOp
 
 
 def check_files(options: FitOptions, paths: Sequence[str | Path]) -> None:
-    """Raise UsageError for a [files] table of a file that is not among `paths`."""
+    """Raise UsageError for a [files] table of a file that is not among `paths`.
+
+    Args:
+        options: options of the fit, with a table [files].
+        paths: the measurement files of the fit.
+    """
     names = [Path(path).name for path in paths]
     for name in options.files:
         if not any(own_table({name: name}, path) for path in paths):

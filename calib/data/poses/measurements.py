@@ -151,12 +151,18 @@ class Positions(PoseMeasurements):
         sigma: (m, 3) standard deviations of the position [m]; None if not known.
         late: (m, k, 3) derivatives of the positions by k unknown errors common to all rows, such as offset [m/s] and
             drift [m] of a clock; None without such errors.
+        base: (m, 7) position [m] and orientation x y z w of a frame on the robot's base, as the instrument measured it
+            with each row, to which the other fields are relative; None: they are in the instrument's frame.
+        base_sigma: (m, 6) standard deviations of its position [m] and of its orientation about the instrument's axes
+            [rad]; NaN where not known.
     """
 
     position: np.ndarray
     _: KW_ONLY
     sigma: np.ndarray | None = None
     late: np.ndarray | None = None
+    base: np.ndarray | None = None
+    base_sigma: np.ndarray | None = None
 
     kind: ClassVar[str] = "position"
     has_instrument: ClassVar[bool] = True
@@ -289,7 +295,12 @@ Block = TypeVar("Block", bound=PoseMeasurements)
 
 
 def take(block: Block, index: Sequence[int] | np.ndarray) -> Block:
-    """Return the rows at the indices `index`; groups keep their numbers, so that links stay valid."""
+    """Return the rows at the indices `index`; groups keep their numbers, so that links stay valid.
+
+    Args:
+        block: measurements of one kind.
+        index: row indices, or a mask (m,).
+    """
     index = np.asarray(index)
     rows: dict[str, object] = {}
     for name in block.per_row:

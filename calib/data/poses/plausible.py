@@ -72,12 +72,24 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
 
 
 def outside(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return which joint values (m, n) exceed their limits (n,) by more than an encoder's error, (m, n) bool."""
+    """Return which joint values (m, n) exceed their limits (n,) by more than an encoder's error, (m, n) bool.
+
+    Args:
+        q: (m, n) joint values [rad or m].
+        lower, upper: (n,) limits; infinite for no limit.
+    """
     return (q < lower - BOUNDS.limit_slack) | (q > upper + BOUNDS.limit_slack)
 
 
 def _check_joint_units(sheet: Sheet, columns: Sequence[str], kinds: Sequence[str], units: Sequence[str]) -> None:
-    """Raise MeasurementError for a unit of the wrong kind: mm for a revolute joint, deg for a prismatic one."""
+    """Raise MeasurementError for a unit of the wrong kind: mm for a revolute joint, deg for a prismatic one.
+
+    Args:
+        sheet: the file's table with its options.
+        columns: the file's names of the joint columns.
+        kinds: URDF type of each joint.
+        units: unit of each joint column; "" without one.
+    """
     for name, kind, unit in zip(columns, kinds, units):
         if unit and (unit.lower() in ANGLES) == (kind == "prismatic"):
             advice = "is it the right column?"
@@ -87,7 +99,13 @@ def _check_joint_units(sheet: Sheet, columns: Sequence[str], kinds: Sequence[str
 
 
 def check_block(block: PoseMeasurements, options: FileOptions, robot: Joints) -> PoseMeasurements:
-    """Return measurements from memory with notes, after the checks that are also applied to files."""
+    """Return measurements from memory with notes, after the checks that are also applied to files.
+
+    Args:
+        block: measurements made from arrays.
+        options: options for reading a file, with stated sigmas.
+        robot: types and limits of the joints.
+    """
     q, joints = np.asarray(block.q), tuple(block.joint_names)
     where = block.file or "measurements in memory"
     message = f"q has shape {q.shape}, expected (rows, joints) with {len(joints)} joints"
@@ -125,7 +143,12 @@ def unit_quaternions(values: np.ndarray, source: Rows, columns: Sequence[str]) -
 
 
 def orientation(sheet: Sheet, names: Sequence[str]) -> np.ndarray:
-    """Return unit quaternions (m, 4) x y z w from the columns `names` of a quaternion, a matrix or three angles."""
+    """Return unit quaternions (m, 4) x y z w from the columns `names` of a quaternion, a matrix or three angles.
+
+    Args:
+        sheet: the file's table with its options, which define the convention of angles.
+        names: the file's names of four, nine or three columns.
+    """
     column = Column(tuple(names))
     # Angles are bounded below, unless they are a rotation vector.
     if len(names) == 3:
@@ -141,26 +164,46 @@ def orientation(sheet: Sheet, names: Sequence[str]) -> np.ndarray:
 
 
 def from_angles(values: np.ndarray, euler: str) -> Rotation:
-    """Return the rotations for three numbers each (m, 3) [rad], in the convention that the option ``euler`` names."""
+    """Return the rotations for three numbers each (m, 3) [rad], in the convention that the option ``euler`` names.
+
+    Args:
+        values: the three numbers.
+        euler: convention, such as ``xyz fixed`` or ``zyx moving`` (``calib formats options``).
+    """
     if euler == "vector":
         return Rotation.from_rotvec(values)
     return Rotation.from_euler(_axes(euler), values)
 
 
 def to_angles(turns: Rotation, euler: str) -> np.ndarray:
-    """Return three numbers (m, 3) [rad] for rotations, the inverse of `from_angles`."""
+    """Return three numbers (m, 3) [rad] for rotations, the inverse of `from_angles`.
+
+    Args:
+        turns: the m rotations.
+        euler: convention, as in `from_angles`.
+    """
     return turns.as_rotvec() if euler == "vector" else turns.as_euler(_axes(euler))
 
 
 def _axes(euler: str) -> str:
-    """Return a convention's axes in SciPy's notation: small letters for fixed axes, capital letters for moving axes."""
+    """Return a convention's axes in SciPy's notation: small letters for fixed axes, capital letters for moving axes.
+
+    Args:
+        euler: convention, such as ``xyz fixed`` or ``zyx moving``.
+    """
     convention = {"wpr": "xyz fixed", "xyz": "xyz moving"}.get(euler, euler)
     axes, _, frame = convention.partition(" ")
     return axes if frame == "fixed" else axes.upper()
 
 
 def _from_matrices(matrices: np.ndarray, source: Rows, columns: Sequence[str]) -> Rotation:
-    """Return the rotations for matrices (m, 3, 3); refuse a matrix that is not a rotation."""
+    """Return the rotations for matrices (m, 3, 3); refuse a matrix that is not a rotation.
+
+    Args:
+        matrices: (m, 3, 3) the numbers as read.
+        source: file and row numbers, for messages.
+        columns: the file's names of the nine columns.
+    """
     defect = np.abs(matrices @ np.swapaxes(matrices, 1, 2) - np.eye(3)).max(axis=(1, 2))
     skewed = defect > 2 * BOUNDS.max_norm_error
 

@@ -8,7 +8,9 @@ position, pose      ``x y z``; with ``qx qy qz qw``, ``r11`` to ``r33`` or three
                     ``w p r``, ``roll pitch yaw``; the options' ``euler`` says what they mean) a pose; also with
                     ``_meas``, ``_measured`` (where a file has both, the options' [columns] say which is to be read)
 several reflectors  ``x1 y1 z1 x2 y2 z2 ...``, each a row of its own; an empty triple is a reflector not seen
-base frame          ``base_x`` … ``base_qw``, measured with every row: the target is then seen from there
+base frame          ``base_x`` … ``base_qw`` (or ``base_r11`` …), a frame on the robot's base measured with every row:
+                    the target is then seen from there (options: ``base_frame``), and rows without it are left out;
+                    ``base_sigma_x`` …, ``base_sigma_rx`` … (by default the target's); ``base_time`` beside ``time``
 sigmas              ``sigma_x``, ``_y``, ``_z`` (numbered as the reflectors, or common), ``sigma_rx``, ``_ry``, ``_rz``
 measured moving     ``late_x``, ``_y``, ``_z``, the target's velocity, with ``time``: the fit then takes offset and
                     drift of the instrument's clock as unknown
@@ -20,10 +22,9 @@ tool                ``tool``: label of the reflector that a row saw
 
 All other columns are ignored and listed. Files of RoboDK: `calib formats robodk`.
 
-A frame on the robot's base measured beside the target: what is relative to it does not care for the instrument.
-
-The study (Kolyubin et al. 2019, section 3.5) marks the base with LEDs of its own, so that the camera may be moved
-between series. Both measurements are noisy, and the base's orientation noise acts over the distance to the target.
+A base frame (as the study's LEDs on the base, Kolyubin et al. 2019, section 3.5) takes out how instrument and base move
+against each other: `calib fit` says how much. It adds the noise of both, and its orientation's over the distance to the
+target, so that it is of no use where nothing moves.
 
 Rows that belong together: sockets, planes, pairs and bars.
 """
@@ -34,10 +35,10 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib.data.csv_table import Table, read_header, read_table
 from calib.data.poses import plausible
+from calib.data.poses.base_frame import rows_with_base, seen_from_base
 from calib.data.poses.columns import (
     DISTANCE,
     LATE,
@@ -119,6 +120,10 @@ def labels(table: Table, columns: Sequence[str]) -> tuple[tuple[str, ...], np.nd
     """Return the distinct labels in order of appearance, and the index (m,) of each row's label.
 
     The labels of several columns are joined by ``/``.
+
+    Args:
+        table: the table.
+        columns: names of the columns with labels.
     """
     texts = np.column_stack([np.array(table.texts(name), dtype=object) for name in columns])
     empty = (texts == "") | (texts == "nan")
@@ -131,7 +136,12 @@ def labels(table: Table, columns: Sequence[str]) -> tuple[tuple[str, ...], np.nd
 
 
 def _read_distance(sheet: Sheet, layout: Layout) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return distances (m,) and their sigmas (m,) [m]; sigmas are None if neither columns nor options contain them."""
+    """Return distances (m,) and their sigmas (m,) [m]; sigmas are None if neither columns nor options contain them.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns to read.
+    """
     distance = sheet.numbers(layout.distance[:1], DISTANCE)[:, 0]
     options = sheet.options.sigma
     if len(layout.distance) == 1 and options.distance is None:
@@ -159,7 +169,13 @@ def _check_pairs(table: Table, layout: Layout, group: np.ndarray, names: Sequenc
 
 
 def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, int, float], ...]:
-    """Return the pairs of groups that differ only in the socket's label, each with the known distance [m]."""
+    """Return the pairs of groups that differ only in the socket's label, each with the known distance [m].
+
+    Args:
+        sheet: the table with its options, which contain the known distances between sockets.
+        layout: the columns to read.
+        group: (m,) index of each row's group.
+    """
     table, options = sheet.table, sheet.options
     if options.socket_distance is None:
         return ()
@@ -186,53 +202,6 @@ def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, 
         message = f"no fixture position has {expected}, needed for socket_distance; found {sockets}"
         sheet.fail(message, layout.group[-1])
     return tuple(links)
-
-
-def relative_to_base(block: Positions, position: np.ndarray, quaternion: np.ndarray) -> Positions:
-    """Return measurements relative to the base frame that was measured with every row.
-
-        p = R_bᵀ (p_t - p_b),   R = R_bᵀ R_t
-        Σ_p = R_bᵀ (Σ_t + Σ_b + [l]× Σ_rb [l]×ᵀ) R_b,  l = p_t - p_b;   Σ_r = R_bᵀ (Σ_rt + Σ_rb) R_b
-
-    Index t denotes the target, b the base frame. The base's sigmas are assumed to be those of the target. Only the
-    diagonals of the covariances are kept.
-
-    Args:
-        block: positions or poses, in the instrument's frame.
-        position: (m, 3) positions of the base frame [m].
-        quaternion: (m, 4) orientations of the base frame, x y z w, of unit norm.
-    """
-    base = Rotation.from_quat(quaternion)
-    lever = block.position - position
-    R_base_instrument = base.inv().as_matrix()
-    changes: dict[str, np.ndarray] = {"position": base.inv().apply(lever)}
-    if block.late is not None:
-        changes["late"] = np.einsum("mij,mkj->mki", R_base_instrument, block.late)
-    sigma_rotation = None
-    if isinstance(block, Poses):
-        sigma_rotation = block.sigma_rotation
-        rotation = base.inv() * Rotation.from_quat(block.quaternion)
-        changes["quaternion"] = rotation.as_quat(canonical=True)
-    if sigma_rotation is not None:
-        changes["sigma_rotation"] = _rotated_sigma(R_base_instrument, 2.0 * _diagonal(sigma_rotation))
-    if block.sigma is not None:
-        covariance = 2.0 * _diagonal(block.sigma)
-        if sigma_rotation is not None:
-            # [l]×, its columns l × e
-            cross = np.swapaxes(np.cross(lever[:, None], np.eye(3)), 1, 2)
-            covariance = covariance + cross @ _diagonal(sigma_rotation) @ np.swapaxes(cross, 1, 2)
-        changes["sigma"] = _rotated_sigma(R_base_instrument, covariance)
-    note = "positions are relative to the base frame measured with each row; its noise is assumed equal to the target's"
-    return replace(block, notes=(*block.notes, note), **changes)
-
-
-def _diagonal(sigma: np.ndarray) -> np.ndarray:
-    return np.einsum("mi,ij->mij", sigma**2, np.eye(3))
-
-
-def _rotated_sigma(rotation: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (m, 3) along rotated axes, from covariances (m, 3, 3) and rotations (m, 3, 3)."""
-    return np.sqrt(np.einsum("mij,mjk,mik->mi", rotation, covariance, rotation))
 
 
 def read_measurements(
@@ -272,6 +241,7 @@ def read_measurements(
         options = replace(options, columns=columns)
     sheet = _select_rows(Sheet(table, options))
     layout = find_layout(sheet, robot.names)
+    sheet, base_notes = rows_with_base(sheet, layout)
     number_columns = layout.used.difference(layout.group, [layout.tool])
     # Where a file has several targets, one that was not seen is a gap.
     columns_with_gaps: set[str] = set()
@@ -279,7 +249,8 @@ def read_measurements(
         columns_with_gaps.update(*layout.positions, *layout.sigmas)
     sheet.table.check([name for name in sheet.table.header if name in number_columns], columns_with_gaps)
     q, _ = sheet.joints(robot.names)
-    notes = (*sheet.table.notes, *notes, *layout.notes, *plausible.check_joints(q, sheet, layout.joints, robot))
+    notes = (*sheet.table.notes, *notes, *layout.notes, *base_notes)
+    notes = (*notes, *plausible.check_joints(q, sheet, layout.joints, robot))
     if layout.positions:
         block: PoseMeasurements = _read_targets(sheet, layout, q)
     else:
@@ -305,7 +276,11 @@ def joint_columns(path: str | Path) -> tuple[str, ...]:
 
 
 def _select_rows(sheet: Sheet) -> Sheet:
-    """Return the sheet with only those rows that the option ``where`` selects."""
+    """Return the sheet with only those rows that the option ``where`` selects.
+
+    Args:
+        sheet: the table with its options.
+    """
     table = sheet.table
     keep = np.ones(len(table), dtype=bool)
     for name, values in sheet.options.where.items():
@@ -361,9 +336,7 @@ def _read_targets(sheet: Sheet, layout: Layout, q: np.ndarray) -> Positions:
         block = Poses(q[row], layout.joints, block.position, quaternion, **common)
     if not layout.base:
         return block
-    base_position = sheet.numbers(layout.base[:3], POSITION)
-    base_quaternion = plausible.orientation(sheet, layout.base[3:])
-    return relative_to_base(block, base_position[row], base_quaternion[row])
+    return seen_from_base(sheet, layout, block, row)
 
 
 def _position(sheet: Sheet, names: Sequence[str], gaps: bool) -> np.ndarray:

@@ -82,7 +82,12 @@ def write_poses(path: str | Path, q: ArrayLike, joint_names: Sequence[str], kind
 
 
 def joint_columns(names: Sequence[str], kinds: Sequence[str]) -> tuple[list[str], np.ndarray]:
-    """Return the headers of joint columns, ``joint1 [deg]`` or ``[mm]``, and the factors (n,) from SI to the units."""
+    """Return the headers of joint columns, ``joint1 [deg]`` or ``[mm]``, and the factors (n,) from SI to the units.
+
+    Args:
+        names: names of the joints.
+        kinds: URDF type of each joint.
+    """
     headers = []
     factors = []
     for name, kind in zip(names, kinds):
@@ -93,7 +98,12 @@ def joint_columns(names: Sequence[str], kinds: Sequence[str]) -> tuple[list[str]
 
 
 def filled_in(path: Path, joints: int) -> bool:
-    """Return whether the user has entered measurements into a CSV list of planned poses with `joints` joint columns."""
+    """Return whether the user has entered measurements into a CSV list of planned poses with `joints` joint columns.
+
+    Args:
+        path: the CSV file.
+        joints: number of joint columns.
+    """
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     for line in lines[1:]:
         cells = re.split("[,;\t]", line)
@@ -110,6 +120,11 @@ def read_poses(
     """Return joint values (m, n) [rad or m] in the order of `joints`, from a CSV file, measurements or an array.
 
     A file's columns and checks are those of a measurement file.
+
+    Args:
+        source: a CSV file, measurements, or joint values (m, n) [rad or m].
+        joints: the robot's n joints, or only their names (then taken as revolute without limits).
+        options: options for reading a file; None: the defaults.
     """
     robot = Joints.of(joints)
     if not isinstance(source, str | Path):
@@ -124,7 +139,14 @@ def read_poses(
 
 
 def check_planned(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joints) -> tuple[str, ...]:
-    """Check planned joint values and return the notes of `check_joints`; a plan may consist of one repeated pose."""
+    """Check planned joint values and return the notes of `check_joints`; a plan may consist of one repeated pose.
+
+    Args:
+        q: (m, n) planned joint values [rad or m].
+        sheet: the file's table with its options.
+        columns: the file's names of the joint columns.
+        robot: types and limits of the joints.
+    """
     moves = np.ptp(q, axis=0).max() > BOUNDS.min_travel
     return plausible.check_joints(q if moves else q[:1], sheet, columns, robot)
 
@@ -187,7 +209,13 @@ def _distinct(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _has_match(candidates: np.ndarray, q: np.ndarray, max_difference: float) -> np.ndarray:
-    """Return for each row of `q` whether a row of `candidates` differs by at most `max_difference` in every joint."""
+    """Return for each row of `q` whether a row of `candidates` differs by at most `max_difference` in every joint.
+
+    Args:
+        candidates: (k, n) joint values to compare with [rad or m].
+        q: (m, n) joint values [rad or m].
+        max_difference: largest difference of a joint between equal poses [rad or m].
+    """
     distance, _ = KDTree(candidates).query(q, p=math.inf)
     return distance <= max_difference
 
@@ -231,6 +259,10 @@ def _best_order(plan: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     Each pair of columns is compared as two sets of numbers (mean distance to the nearest number, at most 1), so that
     order and completeness of the rows do not matter. The assignment of columns minimises the sum of these distances.
+
+    Args:
+        plan: (k, n) planned joint values [rad or m].
+        q: (m, n) measured joint values [rad or m].
     """
     n = plan.shape[1]
     cost = np.empty((2, n, n))

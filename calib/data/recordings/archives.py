@@ -58,7 +58,13 @@ def read_archive(path: Path, joints: Joints | None, options: RecordingOptions, e
 
 
 def read_archived_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Return the time stamps (N,) [s] and reference positions (N, n) in an archive: q_ref, or q without q_ref."""
+    """Return the time stamps (N,) [s] and reference positions (N, n) in an archive: q_ref, or q without q_ref.
+
+    Args:
+        path: the archive.
+        joints: the robot's n joints, in whose order columns are put.
+        options: options for reading the file.
+    """
     with _opened(path) as archive:
         names = find_names(tuple(archive.members), options, path)
         series = "q_ref" if "q_ref" in names else "q"
@@ -98,11 +104,20 @@ class _Archive:
         return {name.removesuffix(".npy"): name for name in self.file.namelist()}
 
     def fail(self, message: str, name: str | None = None) -> NoReturn:
-        """Raise MeasurementError about the archive; with `name`, about one of its arrays."""
+        """Raise MeasurementError about the archive; with `name`, about one of its arrays.
+
+        Args:
+            message: text of the error; the file's name is prepended.
+            name: name of the array; None: the whole archive.
+        """
         refuse_data(self.path, message, name)
 
     def header(self, name: str) -> tuple[IO[bytes], tuple[int, ...], bool, np.dtype]:
-        """Return the stream of an array's data, the array's shape, whether it is in Fortran order, and its dtype."""
+        """Return the stream of an array's data, the array's shape, whether it is in Fortran order, and its dtype.
+
+        Args:
+            name: name of the array.
+        """
         member = self.members[name]
         stream = self.file.open(member)
         # What numpy's reader of headers raises, and Python's parser in it.
@@ -238,7 +253,14 @@ def _variance(archive: _Archive, name: str, shape: tuple[int, ...], rows: np.nda
 
 
 def _stamps(archive: _Archive, names: Mapping[str, str], options: RecordingOptions, count: int) -> np.ndarray:
-    """Return the times (N,) [s] of all samples since the first one, from time stamps or a sampling rate."""
+    """Return the times (N,) [s] of all samples since the first one, from time stamps or a sampling rate.
+
+    Args:
+        archive: the archive.
+        names: the toolkit's name of a series to the archive's.
+        options: options for reading the file, which may state a sampling rate.
+        count: number N of samples.
+    """
     if "t" not in names:
         rate = options.rate or _rate(archive)
         if not rate > 0:
@@ -267,6 +289,12 @@ def _used(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: End
 
     These are the rows within `ends` if given, otherwise within the archive's ``use_range`` if it has one, otherwise
     all. If there are more than `options.samples`, pieces spread over them are read.
+
+    Args:
+        archive: the archive.
+        t: (N,) times of all samples [s].
+        options: options for reading the file.
+        ends: begin and end of the part to read [s]; (None, None): no bounds.
     """
     use_range = None
     if options.use_range and ends == (None, None):
@@ -298,6 +326,11 @@ def _arrange(values: np.ndarray, order: list[int], factor: float) -> np.ndarray:
     """Return the columns of an array in the order of indices `order`, multiplied by `factor`.
 
     The array is copied only if order or unit changes.
+
+    Args:
+        values: (N, n) array.
+        order: column indices of the robot's joints.
+        factor: factor to SI.
     """
     if order != list(range(values.shape[1])):
         values = values[:, order]

@@ -33,7 +33,13 @@ FRANKA_STATE = "franka_msgs/msg/FrankaRobotState"  # of franka_ros2: a joint sta
 
 
 def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Recording:
-    """Return the recording of the joint states in a ROS bag; shapes are checked, values are not."""
+    """Return the recording of the joint states in a ROS bag; shapes are checked, values are not.
+
+    Args:
+        path: the bag, a file or a folder.
+        joints: the robot's joints, in whose order columns are put; None: as in the first message.
+        options: options for reading the bag: topic, kind of the efforts.
+    """
     with opened(path) as reader:
         connections = connections_of(
             reader, (*JOINT_STATE, FRANKA_STATE), options.topic, path, "joint states", "topic = '...'", "/joint_states"
@@ -60,7 +66,11 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
 
 @contextmanager
 def opened(path: Path) -> Iterator[AnyReader]:
-    """Yield a reader of a ROS bag; errors of the package `rosbags` become MeasurementError."""
+    """Yield a reader of a ROS bag; errors of the package `rosbags` become MeasurementError.
+
+    Args:
+        path: the bag, a file or a folder.
+    """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 

@@ -119,6 +119,10 @@ def _check_finite(recording: Recording, limit: float = np.inf) -> None:
     """Raise MeasurementError for NaN, infinities and values beyond `limit`.
 
     NaN is allowed in `q_link`, for joints without a second encoder.
+
+    Args:
+        recording: the recording.
+        limit: largest absolute value of any number in the recording.
     """
     series = []
     columns: list[str] = []
@@ -140,6 +144,10 @@ def _sound_part(recording: Recording, bad: np.ndarray) -> str:
     A part has increasing time stamps and no row that is marked in `bad`, (N,) or (N, k). A cut refers to the latest
     time stamp up to each row. The text is empty if that part is too short, or if the file was read in pieces, since the
     rows between the pieces are unknown.
+
+    Args:
+        recording: the recording.
+        bad: rows, or cells, with faulty values.
     """
     if np.ptp(recording.rows) + 1 > len(recording):
         return ""
@@ -157,6 +165,10 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
 
     Let b be the bound that all but `max_spike_share` of the rows do not exceed. A spike exceeds both `max_effort` times
     the joint's limit and `min_spike_beyond` times b; or, whatever the limit, `min_spike` times b.
+
+    Args:
+        recording: the recording.
+        joints: the robot's joints with their limits; None: unknown limits.
 
     Raises:
         MeasurementError: more rows than the allowed share, but at most `max_unit_share`, have such torques.
@@ -198,7 +210,12 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
 
 
 def _effort_limits(recording: Recording, joints: Joints | None) -> np.ndarray:
-    """Return the effort limits (n,) of the joints; infinite if unknown, and for currents."""
+    """Return the effort limits (n,) of the joints; infinite if unknown, and for currents.
+
+    Args:
+        recording: the recording, which has torques or currents.
+        joints: the robot's joints with their limits; None: unknown.
+    """
     if joints is None or recording.kind != "torque":
         return np.full(recording.n, np.inf)
     return np.where(np.isfinite(joints.effort) & (joints.effort > 0), joints.effort, np.inf)
@@ -219,7 +236,11 @@ def _drop_repeats(recording: Recording) -> Recording:
 
 
 def _check_time(recording: Recording) -> None:
-    """Raise MeasurementError for time stamps that do not increase, or whose step suggests another unit than seconds."""
+    """Raise MeasurementError for time stamps that do not increase, or whose step suggests another unit than seconds.
+
+    Args:
+        recording: the recording.
+    """
     t = recording.t
     step = np.diff(t)
     goes_back, stands_still = np.append(False, step < 0), np.append(False, step == 0)
@@ -258,6 +279,10 @@ def _check_size(recording: Recording, joints: Joints | None = None) -> None:
     """Raise MeasurementError for positions that no joint can reach.
 
     Likely causes are degrees, millimetres, or columns of another robot.
+
+    Args:
+        recording: the recording.
+        joints: types and limits of the joints; None: unknown.
     """
     kinds = joints.kinds if joints else ("revolute",) * recording.n
     max_size = max_travel(kinds)
@@ -291,7 +316,11 @@ def _likely_unit(recording: Recording, joint: int, unit: str) -> str:
 
 
 def _check_speed(recording: Recording) -> None:
-    """Raise MeasurementError if velocities differ from the slope of the positions by the factor 180/π (degrees)."""
+    """Raise MeasurementError if velocities differ from the slope of the positions by the factor 180/π (degrees).
+
+    Args:
+        recording: the recording; without measured velocities nothing is checked.
+    """
     if recording.v is None:
         return
     slope = np.diff(recording.q, axis=0) / np.diff(recording.t)[:, None]
@@ -310,6 +339,10 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
     """Return descriptions of positions that jump relative to the rows around them; an empty list without jumps.
 
     Causes are encoders, clocks, or joined logs.
+
+    Args:
+        recording: the recording.
+        joints: types of the joints; None: all revolute.
     """
     if len(recording) < 5:
         return []
@@ -337,7 +370,12 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
 
 
 def _columns(recording: Recording, name: str) -> list[str]:
-    """Return the label of each joint's column of a series, for messages, such as ``effort of elbow (joint 3)``."""
+    """Return the label of each joint's column of a series, for messages, such as ``effort of elbow (joint 3)``.
+
+    Args:
+        recording: the recording.
+        name: name of the series, such as ``q`` or ``effort``.
+    """
     label = recording.kind if name == "effort" else name
     return [f"{label} of {joint} (joint {j + 1})" for j, joint in enumerate(recording.joint_names)]
 
@@ -365,6 +403,10 @@ def _still(recording: Recording) -> list[str]:
 
 def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
     """Return notes on torques that do not match the effort limits (currents, or torques before the gear).
+
+    Args:
+        recording: the recording.
+        joints: the robot's joints with their limits; None: unknown.
 
     Raises:
         MeasurementError: every joint is far beyond its limit, so that the torques are in another unit.
@@ -410,6 +452,9 @@ def _work_notes(recording: Recording) -> list[str]:
     """Return a note if the torques extract energy from the robot: over a closed path, friction requires ∫τᵀ dq > 0.
 
     There is no note if the motion does not return to a pose, since gravity does work between different poses.
+
+    Args:
+        recording: the recording of joint positions q and torques τ.
     """
     rows = _round_trip(recording.q) if recording.kind == "torque" else None
     if rows is None:

@@ -55,8 +55,8 @@ def column_faults(
     Args:
         t: (N,) time stamps as logged [s].
         q: (N, n) positions [rad or m].
-        effort: (N, n) torques or currents.
-        v: (N, n) measured velocities; None if not recorded.
+        effort: (N, n) torques [N m or N] or currents [A].
+        v: (N, n) measured velocities [rad/s or m/s]; None if not recorded.
     """
     faults = []
     for joint, position in enumerate(q.T):
@@ -74,6 +74,12 @@ def _clipped(joint: int, t: np.ndarray, q: np.ndarray, torque: np.ndarray) -> Co
     """Return the fault of a torque that repeats its extreme value exactly while its joint moves; None without it.
 
     The joint has to move at various speeds, at which friction would change the torque.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        q: (N, n) positions [rad or m].
+        torque: (N,) torque or current of the joint.
     """
     speed = np.abs(_speed(t, q))
     peak = float(speed.max())
@@ -99,7 +105,14 @@ def _clipped(joint: int, t: np.ndarray, q: np.ndarray, torque: np.ndarray) -> Co
 
 
 def _standing_position(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> ColumnFault | None:
-    """Return the fault of a position that is constant while the measured velocity integrates to a motion; or None."""
+    """Return the fault of a position that is constant while the measured velocity integrates to a motion; or None.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        q: (N,) positions of the joint [rad or m].
+        v: (N,) measured velocities of the joint [rad/s or m/s].
+    """
     min_travel = max(MIN_TRAVEL, MIN_STEPS * _resolution(q))
     parts = []
     for first, last in _constant(q):
@@ -112,7 +125,14 @@ def _standing_position(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) 
 
 
 def _standing_velocity(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> ColumnFault | None:
-    """Return the fault of a velocity that is constant while the position moves at another speed; or None."""
+    """Return the fault of a velocity that is constant while the position moves at another speed; or None.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        q: (N,) positions of the joint [rad or m].
+        v: (N,) measured velocities of the joint [rad/s or m/s].
+    """
     parts = []
     for first, last in _constant(v):
         time = t[first:last] - t[first]
@@ -124,7 +144,13 @@ def _standing_velocity(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) 
 
 
 def _jumping(joint: int, t: np.ndarray, q: np.ndarray) -> ColumnFault | None:
-    """Return the fault of a position that is constant during motion, then jumps by about the missed motion; or None."""
+    """Return the fault of a position that is constant during motion, then jumps by about the missed motion; or None.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        q: (N,) positions of the joint [rad or m].
+    """
     parts = []
     for first, last in _constant(q):
         if first < REACH or last + REACH >= len(q):
@@ -175,6 +201,10 @@ def _moved(t: np.ndarray, v: np.ndarray) -> float:
     """Return the range of the integral of velocities v (N,) [rad or m].
 
     Gaps in the time stamps count as short steps.
+
+    Args:
+        t: (N,) time stamps [s].
+        v: (N,) velocities of one joint [rad/s or m/s].
     """
     step = np.diff(t)
     step = np.minimum(step, 3.0 * np.median(step))
@@ -184,13 +214,23 @@ def _moved(t: np.ndarray, v: np.ndarray) -> float:
 
 
 def _wander(t: np.ndarray, v: np.ndarray) -> float:
-    """Return the largest plausible drift [rad or m] that white noise causes in the integral of velocities v (N,)."""
+    """Return the largest plausible drift [rad or m] that white noise causes in the integral of velocities v (N,).
+
+    Args:
+        t: (N,) time stamps [s].
+        v: (N,) velocities of one joint [rad/s or m/s].
+    """
     noise = float(np.std(np.diff(v))) / np.sqrt(2.0)
     return MAX_WANDER * noise * float(np.median(np.diff(t))) * float(np.sqrt(len(t)))
 
 
 def _speed(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the slope (N,) of positions q (N,), from the row `REACH` rows before to the row `REACH` rows after."""
+    """Return the slope (N,) of positions q (N,), from the row `REACH` rows before to the row `REACH` rows after.
+
+    Args:
+        t: (N,) time stamps [s].
+        q: (N,) positions of one joint [rad or m].
+    """
     rows = np.arange(len(t))
     behind = np.minimum(rows + REACH, len(t) - 1)
     before = np.maximum(rows - REACH, 0)

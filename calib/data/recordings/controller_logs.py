@@ -87,7 +87,13 @@ def _toolkit_name(name: str, columns: Sequence[Sequence[str]]) -> str:
 
 
 def _is_whole(body: str, separator: str | None, column: int) -> bool:
-    """Return whether a column contains only whole numbers in the first rows."""
+    """Return whether a column contains only whole numbers in the first rows.
+
+    Args:
+        body: rows of the log.
+        separator: separator of the cells; None: blanks.
+        column: index of the column.
+    """
     for line in body.split("\n", TIME_ROWS)[:TIME_ROWS]:
         row = line.split(separator) if line.strip() else []
         if len(row) > column and not re.fullmatch(r"\s*\d+(\.0*)?\s*", row[column]):

@@ -138,6 +138,9 @@ class Recording:
     def cut(self, start: float | None = None, stop: float | None = None) -> Recording:
         """Return the recording of the samples with start ≤ t < stop [s]; None: no bound at that end.
 
+        Args:
+            start, stop: begin and end of the part [s], counted from the file's first sample.
+
         Raises:
             MeasurementError: no sample is in the interval.
         """
@@ -163,6 +166,11 @@ def rows_in_pieces(t: np.ndarray, first: int, stop: int, max_samples: int | None
     position, so that the pieces cover the whole time and are not periodic like the motion. All rows are used if there
     are at most a quarter more than `max_samples`. All are used too if the time stamps t (N,) run backwards, since a
     later check then refuses them with advice on where to cut.
+
+    Args:
+        t: (N,) time stamps of the whole file [s].
+        first, stop: index of the first row, and of the row after the last one.
+        max_samples: largest number of rows; None: no limit.
     """
     count = stop - first
     if max_samples is None or count <= MAX_EXCESS * max_samples:
@@ -199,7 +207,12 @@ def rows_used(t: np.ndarray, ends: Ends, max_samples: int | None, file: str | Pa
 
 
 def in_pieces(recording: Recording, max_samples: int | None) -> Recording:
-    """Return the recording, or, if it has more than `max_samples` samples, pieces spread over it (`rows_in_pieces`)."""
+    """Return the recording, or, if it has more than `max_samples` samples, pieces spread over it (`rows_in_pieces`).
+
+    Args:
+        recording: the recording.
+        max_samples: largest number of samples; None: no limit.
+    """
     rows, notes = rows_in_pieces(recording.t, 0, len(recording), max_samples)
     if not notes:
         return recording
@@ -222,6 +235,10 @@ def earlier(recording: Recording, lag: float) -> Recording:
     """Return the recording with torques and currents shifted `lag` [s] earlier, to the time of the positions.
 
     Samples for which there is no torque are removed.
+
+    Args:
+        recording: the recording.
+        lag: delay of the torques behind the positions of the same row [s].
 
     Raises:
         MeasurementError: no sample remains.

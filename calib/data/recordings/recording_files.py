@@ -100,7 +100,13 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
 
 
 def read_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Return the time stamps (N,) [s] and reference positions (N, n) in a table: q_ref, or q if there is no q_ref."""
+    """Return the time stamps (N,) [s] and reference positions (N, n) in a table: q_ref, or q if there is no q_ref.
+
+    Args:
+        path: the CSV table.
+        joints: the robot's n joints, in whose order columns are put.
+        options: options for reading the file.
+    """
     table = _numbered_brackets(read_table(path, doubles=True))
     names = {key: name for key, name in options.names.items() if key in ("t", "q", "q_ref")}
     columns_of = _find_columns(table, replace(options, names=names), joints.names)
@@ -125,7 +131,13 @@ def _numbered_brackets(table: Table) -> Table:
 
 
 def _find_columns(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dict[str, list[int]]:
-    """Return the column indices of each series, in the robot's joint order, by the toolkit's name of the series."""
+    """Return the column indices of each series, in the robot's joint order, by the toolkit's name of the series.
+
+    Args:
+        table: the table.
+        options: options for reading the file, which may name columns.
+        joints: names of the robot's joints.
+    """
     columns_of: dict[str, list[int]] = {}
     for name, synonyms in SYNONYMS.items():
         stems = (options.names[name],) if name in options.names else synonyms
@@ -148,7 +160,13 @@ def _stamp_column(table: Table, names: Sequence[str]) -> list[int]:
 
 
 def _joint_columns(table: Table, stems: Sequence[str], joints: Sequence[str]) -> list[int]:
-    """Return the column indices of the first quantity in `stems` that the table has for all joints; else []."""
+    """Return the column indices of the first quantity in `stems` that the table has for all joints; else [].
+
+    Args:
+        table: the table.
+        stems: accepted names of the quantity.
+        joints: names of the robot's joints.
+    """
     for stem in stems:
         columns = _of_joints(table, stem, joints) or _numbered(table, stem)
         if columns:
@@ -157,7 +175,13 @@ def _joint_columns(table: Table, stems: Sequence[str], joints: Sequence[str]) ->
 
 
 def _of_joints(table: Table, stem: str, joints: Sequence[str]) -> list[int]:
-    """Return the indices of the columns whose names consist of the quantity `stem` and a joint's name; else []."""
+    """Return the indices of the columns whose names consist of the quantity `stem` and a joint's name; else [].
+
+    Args:
+        table: the table.
+        stem: name of the quantity.
+        joints: names of the robot's joints, in the order of the result.
+    """
     header, stem = [name.lower() for name in table.header], stem.lower()
     for pattern in (f"{stem}_{{}}", f"{stem}{{}}", f"{stem} {{}}", f"{{}}_{stem}", f"{{}}.{stem}", f"{stem}.{{}}"):
         columns = [pattern.format(joint.lower()) for joint in joints]
@@ -170,6 +194,10 @@ def _numbered(table: Table, stem: str) -> list[int]:
     """Return the indices of the columns named by the quantity `stem` and a number, in order of the numbers.
 
     [] if there are none, or if they are not numbered from 0 or 1 without gaps.
+
+    Args:
+        table: the table.
+        stem: name of the quantity.
     """
     numbered: dict[str, list[tuple[int, int]]] = {}
     for column, name in enumerate(table.header):
@@ -195,7 +223,14 @@ def _joint_names(table: Table, columns: Sequence[int]) -> list[str]:
 
 
 def _values(table: Table, column: int, series: str, options: RecordingOptions) -> np.ndarray:
-    """Return a column in SI; NaN is kept, and refused later if it is within the cut."""
+    """Return a column in SI; NaN is kept, and refused later if it is within the cut.
+
+    Args:
+        table: the table.
+        column: index of the column.
+        series: the toolkit's name of the series, which determines the accepted units.
+        options: options for reading the file, which may state a unit.
+    """
     factor = table.factor(column, SCALES[series], options.units.get(series, ""))
     return table.numbers(table.header[column], None, gaps=True) * factor
 
@@ -269,7 +304,12 @@ def _described(recording: Recording, controller: str) -> Recording:
 
 
 def _reader(path: Path, ends: Ends) -> Reader:
-    """Return the function that reads a file, chosen by the file's first bytes or suffix; a folder is a ROS bag."""
+    """Return the function that reads a file, chosen by the file's first bytes or suffix; a folder is a ROS bag.
+
+    Args:
+        path: the file.
+        ends: begin and end of the cut [s]; (None, None) without a cut.
+    """
     try:
         if path.exists():
             check_regular(path)

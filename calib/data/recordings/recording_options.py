@@ -196,7 +196,13 @@ def plain_stems(stems: Sequence[str]) -> dict[str, str]:
 
 
 def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) -> dict[str, str]:
-    """Return a mapping from the toolkit's name of each series in the file to the file's name."""
+    """Return a mapping from the toolkit's name of each series in the file to the file's name.
+
+    Args:
+        members: names of the columns or arrays in the file.
+        options: options for reading the file, which may name series.
+        path: the file, for messages.
+    """
     members_by_stem: dict[str, str] = {}
     for member in members:
         stem, number = stem_of(member)
@@ -255,7 +261,12 @@ def one_effort(
 
 
 def _advice(names: Mapping[str, str], members: Sequence[str]) -> str:
-    """Return advice to state the missing series in the options, with columns of the file that share a word with it."""
+    """Return advice to state the missing series in the options, with columns of the file that share a word with it.
+
+    Args:
+        names: the toolkit's names of the series found, to the file's names.
+        members: all names in the file.
+    """
     stems = []
     for member in members:
         stem = stem_of(member)[0]
@@ -285,6 +296,12 @@ def _two_torques(names: dict[str, str], options: RecordingOptions, members: tupl
     """Add the motors' torque to `names` as the effort, or the sensors' torque if only that is needed.
 
     Returns a list with the name of the added series.
+
+    Args:
+        names: the toolkit's names of series to the file's names; extended in place.
+        options: options for reading the file: whether torques of motors or of sensors are needed.
+        members: all names in the file, for messages.
+        path: the file, for messages.
     """
     series = "tau_motor" if "tau_motor" in names else "tau_link"
     if "tau_link" not in names or (options.motors and series == "tau_link"):

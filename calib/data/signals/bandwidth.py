@@ -114,7 +114,13 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
 
 
 def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:
-    """Raise MeasurementError for a cut-off [Hz] that is not between 0 and half the sampling rate `rate` [Hz]."""
+    """Raise MeasurementError for a cut-off [Hz] that is not between 0 and half the sampling rate `rate` [Hz].
+
+    Args:
+        cutoff: cut-off of a filter [Hz].
+        rate: sampling rate [Hz].
+        file: name of the recording, for messages; "" for none.
+    """
     if not 0 < cutoff < rate / 2:
         message = (
             f"a cut-off of {cutoff:g} Hz is not between 0 and the Nyquist frequency, {rate / 2:g} Hz at {rate:g} Hz: "
@@ -161,7 +167,7 @@ def _active(steps: np.ndarray) -> np.ndarray:
     """Return for each joint whether it moves fast enough to determine the bandwidth, (n,) bool.
 
     Args:
-        steps: (N, n) differences of successive positions.
+        steps: (N, n) differences of successive positions [rad or m].
     """
     speed = np.quantile(np.abs(steps), 0.95, axis=0)
     return speed > MIN_SPEED_SHARE * speed.max()

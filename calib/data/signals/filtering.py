@@ -64,9 +64,13 @@ def design_decimator(rate: float, factor: int, kind: str = "kaiser") -> Decimato
     ``chebyshev`` is the decimate function of Matlab and Gautier: type I, order 8, 0.05 dB, cut-off 0.8 of the new
     Nyquist frequency, applied forwards and backwards. It is represented by its impulse response (the inverse transform
     of |H|²), truncated where the response has fallen to 1e-4: some 46 n_d samples on each side. ``kaiser`` (our
-    default) is a
-    windowed sinc with an equal band, 60 dB down from 1.2 of the new Nyquist frequency on, with 9 n_d samples on each
-    side: it needs a fifth of the work, and loses a fifth of the samples at the ends.
+    default) is a windowed sinc with an equal band, 60 dB down from 1.2 of the new Nyquist frequency on, with 9 n_d
+    samples on each side: it needs a fifth of the work, and loses a fifth of the samples at the ends.
+
+    Args:
+        rate: sampling rate [Hz].
+        factor: decimation factor n_d.
+        kind: ``kaiser`` or ``chebyshev``.
 
     Raises:
         CalibError: a factor below 1 or an unknown kind.
@@ -84,6 +88,10 @@ def factor_for(rate: float, band: float) -> int:
     """Return the largest decimation factor n_d whose filter passes `band` f_p [Hz], at least 1.
 
     n_d = floor(0.8 rate / (2 f_p))
+
+    Args:
+        rate: sampling rate before decimation [Hz].
+        band: f_p, highest frequency to keep [Hz].
     """
     return max(1, int(SHARE * rate / (2 * band) + 1e-9))
 
@@ -157,6 +165,10 @@ def decimate_blocks(blocks: Iterable[np.ndarray], decimator: Decimator) -> Itera
     """Yield, block by block, the decimation of one segment whose samples are given as blocks (..., N_i).
 
     The sample axis is the last one. Only one block and the earlier samples that windows still need are in memory.
+
+    Args:
+        blocks: blocks of the segment's samples, in order of time.
+        decimator: the decimation.
     """
     r, taps = decimator.factor, decimator.taps
     if r == 1 and len(taps) == 1:
@@ -179,6 +191,12 @@ def _windows(values: np.ndarray, taps: np.ndarray, r: int, count: int) -> np.nda
 
     Windows are computed in groups, as a product with a band matrix of weights. This needs twice the multiplications,
     but is much faster owing to the processor's cache.
+
+    Args:
+        values: (..., N) samples.
+        taps: (2 h + 1,) weights of the samples in one window.
+        r: distance between windows, in samples.
+        count: number of windows.
     """
     flat = values.reshape(-1, values.shape[-1])
     together = min(count, -(-len(taps) // r))
@@ -213,7 +231,12 @@ def _chebyshev(factor: int) -> np.ndarray:
 
 
 def too_short(motion_length: int, decimator: Decimator) -> MeasurementError:
-    """Return the error about a motion of `motion_length` samples, which is shorter than the filter's window."""
+    """Return the error about a motion of `motion_length` samples, which is shorter than the filter's window.
+
+    Args:
+        motion_length: number of samples of the motion.
+        decimator: the filter.
+    """
     needed = len(decimator.taps) / decimator.rate
     duration = motion_length / decimator.rate
     message = f"decimation by {decimator.factor} needs {needed:.3g} s without a gap, found {duration:.3g} s"
@@ -246,7 +269,12 @@ def low_pass(values: np.ndarray, rate: float, cutoff: float, order: int = ORDER)
 
 
 def border(rate: float, cutoff: float) -> int:
-    """Return the number of samples at each end that `low_pass` affects: 2 rate/f_c, our choice (0.8 % remain)."""
+    """Return the number of samples at each end that `low_pass` affects: 2 rate/f_c, our choice (0.8 % remain).
+
+    Args:
+        rate: sampling rate [Hz].
+        cutoff: cut-off f_c of the filter [Hz].
+    """
     return int(np.ceil(2 * rate / cutoff))
 
 
@@ -257,6 +285,11 @@ def slope(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
     form (width 1) is too small by the relative error (ωΔ)²/6, which is 6.6 % at a tenth of the sampling rate. Width 4
     is too small by (ωΔ)⁸/630, which is 0.004 % there. It is our default, since log rates are low, and the low-pass
     filter removes noise.
+
+    Args:
+        values: (N, ...) samples of a segment without gaps.
+        rate: sampling rate [Hz].
+        width: number of samples on each side that the differences use.
     """
     return _differences(values, SLOPE[width], rate, -1.0)
 
@@ -264,7 +297,13 @@ def slope(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
 def curvature(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
     """Return the second time derivative of `values` (N, ...) by central differences; NaN at the ends as in `slope`.
 
-    ẍ_k = rate² Σ_i d_i (x_{k+i} - 2 x_k + x_{k-i}). The relative error of width 1 is (ωΔ)²/12.
+    ẍ_k = rate² Σ_i d_i (x_{k+i} - 2 x_k + x_{k-i}). At the angular frequency ω and the sampling period Δ, the relative
+    error of width 1 is (ωΔ)²/12.
+
+    Args:
+        values: (N, ...) samples of a segment without gaps.
+        rate: sampling rate [Hz].
+        width: number of samples on each side that the differences use.
     """
     return _differences(values, CURVATURE[width], rate**2, 1.0)
 

@@ -74,6 +74,11 @@ def _rounded(t: np.ndarray, period: float, drift_samples: int) -> tuple[np.ndarr
     """Return the step number (N,) nearest to each time stamp after removing drift.
 
     The second value is the concentration of the phases, from 0 (random) to 1 (no jitter).
+
+    Args:
+        t: (N,) time stamps [s].
+        period: period of the clock [s].
+        drift_samples: number of samples over which the phase is averaged to follow a drift of the stamps.
     """
     stops = np.flatnonzero(np.diff(t) > LONG_STOP * period) + 1
     steps, votes = np.zeros(len(t), dtype=int), 0.0

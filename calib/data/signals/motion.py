@@ -344,7 +344,7 @@ def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: 
     Args:
         cutoffs: proposed cut-offs, with the position noise.
         cutoff: (n,) cut-off f_q of the positions [Hz].
-        a: (N, n) accelerations.
+        a: (N, n) accelerations [rad/s² or m/s²].
         rate: sampling rate [Hz].
     """
     rms = np.sqrt(np.mean(a**2, axis=0))
@@ -356,7 +356,13 @@ def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: 
 
 
 def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
-    """Return the positions (N, n) low-pass filtered at each joint's cut-off (n,) [Hz], segment by segment."""
+    """Return the positions (N, n) low-pass filtered at each joint's cut-off (n,) [Hz], segment by segment.
+
+    Args:
+        sampled: the resampled recording.
+        cutoff: (n,) cut-offs f_q [Hz].
+        order: order of the Butterworth filter in one pass.
+    """
     # By joints, as all that follows reads them.
     result = np.array(sampled.series["q"], order="F")
     for rows in filtering.segments(sampled.segment):
@@ -382,6 +388,12 @@ def _differences(
 
 def _unaffected(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file: str) -> np.ndarray:
     """Return the samples that the ends of the filters do not affect, (N,) bool.
+
+    Args:
+        sampled: the resampled recording.
+        cutoff: (n,) cut-offs of the positions [Hz].
+        options: options of filtering, with the time to remove at the ends.
+        file: name of the recording, for messages.
 
     Raises:
         MeasurementError: there are no such samples.
@@ -433,7 +445,12 @@ def _per_joint(cutoff: float | tuple[float, ...], recording: Recording) -> np.nd
 
 
 def _reasons(cutoffs: Cutoffs, options: FilterOptions) -> tuple[str, ...]:
-    """Return sentences that explain how the cut-offs were chosen."""
+    """Return sentences that explain how the cut-offs were chosen.
+
+    Args:
+        cutoffs: the proposed cut-offs.
+        options: options of filtering, which may state others.
+    """
     lines = []
     for name, option in (("cutoff", options.cutoff), ("band", options.band)):
         if option is not None:

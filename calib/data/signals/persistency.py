@@ -97,6 +97,10 @@ def repeats(training: Motion, test: Motion) -> float:
     number of cycles or another order of parts. The same path at another speed is no repeat. A repeat is no independent
     test, since the fit has already absorbed the model's errors along that path. Our choice is to refuse a test motion
     with a share of a half or more.
+
+    Args:
+        training: the motion that was fitted.
+        test: the motion for validation.
     """
     moves = np.ptp(training.q, axis=0) > MIN_TRAVEL
     if not moves.any() or training.n != test.n:
@@ -115,14 +119,24 @@ def repeats(training: Motion, test: Motion) -> float:
 
 
 def _moving_states(motion: Motion, max_states: int) -> np.ndarray:
-    """Return the states (q, v) of moving samples, thinned to about `max_states` rows: (M, 2 n)."""
+    """Return the states (q, v) of moving samples, thinned to about `max_states` rows: (M, 2 n).
+
+    Args:
+        motion: the motion.
+        max_states: approximate number M of states.
+    """
     rows = np.flatnonzero(~motion.standstill())
     rows = rows[:: max(1, len(rows) // max_states)]
     return np.hstack([motion.q[rows], motion.v[rows]])
 
 
 def _best_sine(q: np.ndarray, rate: float) -> tuple[float, float]:
-    """Return the largest share of the variance of a series (N,) that one sine explains, and its frequency [Hz]."""
+    """Return the largest share of the variance of a series (N,) that one sine explains, and its frequency [Hz].
+
+    Args:
+        q: (N,) positions of one joint [rad or m].
+        rate: sampling rate [Hz].
+    """
     window = np.hanning(len(q) + 1)[:-1]
     size = int(next_fast_len(4 * len(q), real=True) or 0)
     power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), size)) ** 2
@@ -133,7 +147,13 @@ def _best_sine(q: np.ndarray, rate: float) -> tuple[float, float]:
 
 
 def _one_sine(q: np.ndarray, f: float, rate: float) -> float:
-    """Return the share of the variance of `q` (N,) that a constant and one sine of frequency `f` [Hz] explain."""
+    """Return the share of the variance of `q` (N,) that a constant and one sine of frequency `f` [Hz] explain.
+
+    Args:
+        q: (N,) positions of one joint [rad or m].
+        f: frequency of the sine [Hz].
+        rate: sampling rate [Hz].
+    """
     step = max(1, int(rate / (20 * f)), len(q) // MAX_STATES)
     y = q[::step] - q[::step].mean()
     angle = 2 * np.pi * f * np.arange(0, len(q), step) / rate

@@ -86,6 +86,10 @@ class SampleClock:
 def find_clock(recording: Recording, kind: str = "auto") -> SampleClock:
     """Return the clock `kind` of a recording; for ``auto``, the clock with the smoothest positions.
 
+    Args:
+        recording: the recording.
+        kind: one of `CLOCKS`, or ``auto``.
+
     Raises:
         UsageError: an unknown clock, or a clock that is not possible for this recording.
     """
@@ -122,6 +126,9 @@ def _read_twice(recording: Recording) -> np.ndarray:
 
     Such a row is the last sample read again because the next one was late. Rows of a robot at rest may be equal, too.
     Therefore only short runs of equal rows between rows of different positions are marked.
+
+    Args:
+        recording: the recording of N samples.
     """
     q_changes = np.asarray(np.diff(recording.q, axis=0).any(axis=1))
     effort_changes = np.asarray(np.diff(recording.effort, axis=0).any(axis=1))
@@ -139,6 +146,9 @@ def _even_times(t: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Return times k T + drift (N,) [s], where k counts lost samples too, and the period T [s].
 
     None if the samples are not even.
+
+    Args:
+        t: (N,) time stamps [s].
     """
     lattice = find_lattice(t, DRIFT_SAMPLES)
     if lattice is not None:
@@ -211,6 +221,10 @@ def _lost(t: np.ndarray, step: float) -> np.ndarray:
     """Return the number of samples lost between successive stamps (N - 1,).
 
     It is the number of whole periods by which all later stamps are late.
+
+    Args:
+        t: (N,) time stamps [s].
+        step: period of the samples [s].
     """
     lost = np.zeros(len(t) - 1)
     delay = t - step * np.arange(len(t))
@@ -455,12 +469,23 @@ def _interpolate(
 
 
 def _on_grid(t: np.ndarray, grid: np.ndarray) -> bool:
-    """Return whether sample times equal the times of a grid up to rounding."""
+    """Return whether sample times equal the times of a grid up to rounding.
+
+    Args:
+        t: (N,) times of the samples [s].
+        grid: times of the grid [s].
+    """
     return len(t) == len(grid) and bool(np.abs(grid - t).max() < 1e-6 * (grid[1] - grid[0]))
 
 
 def _weight(t: np.ndarray, grid: np.ndarray, period: float) -> np.ndarray:
-    """Return the weight of each time of a grid: 1 if a sample is within 0.75 periods, else 0."""
+    """Return the weight of each time of a grid: 1 if a sample is within 0.75 periods, else 0.
+
+    Args:
+        t: times of the samples [s].
+        grid: times of the grid [s].
+        period: sampling period [s].
+    """
     after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
     distance = np.minimum(np.abs(grid - t[after - 1]), np.abs(t[after] - grid))
     return (distance < SAMPLE_REACH * period).astype(float)

@@ -105,6 +105,11 @@ def sigma_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> np.ndarray
     If all rigid parameters were candidates of the fit, σ is computed from the fit's covariance. Otherwise it is
     computed from the posterior covariance given the fit's data and the prior of making
     (`calib.geometry.fit.PLAUSIBLE`).
+
+    Args:
+        cell: installation of the arm whose target is predicted: the calibrated or the nominal one.
+        fit: the rigid fit, with its data and its covariance.
+        q: (m, n) joint values [rad or m].
     """
     table = layout(cell)
     columns = table.rigid_index
@@ -122,6 +127,11 @@ def _posterior(cell: Installation, fit: GeometricFit, columns: np.ndarray) -> np
     """Return the posterior covariance (c, c) of the parameters `columns` (c,).
 
     It follows from the data of the fit and the prior of making.
+
+    Args:
+        cell: the installation at which the derivatives are computed.
+        fit: the fit whose measurements are the data.
+        columns: (c,) indices in the full parameter vector (`calib.geometry.observation`).
     """
     square = np.zeros((len(columns), len(columns)))
     for number, block in enumerate(fit.blocks):
@@ -140,6 +150,11 @@ def _positions_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> Posit
     """Return positions of the first target as an installation predicts them at postures q (m, n) [rad or m].
 
     They have the form of measurements, so that functions on measurements can be applied to them.
+
+    Args:
+        cell: the installation.
+        fit: the fit, whose first block of positions provides the names of target and station.
+        q: (m, n) joint values [rad or m].
     """
     measured = next(block.measured for block in fit.blocks if isinstance(block.measured, Positions))
     block = Positions(
@@ -157,6 +172,11 @@ def _nominal_error(fit: GeometricFit, nominal: Installation, q: np.ndarray) -> f
     """Return the nominal arm's rms error [m] at postures q (m, n), if the calibrated arm is true.
 
     None where this error cannot be computed.
+
+    Args:
+        fit: the fit of the calibrated arm.
+        nominal: the nominal arm; its base and tool placement are fitted to the calibrated arm's positions.
+        q: (m, n) joint values [rad or m].
     """
     block = _positions_at(fit.cell, fit, q)
     with suppress(CalibError):

@@ -40,14 +40,22 @@ def repeated_readings(nominal: Installation, blocks: Sequence[PoseMeasurements])
 
 
 def _readings(block: Positions) -> np.ndarray:
-    """Return a number (m,) for each row's reading, equal for equal readings."""
+    """Return a number (m,) for each row's reading, equal for equal readings.
+
+    Args:
+        block: measured positions or poses; equal readings have equal coordinates.
+    """
     rounded = np.round(block.position / SAME)
     _, number = np.unique(rounded, axis=0, return_inverse=True)
     return number.reshape(-1)
 
 
 def _copied_targets(block: Positions) -> list[Finding]:
-    """Return findings on targets whose readings equal those of another target at all poses where both were measured."""
+    """Return findings on targets whose readings equal those of another target at all poses where both were measured.
+
+    Args:
+        block: measured positions of several targets.
+    """
     readings = _readings(block)
     # per target: its readings by row number
     reading_of_row = []

@@ -195,7 +195,7 @@ def row_changes(fit: GeometricFit) -> list[Finding]:
 
 
 def _rows_of(fit: GeometricFit, number: int) -> WhitenedRows:
-    """Return the whitened rows of block `number` of a fit, with the columns of all rigid parameters."""
+    """Return the whitened rows of the block with index `number` in a fit, with the columns of all rigid parameters."""
     measured = fit.blocks[number].measured
     (block,) = prepare(fit.cell, [take(measured, evenly(len(measured), MAX_ROWS))])
     table = layout(fit.cell)
@@ -228,7 +228,12 @@ def _without_gross(rows: WhitenedRows) -> WhitenedRows:
 
 
 def _subjects(fit: GeometricFit, rows: WhitenedRows) -> list[Subject]:
-    """Return the parts of the set-up that may have changed: station, instrument scale, targets, zeros of the joints."""
+    """Return the parts of the set-up that may have changed: station, instrument scale, targets, zeros of the joints.
+
+    Args:
+        fit: a fit without joint corrections.
+        rows: the whitened rows of one of its blocks.
+    """
     cell = fit.cell
     table = layout(cell)
     column = {table.names[k]: number for number, k in enumerate(table.index("arm", "station", "tool"))}
@@ -257,6 +262,10 @@ def _best_change(rows: WhitenedRows, subjects: Sequence[Subject]) -> RowChange |
     """Return the change over time (row order) that explains the residuals best; None if no change meets all conditions.
 
     The conditions are those of the module's docstring.
+
+    Args:
+        rows: the whitened rows of one block.
+        subjects: the parts that may have changed.
     """
     residuals = rows.residuals(rows.solve())
     cost = float(np.sum(residuals**2))
@@ -284,7 +293,7 @@ def _information(cost: float, count: int, parameters: int) -> float:
     """Return Schwarz's criterion (BIC) of a fit.
 
     Args:
-        cost: sum of squares of the fit.
+        cost: sum of squared residuals of the fit, in sigmas.
         count: number of measured numbers.
         parameters: number of unknowns.
     """
@@ -373,9 +382,11 @@ def _gains(score: np.ndarray, square: np.ndarray, shared: np.ndarray) -> np.ndar
     """Return the gains gᵀ S⁻¹ g (c,) of c changes, from their sums over rows.
 
     Args:
-        score: (c, k) g.
-        square: (c, k, k) Σ HᵀH.
-        shared: (c, k, f) Σ HᵀQ.
+        score: (c, k) g, the score Σ Hᵀr of each change: H are the derivatives of the rows by the change's k parameters,
+            r the residuals without a change.
+        square: (c, k, k) Σ HᵀH over the rows; S is Σ HᵀH less the part that the other parameters explain, plus the
+            prior precision of a change.
+        shared: (c, k, f) Σ HᵀQ, with Q orthonormal columns for the other f parameters.
     """
     prior = CHANGED**-2.0 * np.eye(score.shape[1])
     matrix = square - shared @ shared.transpose(0, 2, 1) + prior
@@ -384,7 +395,13 @@ def _gains(score: np.ndarray, square: np.ndarray, shared: np.ndarray) -> np.ndar
 
 
 def _gains_over_other_orders(rows: WhitenedRows, residuals: np.ndarray, subjects: Sequence[Subject]) -> Iterator[float]:
-    """Yield the gains of changes over rows ordered by each joint's values and target coordinate instead of time."""
+    """Yield the gains of changes over rows ordered by each joint's values and target coordinate instead of time.
+
+    Args:
+        rows: the whitened rows of one block of positions.
+        residuals: (m, d) whitened residuals without a change.
+        subjects: the parts that may have changed.
+    """
     measured = rows.block.measured
     assert isinstance(measured, Positions)
     for order in (*measured.q.T, *measured.position.T):
@@ -393,7 +410,12 @@ def _gains_over_other_orders(rows: WhitenedRows, residuals: np.ndarray, subjects
 
 
 def _holds_on_held_out(rows: WhitenedRows, change: RowChange) -> bool:
-    """Return whether the change also reduces the residuals of held-out rows."""
+    """Return whether the change also reduces the residuals of held-out rows, every k-th row being held out in turn.
+
+    Args:
+        rows: the whitened rows of one block.
+        change: the change, whose columns are added.
+    """
     changed = rows.with_columns(change.columns)
     count = len(rows.residual)
     squares = changed_squares = 0.0
@@ -406,13 +428,23 @@ def _holds_on_held_out(rows: WhitenedRows, change: RowChange) -> bool:
 
 
 def _squares_on(rows: WhitenedRows, held_out: np.ndarray, fitted: np.ndarray) -> float:
-    """Return the sum of squares of the rows `held_out`, predicted with the estimate from the rows `fitted`."""
+    """Return the sum of squares of the rows `held_out`, predicted with the estimate from the rows `fitted`.
+
+    Args:
+        rows: the whitened rows of one block.
+        held_out, fitted: row numbers.
+    """
     residuals = rows.some(held_out).residuals(rows.some(fitted).solve())
     return float(np.sum(residuals**2))
 
 
 def _described(rows: WhitenedRows, change: RowChange) -> Finding:
-    """Return the finding on a change, with the estimated size of the change and its standard deviation."""
+    """Return the finding on a change, with the estimated size of the change and its standard deviation.
+
+    Args:
+        rows: the whitened rows of one block.
+        change: the change to describe.
+    """
     extended = rows.with_columns(change.columns)
     estimate = extended.solve()
     count = change.subject.count

@@ -33,7 +33,12 @@ Blocks = Sequence[PoseMeasurements]
 
 
 def least_error(nominal: Installation, blocks: Blocks) -> np.ndarray:
-    """Return the least mean squared error [m²] (1,) over all placements of base and tool; 0 for too few positions."""
+    """Return the least mean squared error [m²] (1,) over all placements of base and tool; 0 for too few positions.
+
+    Args:
+        nominal: the nominal arm.
+        blocks: measured positions; with a block of another kind, 0 is returned.
+    """
     squares = 0.0
     count = 0
     for block in blocks:
@@ -49,14 +54,24 @@ def least_error(nominal: Installation, blocks: Blocks) -> np.ndarray:
 
 
 def _columns(nominal: Installation, block: Positions) -> np.ndarray:
-    """Return the columns (m, 13) of the linear position model for a block's rows, from the tip's R, t and 1."""
+    """Return the columns (m, 13) of the linear position model: the nine entries of R, the three of t, and 1.
+
+    Args:
+        nominal: the nominal arm, which provides the tip's pose R, t in each row.
+        block: measured positions of m rows.
+    """
     tip = forward(nominal.chain, block.q)
     rotation = tip[:, :3, :3].reshape(-1, 9)
     return np.column_stack([rotation, tip[:, :3, 3], np.ones(len(tip))])
 
 
 def _unexplained(columns: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Return the residual (m, 3) of the linear least-squares fit of positions by columns."""
+    """Return the residual (m, 3) of the linear least-squares fit of positions by columns.
+
+    Args:
+        columns: (m, 13) columns of the linear position model, computed by `_columns`.
+        position: (m, 3) measured positions [m].
+    """
     return position - columns @ np.linalg.lstsq(columns, position)[0]
 
 
@@ -68,7 +83,7 @@ def row_shifts(nominal: Installation, blocks: Blocks, max_left: float) -> list[C
     Args:
         nominal: the nominal arm.
         blocks: the measurements; row numbers missing in a block are rows that were held out.
-        max_left: largest share of the error that may remain with such a shift.
+        max_left: largest mean squared error with such a shift, as a share of that without it.
     """
     changes = []
     for number, block in enumerate(blocks):
@@ -86,7 +101,13 @@ def row_shifts(nominal: Installation, blocks: Blocks, max_left: float) -> list[C
 
 
 def _best_first(nominal: Installation, block: Positions, shift: int) -> int | None:
-    """Return the row from which on a shift by `shift` rows explains the positions best; None where rows are too few."""
+    """Return the row from which on a shift by `shift` rows explains the positions best; None where rows are too few.
+
+    Args:
+        nominal: the nominal arm.
+        block: measured positions.
+        shift: number of rows by which the joint values are shifted down; negative for up.
+    """
     numbers = np.unique(block.rows)[: -MIN_SHIFTED - abs(shift)]
     if len(numbers) < MIN_SHIFTED or len(_shifted(block, 0, shift)) < MIN_PAIRED * len(block):
         return None
@@ -101,14 +122,27 @@ def _best_first(nominal: Installation, block: Positions, shift: int) -> int | No
 
 
 def _shifted_block(number: int, first: int, shift: int, blocks: Blocks) -> Blocks:
-    """Return the blocks with the joint values of block `number` shifted as by `_shifted`."""
+    """Return the blocks with the joint values of block `number` shifted as by `_shifted`.
+
+    Args:
+        number: index of the block.
+        first: row number in the file from which on joint values are shifted.
+        shift: number of rows by which they are shifted.
+        blocks: the measurements.
+    """
     block = blocks[number]
     assert isinstance(block, Positions)
     return [*blocks[:number], _shifted(block, first, shift), *blocks[number + 1 :]]
 
 
 def _shifted(block: Positions, first: int, shift: int) -> Positions:
-    """Return a block whose rows from number `first` on have the joint values of the row `shift` rows further down."""
+    """Return a block whose rows from number `first` on have the joint values of the row `shift` rows further down.
+
+    Args:
+        block: measured positions.
+        first: row number in the file.
+        shift: number of rows; negative: rows further up.
+    """
     numbers, index = np.unique(block.rows, return_index=True)
     source = np.where(block.rows >= first, block.rows + shift, block.rows)
     position = np.minimum(np.searchsorted(numbers, source), len(numbers) - 1)
@@ -137,7 +171,7 @@ def two_targets(nominal: Installation, blocks: Blocks, max_left: float) -> list[
     Args:
         nominal: the nominal arm.
         blocks: the measurements.
-        max_left: largest share of the error that may remain with two targets.
+        max_left: largest mean squared error with two targets, as a share of that with one.
     """
     changes = []
     for number, block in enumerate(blocks):
@@ -162,7 +196,7 @@ def two_targets(nominal: Installation, blocks: Blocks, max_left: float) -> list[
 
 
 def _divided(number: int, second: frozenset[int], blocks: Blocks) -> Blocks:
-    """Return the blocks with the rows `second` of block `number` assigned to a second target."""
+    """Return the blocks with the rows `second` of the block with index `number` assigned to a second target."""
     block = blocks[number]
     tool = np.isin(block.rows, list(second)).astype(int)
     name = block.tool_names[0]
@@ -192,7 +226,13 @@ def _sorted_by_target(columns: np.ndarray, position: np.ndarray) -> Mixture:
 
 
 def _settled(columns: np.ndarray, position: np.ndarray, second: np.ndarray) -> Mixture:
-    """Return the rows assigned to two targets, iterated from a first assignment `second` (m,) until none changes."""
+    """Return the rows assigned to two targets, iterated from a first assignment `second` (m,) until none changes.
+
+    Args:
+        columns: (m, 13) columns of the linear position model, computed by `_columns`.
+        position: (m, 3) measured positions [m].
+        second: whether a row is assigned to the second target.
+    """
     distance = 0.0
     squares = np.inf
     for _ in range(MAX_ROUNDS):

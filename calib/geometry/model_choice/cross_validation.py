@@ -67,6 +67,9 @@ def term_sizes(terms: tuple[Term, ...]) -> np.ndarray:
 
     This is our choice among constant, 1 / √order and 1 / order: the last predicts held-out regions of a UR5 and a
     Motoman best.
+
+    Args:
+        terms: the E terms.
     """
     sizes = []
     for term in terms:
@@ -170,8 +173,8 @@ class FoldStatistics:
         """Return the estimate of the coordinates `index`, with the most probable prior standard deviations.
 
         Args:
-            data: statistics of the rows.
-            index: numbers of the coordinates.
+            data: sufficient statistics of the rows, in all coordinates.
+            index: indices of the coordinates to estimate.
             start: initial prior standard deviations.
             iterations: largest number of iterations.
         """
@@ -267,6 +270,10 @@ def _placed_anew(measured: Sequence[PoseMeasurements], held_out: Sequence[np.nda
     """Return, for each block, whether all rows of its station are held out.
 
     The placement of such a station is fitted to the held-out rows.
+
+    Args:
+        measured: the blocks of measurements.
+        held_out: for each block, the numbers of its held-out rows.
     """
     fitted_stations = set()
     for block, rows in zip(measured, held_out):
@@ -395,7 +402,12 @@ class _FoldRows:
         return shares, count
 
     def _separable_shares(self, number: int, rows: np.ndarray) -> list[Share]:
-        """Return the statistics of positions or poses; for these, whitened and metric rows differ only by a factor."""
+        """Return the statistics of positions or poses; for these, whitened and metric rows differ only by a factor.
+
+        Args:
+            number: index of the block.
+            rows: row numbers in the block.
+        """
         block = prepare(self.cell, [take(self.measured[number], rows)])[0]
         divisors = repeat(1.0 / np.sqrt(self.weights[number][rows][None]))
         shares = []
@@ -407,7 +419,12 @@ class _FoldRows:
     def _observed_shares(
         self, number: int, rows: np.ndarray
     ) -> tuple[list[Share], list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
-        """Return the statistics of whitened rows; for rows in metres, return residual, W and weights of each part."""
+        """Return the statistics of whitened rows, and for rows in metres residual, Jacobian and weights of each part.
+
+        Args:
+            number: index of the block.
+            rows: row numbers in the block.
+        """
         block = prepare(self.cell, [take(self.measured[number], rows)])[0]
         weights = self.weights[number][rows]
         noise = self.noises[number]
@@ -431,6 +448,10 @@ def project_out(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:
     """Return the part of `columns` (f, ...) that is orthogonal to the columns at `frames`.
 
     This has the same effect as a fit of the parameters at `frames` to the rows.
+
+    Args:
+        columns: (f, ...) statistics or Jacobian columns of f parameters.
+        frames: indices of the parameters to project out.
     """
     flat = columns.reshape(len(columns), -1)
     basis, size, _ = np.linalg.svd(flat[frames].T, full_matrices=False)

@@ -30,7 +30,7 @@ class Folds:
     Attributes:
         kind: ``stations``, ``files``, ``fixtures`` or ``regions``; on request ``random`` or ``poses`` (leave-one-out).
         count: number of folds.
-        members: for each block, (m,) fold number of each row.
+        members: for each block, (m,) index of each row's fold, from 0.
         blind: names of stations or files that are not held out as a whole, since the other rows do not determine their
             tool.
     """
@@ -48,6 +48,10 @@ def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds
     or more files without an instrument, each fold holds out one file. With at least three fixtures (groups of linked
     sockets, planes), each fold holds out some of them. Otherwise `REGIONS` regions of the joint space (k-means) are
     distributed over `FOLDS` folds; both numbers are smaller where there are few rows.
+
+    Args:
+        measured: blocks of measurements.
+        seed: seed of the clusters of regions.
     """
     stations = {block.station for block in measured if block.has_instrument}
     if len(stations) >= 2 and all(block.has_instrument for block in measured):
@@ -63,7 +67,13 @@ def transfer_folds(measured: Sequence[PoseMeasurements], seed: int = 0) -> Folds
 
 
 def _folds_of(kind: str, names: Sequence[str], measured: Sequence[PoseMeasurements]) -> Folds:
-    """Return folds that each hold out all blocks of one name; with too many names, several names share a fold."""
+    """Return folds that each hold out all blocks of one name; with too many names, several names share a fold.
+
+    Args:
+        kind: kind of the folds, for `Folds.kind`.
+        names: name of each block's station or file.
+        measured: blocks of measurements.
+    """
     distinct = list(dict.fromkeys(names))
     count = min(len(distinct), 2 * FOLDS)
     members = []
@@ -113,7 +123,14 @@ def divide(
 def _divided(
     measured: Sequence[PoseMeasurements], fold_rows: Sequence[np.ndarray], seed: int, scattered: bool
 ) -> list[np.ndarray]:
-    """Return, for each block, the part number of each of its rows in a fold that is split by region or at random."""
+    """Return, for each block, the part number of each of its rows in a fold that is split by region or at random.
+
+    Args:
+        measured: blocks of measurements.
+        fold_rows: for each block, the row numbers in the fold.
+        seed: seed of regions or random parts.
+        scattered: True splits at random, False by region.
+    """
     parts = [np.zeros(0, dtype=int) for _ in measured]
     numbers = [number for number, rows in enumerate(fold_rows) if len(rows)]
     blocks = [take(measured[number], fold_rows[number]) for number in numbers]
@@ -129,6 +146,12 @@ def region_folds(
     """Return folds that consist of regions of the joint space.
 
     The regions are clusters by k-means on joint values divided by their standard deviations.
+
+    Args:
+        measured: blocks of measurements.
+        regions: number of regions.
+        folds: number of folds; each consists of several regions.
+        seed: seed of the clusters.
     """
     from scipy.cluster.vq import kmeans2
 
@@ -177,6 +200,11 @@ def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, s
     These folds test interpolation only: on a grid of poses, every held-out pose has fitted neighbours, so that errors
     are smaller than elsewhere in the workspace. All reflectors measured at one pose are in the same fold, and so are
     the two rows of a distance.
+
+    Args:
+        measured: blocks of measurements.
+        folds: number k of folds; None for one fold per pose.
+        seed: seed of the draw.
     """
     members = []
     count = 0
@@ -192,7 +220,12 @@ def random_folds(measured: Sequence[PoseMeasurements], folds: int | None = 10, s
 
 
 def _together(block: PoseMeasurements, fold: np.ndarray) -> np.ndarray:
-    """Return the fold number of each row, with both rows of a distance in the same fold."""
+    """Return the fold number of each row, with both rows of a distance in the same fold.
+
+    Args:
+        block: the measurements.
+        fold: (m,) fold number of each row.
+    """
     if not isinstance(block, Distances):
         return fold
     _, first, pair = np.unique(block.group, return_index=True, return_inverse=True)
@@ -203,6 +236,9 @@ def _fixtures(block: Sockets) -> Folds | None:
     """Return folds that hold out whole fixtures; None for fewer than three fixtures.
 
     Sockets with known distances between them are one fixture.
+
+    Args:
+        block: measurements of sockets.
     """
     groups = np.unique(block.group).tolist()
     fixture = dict(zip(groups, groups))

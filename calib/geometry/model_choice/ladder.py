@@ -52,6 +52,10 @@ def _stiffness(chain: Chain, torques_known: bool) -> list[Term]:
     """Return the terms for deflection of each joint about its axis under gravity.
 
     They use the gravity torques if these are known, else fitted moments.
+
+    Args:
+        chain: the arm.
+        torques_known: whether gravity torques can be computed from known masses.
     """
     terms: list[Term] = []
     for joint, element in enumerate(chain.moving):
@@ -63,7 +67,12 @@ def _stiffness(chain: Chain, torques_known: bool) -> list[Term]:
 
 
 def _bending(chain: Chain, torques_known: bool) -> list[Term]:
-    """Return the terms for the tilt of each joint's axis under gravity, due to compliant bearings and links."""
+    """Return the terms for the tilt of each joint's axis under gravity, due to compliant bearings and links.
+
+    Args:
+        chain: the arm.
+        torques_known: not used; the interface of all effects.
+    """
     terms: list[Term] = []
     for number in _fixed_elements(chain):
         if chain.elements[number].axis[0] == "r":
@@ -78,7 +87,12 @@ def _fixed_elements(chain: Chain) -> list[int]:
 
 
 def _sag(chain: Chain, number: int) -> list[Term]:
-    """Return the terms for the rotation of an element under the weight of the links it carries, by link and axis."""
+    """Return the terms for the rotation of an element under the weight of the links it carries, by link and axis.
+
+    Args:
+        chain: the arm.
+        number: index of the element.
+    """
     element = chain.elements[number]
     links = range(element.owner, chain.n)
     return [Term(element.name, "lever", link, axis) for link in links for axis in range(3)]
@@ -87,6 +101,10 @@ def _sag(chain: Chain, number: int) -> list[Term]:
 def _coupling(chain: Chain, torques_known: bool) -> list[Term]:
     """Return the terms for gear ratios and coupled gears: corrections proportional to a joint's value or its
     neighbours'.
+
+    Args:
+        chain: the arm.
+        torques_known: not used; the interface of all effects.
     """
     terms: list[Term] = []
     for joint in range(chain.n):
@@ -97,7 +115,12 @@ def _coupling(chain: Chain, torques_known: bool) -> list[Term]:
 
 
 def _harmonics(chain: Chain, torques_known: bool) -> list[Term]:
-    """Return the terms sin k q_j, cos k q_j, k = 1 … `MAX_ORDER`, of each revolute joint: encoder and gear errors."""
+    """Return the terms sin k q_j, cos k q_j, k = 1 … `MAX_ORDER`, of each revolute joint: encoder and gear errors.
+
+    Args:
+        chain: the arm.
+        torques_known: not used; the interface of all effects.
+    """
     terms: list[Term] = []
     for joint, element in enumerate(chain.moving):
         terms += _turning(chain, chain.names[element], joint, MAX_ORDER)
@@ -105,7 +128,12 @@ def _harmonics(chain: Chain, torques_known: bool) -> list[Term]:
 
 
 def _wobble(chain: Chain, torques_known: bool) -> list[Term]:
-    """Return the terms for wobble of each joint's axis: low harmonics of q_j on the other elements of joint j."""
+    """Return the terms for wobble of each joint's axis: low harmonics of q_j on the other elements of joint j.
+
+    Args:
+        chain: the arm.
+        torques_known: not used; the interface of all effects.
+    """
     terms: list[Term] = []
     for number in _fixed_elements(chain):
         element = chain.elements[number]
@@ -114,7 +142,14 @@ def _wobble(chain: Chain, torques_known: bool) -> list[Term]:
 
 
 def _turning(chain: Chain, name: str, joint: int, max_order: int) -> list[Term]:
-    """Return the terms of an element that are harmonics of a revolute joint's angle; empty for a prismatic joint."""
+    """Return the terms of an element that are harmonics of a revolute joint's angle; empty for a prismatic joint.
+
+    Args:
+        chain: the arm.
+        name: name of the element that the terms move.
+        joint: index of the joint.
+        max_order: highest order k of sin k q and cos k q.
+    """
     if chain.joints[joint].kind != "revolute":
         return []
     return [Term(name, basis, joint, order) for order in range(1, max_order + 1) for basis in HARMONIC]
@@ -233,10 +268,10 @@ def select_model(
         fixed: indices of parameters that are not fitted; None for no such parameters.
         prior: standard deviations of the parameter vector about its nominal values, infinite for no prior; None for no
             prior at all.
-        seed: seed of the regions.
+        seed: seed of the regions of the joint space that are held out.
         folds: partition by which rows are held out; None for the most demanding one
             (`calib.geometry.model_choice.folds`).
-        progress: called with (done, total, task); None for no report.
+        progress: called with (done, total, task): steps done, steps in all, name of the next step; None for no report.
 
     Raises:
         UsageError: the model does not exist.
@@ -318,7 +353,12 @@ class _Climber:
             self.folds = divide(self.folds, blind, self.measured, self.seed, scattered)
 
     def rigid(self, model: str) -> None:
-        """Fit the rigid geometry, or only the placements or joint offsets where the user asks for these."""
+        """Fit the rigid geometry, or only the placements or joint offsets where the user asks for these.
+
+        Args:
+            model: name of the requested model: ``frames`` (placements), ``offsets``, or any other for all rigid
+                parameters.
+        """
         rigid_model = model if model in RIGID_MODELS else "geometry"
         self.error = self._statistics(self.nominal, ()).error(NONE).rms
         self.nominal_step = ModelStep("frames", self.nominal.identified, 1e3 * self.error, rigid_model == "frames")
@@ -345,6 +385,9 @@ class _Climber:
         """Add effects to the geometry one by one or, given the name of an effect, add this one and all before it.
 
         Effects that the selection added are removed again if the fit with them does not converge.
+
+        Args:
+            model: name of an effect, or ``auto`` to select the effects.
         """
         if self.full is None:
             return
@@ -418,7 +461,14 @@ class _Climber:
     def _final(
         self, rigid: GeometricFit, statistics: FoldStatistics, terms: Sequence[Term], index: np.ndarray
     ) -> GeometricFit:
-        """Return the fit of geometry and effects to all rows, with the most probable ridge of each term."""
+        """Return the fit of geometry and effects to all rows, with the most probable ridge of each term.
+
+        Args:
+            rigid: the fit of the geometry.
+            statistics: statistics of every fold, from which the ridges follow.
+            terms: all terms to which the statistics refer.
+            index: numbers of the terms to fit; terms that the data switch off are omitted.
+        """
         reference = self.nominal.cell.chain
         ridges = statistics.ridges(index)
         alive = ridges > 0.0
@@ -473,7 +523,12 @@ class _Climber:
 
 
 def _declined(effect: UnseenErrors, error: UnseenErrors) -> str:
-    """Return why an effect is not used: the change of the error on held-out rows, and the number of better folds."""
+    """Return why an effect is not used: the change of the error on held-out rows, and the number of better folds.
+
+    Args:
+        effect: errors with the effect.
+        error: errors without it.
+    """
     gain = 1.0 - effect.rms / error.rms
     if gain <= 0.0:
         return "no better on held-out rows: not used"
@@ -486,6 +541,13 @@ def _rung(statistics: FoldStatistics, effect: str, index: np.ndarray, rms: float
     """Return the step of an effect, from its cross-validation error `rms` [m].
 
     The effect is used in the next models if `note` is empty.
+
+    Args:
+        statistics: statistics of every fold.
+        effect: name of the effect.
+        index: numbers of the terms of the model.
+        rms: cross-validation error [m].
+        note: reason for not using the effect.
     """
     # terms that the data do not switch off
     corrections = int(np.sum(statistics.ridges(index) > 0.0))

@@ -85,7 +85,7 @@ class GravityHypotheses:
 
     @property
     def factor(self) -> float:
-        """Ratio of rms residuals with the other and with the stated direction, geometric mean over the joints."""
+        """Ratio of rms residuals with `direction` and with the stated gravity, geometric mean over the joints."""
         ratio = self.after / self.before
         return float(np.exp(np.mean(np.log(ratio))))
 
@@ -135,7 +135,7 @@ def _another_direction(sums: "_GravitySums", stated: np.ndarray, before: np.ndar
     Args:
         sums: regressor products of the motions.
         stated: (3,) stated gravity vector, which gives the magnitude.
-        before: (n,) unexplained shares with the stated vector.
+        before: (n,) unexplained share of each joint's rms torque with the stated vector.
     """
     bound = sums.bound()
     if _mean(bound / before) > MAX_LEFT:
@@ -157,7 +157,7 @@ def _without_gravity(
     Args:
         sums: regressor products of the motions.
         gravity: (3,) gravity vector.
-        unexplained: (n,) unexplained shares with gravity at all joints.
+        unexplained: (n,) unexplained share of each joint's rms torque with gravity at all joints.
         candidates: joints whose torques do not contain the gravity torque of the robot's masses; for them it suffices
             that the fit without gravity is as good.
     """
@@ -229,7 +229,7 @@ class _GravitySums:
         return squares
 
     def _under(self, gravity: np.ndarray) -> np.ndarray:
-        """Return the matrix (k, p + 1) that combines the k columns into the columns under a gravity vector (3,)."""
+        """Return the matrix (k, p + 1) from the k columns to p columns under a gravity vector (3,), and the torque."""
         inertial = np.eye(10 * self.bodies)
         by_body = inertial.reshape(self.bodies, 10, -1)
         masses = by_body[:, MASSES].reshape(4 * self.bodies, -1)
@@ -257,7 +257,11 @@ class _GravitySums:
 
 
 def _products(motion: MotionSamples) -> np.ndarray:
-    """Return WᵀW of each joint (n, k, k) for the columns of `_columns`."""
+    """Return WᵀW of each joint (n, k, k) for the columns of `_columns`.
+
+    Args:
+        motion: samples of one recording.
+    """
     columns = _columns(motion).transpose(1, 0, 2)
     return np.asarray(columns.transpose(0, 2, 1) @ columns)
 
@@ -267,6 +271,9 @@ def _columns(motion: MotionSamples) -> np.ndarray:
 
     They describe bodies in motion without gravity, bodies at rest under gravity along x, y and z, and drives; the last
     column is the torque.
+
+    Args:
+        motion: m samples of one recording of n joints and B bodies.
     """
     m, n = motion.q.shape
     zero = np.zeros_like(motion.v)
@@ -298,7 +305,7 @@ def _mean(ratios: np.ndarray) -> float:
 
 
 def _angle(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the angle between two vectors (3,) [rad]; a right angle if one of them is zero."""
+    """Return the angle between the vectors `first` and `second` (3,) [rad]; a right angle if one of them is zero."""
     size = float(np.linalg.norm(first) * np.linalg.norm(second))
     if not size > 0.0:
         return 0.5 * np.pi
@@ -324,7 +331,12 @@ def _best_direction(sums: _GravitySums, magnitude: float, unexplained: np.ndarra
 
 
 def _refined(cost: Callable[[np.ndarray], float], start: np.ndarray) -> np.ndarray:
-    """Return the vector (3,) with the smallest cost near `start`, of equal length."""
+    """Return the vector (3,) with the smallest cost near `start`, of equal length.
+
+    Args:
+        cost: function of a vector (3,).
+        start: first vector, whose length is kept.
+    """
     # Imported here because it is slow to load.
     from scipy.optimize import minimize
 

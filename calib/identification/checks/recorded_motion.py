@@ -87,7 +87,12 @@ class LocatedMotion:
 
 
 def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None:
-    """Return the location of the repetitions of a designed motion in a recording; None if it contains none."""
+    """Return the location of the repetitions of a designed motion in a recording; None if it contains none.
+
+    Args:
+        recording: recording of n joints.
+        motion: the designed motion, which may be repeated.
+    """
     grid, q = _on_grid(recording)
     reference = _one_period(motion)
     recalled = _recalled(q, reference)
@@ -155,7 +160,11 @@ def another_motion(
 
 
 def _on_grid(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times of the coarse grid (N,) and the positions at these times (N, n)."""
+    """Return the times of the coarse grid (N,) and the positions at these times (N, n).
+
+    Args:
+        recording: recording of n joints.
+    """
     grid = _coarse(recording.t)
     return grid, _sampled(recording.t, recording.q, grid)
 
@@ -182,7 +191,12 @@ def _one_period(motion: DesignedMotion, speed: float = 1.0) -> np.ndarray:
 
 
 def _recalled(q: np.ndarray, reference: np.ndarray) -> Recalled | None:
-    """Return the repetitions of one period (P, n) of a motion in positions (N, n); None if there are none."""
+    """Return the repetitions of one period (P, n) of a motion in positions (N, n); None if there are none.
+
+    Args:
+        q: (N, n) positions on the coarse grid [rad or m].
+        reference: (P, n) positions over one period on a grid of equal spacing.
+    """
     try:
         return find_periods(q, reference, likeness=MIN_LIKENESS)
     except BadInput:
@@ -190,7 +204,11 @@ def _recalled(q: np.ndarray, reference: np.ndarray) -> Recalled | None:
 
 
 def _unlike(data: Pair) -> np.ndarray:
-    """Return the share (1,) of variance that is unexplained in the worst recorded period; 1 without periods."""
+    """Return the share (1,) of variance that is unexplained in the worst recorded period; 1 without periods.
+
+    Args:
+        data: recorded positions (N, n), and one period (P, n) of the designed motion.
+    """
     q, reference = data
     recalled = _recalled(q, reference)
     if recalled is None:
@@ -199,7 +217,12 @@ def _unlike(data: Pair) -> np.ndarray:
 
 
 def _best_order(q: np.ndarray, reference: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the recorded column (n,) and sign (n,) for each joint that correlate best with the designed motion."""
+    """Return the recorded column (n,) and sign (n,) for each joint that correlate best with the designed motion.
+
+    Args:
+        q: (N, n) recorded positions on the coarse grid.
+        reference: (P, n) positions over one period of the designed motion.
+    """
     n = reference.shape[1]
     likeness = np.zeros((2, n, n))
     window = np.ones(len(reference))
@@ -232,7 +255,7 @@ def share_of_nominal(
 
     Args:
         t: (N,) sample times [s].
-        q, effort: (N, n) positions [rad or m] and torques.
+        q, effort: (N, n) positions [rad or m] and torques [N m or N].
         chain: the arm with its nominal masses.
         gravity: (3,) gravity vector [m/s²]; None: the chain's.
         static: whether only gravity torques are compared; the torques of motion are then fitted with a free factor.
@@ -286,7 +309,7 @@ def bodies_under(chain: Chain, gravity: Sequence[float] | None) -> Bodies:
 
 
 def _smooth(values: np.ndarray, order: int = 0) -> np.ndarray:
-    """Return values (N, n) on the coarse grid, or their derivatives, smoothed by cubics over a moving window.
+    """Return values (N, n) on the coarse grid, or their time derivatives, smoothed by cubics over a moving window.
 
     `order` is the order of the derivative, 0 for the values themselves.
     """
@@ -305,7 +328,7 @@ class MotionSamples:
     Attributes:
         index: (N,) indices of the samples in the motion.
         q, v, a: (N, n) [rad or m, per s, per s²].
-        effort, velocity: (M, n) smoothed torques, and velocities, of all M samples of the motion.
+        effort, velocity: (M, n) smoothed torques [N m or N], and velocities [per s], of all M samples of the motion.
         bodies: rigid bodies of the robot.
     """
 
@@ -385,7 +408,11 @@ def basis(columns: np.ndarray) -> np.ndarray:
 
 
 def spanning(square: np.ndarray) -> np.ndarray:
-    """Return the matrix S (p, k) for which W S is an orthonormal basis of the column space of W, from WᵀW (p, p)."""
+    """Return the matrix S (p, k) for which W S is an orthonormal basis of the column space of W, from WᵀW (p, p).
+
+    Args:
+        square: WᵀW of the columns W (N, p); k is their rank.
+    """
     size = np.sqrt(np.diag(square))
     nonzero = np.flatnonzero(size > 1e-9 * size.max())
     nonzero_size = size[nonzero]

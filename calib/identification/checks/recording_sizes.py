@@ -94,10 +94,10 @@ class ClockRatio:
 def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
     """Return the ratio of inertias to masses; None if motion or arm do not identify both.
 
-    Torques are modelled as τ = α τ_rods + free, twice. In the first fit α scales the rods' torques of motion, and any
-    gravity torque is allowed; in the second, α scales the rods' gravity torques, and any torque of motion is allowed.
-    Both fits include free drives. If the description has masses, the ratio relative to the described bodies is returned
-    if it is nearer to 1.
+    Torques τ are modelled as α τ_rods + free, twice: α is a factor of τ_rods, the torques of rods between the joints.
+    In the first fit α scales the rods' torques of motion, and any gravity torque is allowed; in the second, α scales
+    the rods' gravity torques, and any torque of motion is allowed. Both fits include free drives. If the description
+    has masses, the ratio relative to the described bodies is returned if it is nearer to 1.
 
     Args:
         samples: samples of a recording.
@@ -141,8 +141,8 @@ def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> t
     """Return α and its sigma for torques τ (m, n) = α `common` + `free` x, each joint weighted by its residual.
 
     Args:
-        torque: (m, n) torques τ.
-        common: (m, n) torques whose factor α all joints share.
+        torque: (m, n) torques τ [N m or N].
+        common: (m, n) torques whose factor α all joints share, in the unit of τ.
         free: (m, n, p) columns with free parameters x.
     """
     m, n = torque.shape
@@ -180,6 +180,9 @@ def wrong_joints(samples: MotionSamples) -> Explanation | None:
     For each tested change one model of all joints is fitted: bodies and offsets of any size, and non-negative motor
     inertia, viscous and Coulomb friction of every drive. The robot's masses need not be known. Residuals are shares of
     the joints' torque variances.
+
+    Args:
+        samples: samples of a recording of motor torques.
     """
     n = samples.q.shape[1]
     unexplained_shares = cache(_unexplained_function)
@@ -208,6 +211,9 @@ def _unexplained_function(samples: MotionSamples) -> Callable[[np.ndarray], np.n
     """Return a function that maps a mixing matrix of the torques to unexplained shares of the joints' variances (n,).
 
     The matrix (n, n) multiplies the recorded torques: the identity, or one with signs reversed or rows exchanged.
+
+    Args:
+        samples: samples of a recording of n joints.
     """
     m, n = samples.q.shape
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
@@ -241,6 +247,10 @@ def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
     """Return the exchange of two joints, or zero offset of a joint, that best explains the torques; None if none does.
 
     The torques are predicted from the robot's masses. Residuals are shares of the variance of each joint's torque.
+
+    Args:
+        samples: samples of a recording of motor torques.
+        chain: the arm with its masses.
     """
     n = chain.n
     masses = standard_parameters(chain)
@@ -269,7 +279,12 @@ def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
 
 
 def _changed(samples: MotionSamples, matrix: np.ndarray) -> MotionSamples:
-    """Return the samples with joint positions, velocities and accelerations multiplied by a matrix (n, n)."""
+    """Return the samples with joint positions, velocities and accelerations multiplied by a matrix (n, n).
+
+    Args:
+        samples: samples of a recording of n joints.
+        matrix: matrix that multiplies the joint values of each sample.
+    """
     q = np.ascontiguousarray(samples.q @ matrix.T)
     v = np.ascontiguousarray(samples.v @ matrix.T)
     a = np.ascontiguousarray(samples.a @ matrix.T)
@@ -423,7 +438,7 @@ def _speed_ratio(
 
     Args:
         t: (N,) times [s].
-        q, v: (N, n) positions and measured velocities.
+        q, v: (N, n) positions [rad or m] and measured velocities [rad/s or m/s].
         segment: (N,) number of the gap-free segment of each sample.
     """
     position = np.array(q)

@@ -111,7 +111,12 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
 
 
 def _single_joint(lag: Lag, half_lags: Sequence[Lag]) -> int | None:
-    """Return the joint whose lag alone differs from the common one, in both halves of the recording; else None."""
+    """Return the joint whose lag alone differs from the common one, in both halves of the recording; else None.
+
+    Args:
+        lag: lags in the whole recording.
+        half_lags: lags in its first and in its second half.
+    """
     joint = int(lag.gains.argmax())
     gains = np.sort(lag.gains) - 1.0
     late = lag.own[joint] - lag.seconds
@@ -150,7 +155,12 @@ class _LagRows:
 
 
 def _rows(samples: MotionSamples, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the regressor columns (n, m, p) of all joints, and the torques (n, S, m) shifted by all `SHIFTS`."""
+    """Return the regressor columns (n, m, p) of all joints, and the torques (n, S, m) shifted by all `SHIFTS`.
+
+    Args:
+        samples: samples of the recording.
+        rate: sampling rate of the recording [Hz].
+    """
     shifted = samples.index + SHIFTS[:, None] * rate
     times = np.arange(len(samples.effort))
     shifted_efforts = [np.interp(shifted, times, effort) for effort in samples.effort.T]
@@ -203,7 +213,12 @@ class _LagFit:
     """
 
     def __init__(self, rows: _LagRows, weight: np.ndarray) -> None:
-        """Project the torques, multiplied by `weight` (n,), onto the columns of all joints."""
+        """Project the torques, multiplied by `weight` (n,), onto the columns of all joints.
+
+        Args:
+            rows: columns and torques of n joints at all lags.
+            weight: (n,) weights of the joints.
+        """
         self.rows = rows
         self.weight = weight
         squares = weight**2
@@ -231,7 +246,8 @@ class _LagFit:
 
         Args:
             lags: (n,) lags of the joints, as indices of `SHIFTS`.
-            spread: (n,) standard deviations of the joints' torques, to which residuals are relative.
+            spread: (n,) standard deviations of the joints' torques over time [N m or N], to which residuals are
+                relative.
         """
         deviation = self.residual(lags).std(axis=1) / self.weight
         relative = deviation / np.maximum(spread, 1e-12)
@@ -299,7 +315,12 @@ class _LagFit:
 
 
 def _turning(samples: MotionSamples, rate: float) -> list[np.ndarray]:
-    """Return two friction regressors (m, n, n) whose sign changes `FREE_TIME` too early and too late, respectively."""
+    """Return two friction regressors (m, n, n) whose sign changes `FREE_TIME` too early and too late, respectively.
+
+    Args:
+        samples: m samples of a recording of n joints.
+        rate: sampling rate of the recording [Hz].
+    """
     times = np.arange(len(samples.velocity))
     regressors = []
     for early in (-FREE_TIME, FREE_TIME):
@@ -312,9 +333,9 @@ def _turning(samples: MotionSamples, rate: float) -> list[np.ndarray]:
 
 
 def _parabola_minimum(values: np.ndarray, index: int) -> float:
-    """Return the minimum of the parabola through the value at an index and its two neighbours.
+    """Return where the parabola through values[index] and its two neighbours is smallest, as an offset from `index`.
 
-    The result is an offset in indices; 0 at the ends of the array, or if the parabola has no minimum.
+    The result is 0 at the ends of the array, or if the parabola has no minimum.
     """
     if not 0 < index < len(values) - 1:
         return 0.0

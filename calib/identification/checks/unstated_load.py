@@ -118,6 +118,9 @@ def _rows(motion: MotionSamples) -> np.ndarray:
     """Return the columns (m, n, 10 B + n + 1) of bodies and rotor inertias, and the torque, of m samples.
 
     Each is reduced by its projection onto friction and offsets, which are thereby free parameters of the recording.
+
+    Args:
+        motion: m samples of one recording.
     """
     m, n = motion.q.shape
     drives = motion.drives.reshape(m, n, n, 4)
@@ -171,7 +174,12 @@ def _fit(rows: Sequence[np.ndarray], loaded: int | None) -> _Fit:
 
 
 def _scaled(rows: Sequence[np.ndarray], recording: int) -> list[np.ndarray]:
-    """Return the residuals of a fit without load, with a free factor per joint on the torques of one recording."""
+    """Return the residuals of a fit without load, with a free factor per joint on the torques of one recording.
+
+    Args:
+        rows: columns of each recording, from `_rows`.
+        recording: index of the recording whose torques are scaled.
+    """
     before = rows[:recording]
     part = rows[recording]
     after = rows[recording + 1 :]
@@ -192,7 +200,11 @@ def _scaled(rows: Sequence[np.ndarray], recording: int) -> list[np.ndarray]:
 
 
 def _inverse(square: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse (p, p) of WᵀW, computed with columns scaled to unit norm."""
+    """Return the pseudo-inverse (p, p) of WᵀW, computed with columns scaled to unit norm.
+
+    Args:
+        square: WᵀW (p, p).
+    """
     size = np.sqrt(np.diag(square))
     scale = np.where(size > 1e-9 * size.max(), size, np.inf)
     scales = np.outer(scale, scale)

@@ -53,7 +53,7 @@ class Reference:
         """Return position, velocity, feedforward torque and acceleration as one array (4, N, n).
 
         Args:
-            ahead: (N, n) feedforward torques; None: zero.
+            ahead: (N, n) feedforward torques [N m or N]; None: zero.
         """
         if ahead is None:
             torque = np.zeros_like(self.q)
@@ -80,8 +80,8 @@ def pd(
     """Return a PD or PID controller.
 
     Args:
-        kp, kd: (n,) gains of position and velocity error.
-        limit: (n,) torque limit, or one number.
+        kp, kd: (n,) gains of position error [N m/rad] and velocity error [N m s/rad]; N and m for a prismatic joint.
+        limit: (n,) torque limit [N m or N], or one number.
         ki: (n,) integral gains, or one number; 0 for a PD controller.
     """
     share = np.asarray(1.0)
@@ -105,8 +105,8 @@ def cascade(
         position: P (n,), gain of the position loop [1/s].
         velocity: K (n,), gain of the velocity loop [N m s/rad].
         reset: Ti (n,), reset time [s]; infinite for a P-P cascade.
-        limit: (n,) torque limit, or one number.
-        share: share of the reference velocity.
+        limit: (n,) torque limit [N m or N], or one number.
+        share: share of the reference velocity in the velocity loop, 0 to 1.
 
     Raises:
         CalibError: for a share other than 1 with an integral part.
@@ -126,12 +126,15 @@ def computed_torque(
 ) -> LoopController:
     """Return a computed-torque controller with error dynamics ë + 2 ζ ω ė + ω² e = 0 if its model is exact.
 
+    e is the position error.
+
     Args:
-        model: (10 B,) standard parameters of the controller's model; inertias and friction of the drives are not in it.
+        model: (10 B,) standard parameters of the controller's model of B bodies; inertias and friction of the drives
+            are not in it.
         frequency: ω of the error dynamics [rad/s].
         damping: damping ratio ζ.
         n: number of joints.
-        limit: (n,) torque limit, or one number.
+        limit: (n,) torque limit [N m or N], or one number.
     """
     kp = np.full(n, frequency**2)
     kd = np.full(n, 2 * damping * frequency)
@@ -142,7 +145,13 @@ def computed_torque(
 
 
 def completed(controller: LoopController, loop: LoopSettings, n: int) -> LoopController:
-    """Return a controller of n joints with the limits, delay and velocity filter of the settings."""
+    """Return a controller of n joints with the limits, delay and velocity filter of the settings.
+
+    Args:
+        controller: the controller with its gains.
+        loop: settings of the loop.
+        n: number of joints.
+    """
     share = np.full(n, loop.share)
     limit = loop.per_joint("limit", n)
     windup = loop.per_joint("windup", n)
@@ -153,6 +162,10 @@ def completed(controller: LoopController, loop: LoopSettings, n: int) -> LoopCon
 
 def stated_controller(loop: LoopSettings, n: int) -> LoopController:
     """Return the controller of n joints that the table [loop] describes.
+
+    Args:
+        loop: the table [loop], in which a list has one value or n.
+        n: number of joints.
 
     Raises:
         UsageError: if the length of a list is not the number of joints.
@@ -205,10 +218,10 @@ def identify_controller(
 
     Args:
         reference: reference at any multiple of the log's rate; it starts with the log's first sample.
-        measured, tau: (N, n) logged positions and torques.
+        measured, tau: (N, n) logged positions [rad or m] and torques [N m or N].
         rate: sampling rate of the log [Hz].
         band: cut-off of the low-pass, and highest frequency at which the gains are fitted [Hz].
-        orders: na, nb of the ARX model.
+        orders: na, nb: numbers of past torques and of past position errors in the ARX model.
         integral: whether to identify the integral gains, too.
 
     Raises:
@@ -249,7 +262,13 @@ def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarra
 
 
 def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
-    """Return the times (count,) of a log's samples in control periods, as integers where these are within 0.1 %."""
+    """Return the times (count,) of a log's samples in control periods, as integers where these are within 0.1 %.
+
+    Args:
+        reference: reference at the controller's rate.
+        rate: sampling rate of the log [Hz].
+        count: number of the log's samples.
+    """
     every = 1.0 / (rate * reference.period)
     if abs(every / max(round(every), 1) - 1.0) < 1e-3:
         every = round(every)
@@ -257,7 +276,14 @@ def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
 
 
 def _instruments(reference: Reference, count: int, rate: float, band: float) -> np.ndarray:
-    """Return low-passed instruments (count, k): functions of the reference like friction, inertia and gravity."""
+    """Return low-passed instruments (count, k): functions of the reference like friction, inertia and gravity.
+
+    Args:
+        reference: reference at the controller's rate.
+        count: number of the log's samples.
+        rate: sampling rate of the log [Hz].
+        band: cut-off of the low-pass [Hz].
+    """
     q, v, a = reference.at(_ticks(reference, rate, count))
     jerk = np.gradient(a, 1.0 / rate, axis=0)
     peak = np.abs(v).max(axis=0, initial=1e-9)
@@ -275,7 +301,7 @@ def _joint(
     """Return the ARX coefficients a (na,), b (nb + 1,) of one joint, by two-stage least squares.
 
     Args:
-        error, tau: (N,) low-passed position error and torque.
+        error, tau: (N,) low-passed position error [rad or m] and torque [N m or N].
         basis: (N, k) orthonormal basis of the instruments.
         orders: na, nb of the ARX model.
     """
@@ -326,7 +352,14 @@ def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integr
 
 
 def _explained(error: np.ndarray, tau: np.ndarray, gains: np.ndarray, rate: float, band: float) -> float:
-    """Return the share [%] of a joint's low-passed torque (N,) that the gains kp, kd, ki (3,) explain."""
+    """Return the share [%] of a joint's low-passed torque (N,) that the gains kp, kd, ki (3,) explain.
+
+    Args:
+        error, tau: (N,) low-passed position error [rad or m] and torque [N m or N] of the joint.
+        gains: (3,) kp, kd, ki.
+        rate: sampling rate [Hz].
+        band: cut-off of the low-pass [Hz].
+    """
     kp, kd, ki = gains
     rate_of_error = np.gradient(error, 1.0 / rate)
     integral = np.cumsum(error)

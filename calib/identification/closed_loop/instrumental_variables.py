@@ -73,19 +73,20 @@ class Instruments:
         return self.data.names[len(self.data.names) // 2 :]
 
     def least_squares(self) -> Triangles:
-        """Return the R factors of [W y] alone, for `linear.ols` and `linear.wls`."""
+        """Return the R factors of [W y] alone (observation matrix and torques), for `linear.ols` and `linear.wls`."""
         p = len(self.names)
         return self.data.select(np.arange(p, 2 * p))
 
     def testable(self, fit: LinearFit, std: np.ndarray | None = None) -> Triangles:
         """Return one group's R factor [A b; 0 ‖ρ‖] whose least-squares solution is the IV estimate and covariance.
 
-        ρ = y - W x_IV is the whitened residual. Tests of nested models with this factor are those of two-stage least
-        squares (Wooldridge 2010, section 5.2.3): differences of ‖P_Z (y - W x)‖² against the variance of ρ.
+        W is the observation matrix, y are the torques; ρ = y - W x_IV is the whitened residual of the IV estimate x_IV.
+        Tests of nested models with this factor are those of two-stage least squares (Wooldridge 2010, section 5.2.3):
+        differences of ‖P_Z (y - W x)‖² against the variance of ρ.
 
         Args:
             fit: the result of `iv`.
-            std: (g,) standard deviations of the groups that `iv` used; None: equal.
+            std: (g,) noise standard deviations of the groups of rows that `iv` used, in units of y; None: equal.
         """
         p = len(self.names)
         sigma = np.ones(self.data.groups) if std is None else std
@@ -132,13 +133,23 @@ def instrument(
 
 
 def unseen(names: Sequence[str], units: Sequence[str], groups: int) -> Instruments:
-    """Return R factors of [Z W y] without rows, for columns of W with these names and units."""
+    """Return R factors of [Z W y] without rows, for columns of W with these names and units.
+
+    Z (r, p) are the instruments, W (r, p) is the observation matrix, y (r,) are the torques.
+
+    Args:
+        names, units: names and units of the p columns of W.
+        groups: number of groups of rows.
+    """
     data = empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups)
     return Instruments(data)
 
 
 def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> LinearFit:
     """Estimate x = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y with Ω = diag(σ_g² I), by instrumental variables.
+
+    Z (r, p) are the instruments, W (r, p) the observation matrix, y (r,) the torques, σ_g the standard deviation of the
+    rows of group g.
 
     The covariance is σ² (ZᵀΩ⁻¹W)⁻¹ (ZᵀΩ⁻¹Z) (WᵀΩ⁻¹Z)⁻¹. Janot, Vandanjon & Gautier (2014) use (ZᵀΩ⁻¹Z)⁻¹, which is
     equal if Z is W without its noise, and too small if the simulation deviates. σ² is estimated, so that a common
@@ -147,7 +158,8 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
 
     Args:
         problem: R factors of [Z W y].
-        std: (g,) standard deviations of the groups, usually those of the weighted least squares of W; None: equal.
+        std: (g,) noise standard deviations σ_g of the groups of rows, in units of y, usually those of the weighted
+            least squares of W; None: equal.
         inflation: variance inflation >= 1 of all groups, explained in the module `linear`.
 
     Raises:
@@ -177,9 +189,10 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
 def settled(before: LinearFit, after: LinearFit, change: float = 0.025, residual: float = 0.025) -> bool:
     """Return whether the outer loop (simulate, estimate) has converged in parameters and residual.
 
-    The criterion is |Δx_j| < change · |x_j| for every parameter and |Δ‖ρ‖| < residual · ‖ρ‖ (Janot, Vandanjon & Gautier
-    2014; both usually 1 … 5 %). A parameter that changes by less than a fifth of its standard deviation has also
-    converged (our choice: a parameter near zero never satisfies a relative criterion).
+    The criterion is |Δx_j| < change · |x_j| for every parameter x_j and |Δ‖ρ‖| < residual · ‖ρ‖ for the residuals ρ,
+    with Δ the difference of the two estimates (Janot, Vandanjon & Gautier 2014; both usually 1 … 5 %). A parameter that
+    changes by less than a fifth of its standard deviation has also converged (our choice: a parameter near zero never
+    satisfies a relative criterion).
 
     Args:
         before, after: the last two estimates.
@@ -197,9 +210,11 @@ def settled(before: LinearFit, after: LinearFit, change: float = 0.025, residual
 def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentStrength:
     """Return the strength of the instruments: how well they explain the columns of W.
 
+    W (r, p) is the observation matrix, Z (r, p) are the instruments.
+
     Args:
         problem: R factors of [Z W y].
-        std: (g,) standard deviations of the groups; None: equal.
+        std: (g,) noise standard deviations of the groups of rows, in units of y; None: equal.
     """
     p = len(problem.names)
     rows = int(problem.data.rows.sum())
@@ -225,16 +240,17 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
 def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> ExogeneityTest:
     """Return the test that W is uncorrelated with the noise (Durbin, Wu, Hausman), by augmented regression and QR.
 
-    With V = W - P_Z W, the part of the columns that the instruments do not explain, the model is y = W x + V δ + e. The
-    hypothesis is δ = 0, with F = [(RSS0 - RSS1) / k] / [RSS1 / (r - p - k)] (Janot, Vandanjon & Gautier 2016, after
-    Hausman 1978). k is the number of independent columns of V. The test assumes valid instruments: check `strength`
-    first.
+    W (r, p) is the observation matrix, y (r,) are the torques. With V = W - P_Z W, the part of W's columns that the
+    instruments Z do not explain, the model is y = W x + V δ + e. The hypothesis is δ = 0, with F = [(RSS0 - RSS1) / k]
+    / [RSS1 / (r - p - k)] (Janot, Vandanjon & Gautier 2016, after Hausman 1978). k is the number of independent columns
+    of V. The test assumes valid instruments: check `strength` first.
 
     Args:
         problem: R factors of [Z W y].
-        std: (g,) standard deviations of the groups; None: equal, which gives false alarms for groups of different
-            noise.
-        inflation: variance inflation >= 1; at 1, autocorrelated residuals give false alarms.
+        std: (g,) noise standard deviations of the groups of rows, in units of y; None: equal, which gives false alarms
+            for groups of different noise.
+        inflation: variance inflation >= 1, the number of rows that count as one; at 1, autocorrelated residuals give
+            false alarms.
 
     Raises:
         CalibError: if the instruments equal the columns, or there are too few rows.
@@ -271,7 +287,13 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
 def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray:
     """Return the R factor (p + 1, p + 1) of min ‖P_Z (y - W x)‖ (two-stage least squares), whose solution is `iv`.
 
+    P_Z is the projection onto the columns of Z.
+
     Constrained IV minimises with this factor: Q = Wᵀ P_Z W is positive definite, while Zᵀ W need not be.
+
+    Args:
+        problem: R factors of [Z W y].
+        std: (g,) noise standard deviations of the groups of rows, in units of y; None: equal.
     """
     return _projected(combine(problem.data, std), problem.names)
 
@@ -281,16 +303,17 @@ def by_free_instruments(
 ) -> np.ndarray:
     """Return the IV estimate x (p,) under equalities A x = A x_c that uses the instruments of the free directions only.
 
-    x satisfies Z_Uᵀ Ω⁻¹ (y - W x) = 0, where Z_U are the instruments of the directions in the null space of A. Janot's
-    slides on the TX40 give the criterion ½ ‖P_Z (y - W x)‖² (`projected`), in which all instruments count, but for
-    bounds x_C = d the relation x_U = x_U^IV + (Z_UᵀW_U)⁻¹ Z_UᵀW_C (x_C^IV - d), which is the one computed here. Both
-    are consistent if the constraint is true. On a simulated TX40 they differ by at most 0.011 σ (`examples/tx40`), in
-    simulated problems with weak instruments by 0.24 σ, and by 2.4 σ if the bound is wrong by 6 σ: there the estimate by
-    free instruments has the smaller error (`tests/identification/closed_loop/test_instruments.py`).
+    x satisfies Z_Uᵀ Ω⁻¹ (y - W x) = 0, where W (r, p) is the observation matrix, y (r,) are the torques with covariance
+    Ω = diag(std²), and Z_U are the instruments of the directions in the null space of A. Janot's slides on the TX40
+    give the criterion ½ ‖P_Z (y - W x)‖² (`projected`), in which all instruments count, but for bounds x_C = d the
+    relation x_U = x_U^IV + (Z_UᵀW_U)⁻¹ Z_UᵀW_C (x_C^IV - d), which is the one computed here. Both are consistent if the
+    constraint is true. On a simulated TX40 they differ by at most 0.011 σ (`examples/tx40`), in simulated problems with
+    weak instruments by 0.24 σ, and by 2.4 σ if the bound is wrong by 6 σ: there the estimate by free instruments has
+    the smaller error (`tests/identification/closed_loop/test_instruments.py`).
 
     Args:
         problem: R factors of [Z W y].
-        std: (g,) standard deviations of the groups.
+        std: (g,) noise standard deviations of the groups of rows, in units of y.
         constrained: (p,) a point x_c that satisfies the constraints.
         normals: A (k, p), normals of the constraints.
     """
@@ -307,6 +330,10 @@ def by_free_instruments(
 
 def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """Return the R factor of P_Z [W y] from the R factor of [Z W y].
+
+    Args:
+        factor: R factor of [Z W y].
+        names: names of the columns of W, for messages.
 
     Raises:
         Unidentifiable: if Z or Zᵀ W do not have full rank.

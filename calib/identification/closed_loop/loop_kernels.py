@@ -41,7 +41,10 @@ FINE, SINGULAR, STIFF, DIVERGED = -1, 1, 2, 3
 
 @njit(**JOINED)
 def twist_cross(w, v, u, s):
-    """Return the cross product of two twists, (w, v) × (u, s), as its angular and linear parts."""
+    """Return the cross product of two twists, (w, v) × (u, s), as its angular and linear parts.
+
+    The first vector of a twist is its angular, the second its linear velocity.
+    """
     return cross(w, u), add(cross(w, s), cross(v, u))
 
 
@@ -50,6 +53,10 @@ def inertia_of(work, i):
     """Return the composite inertia of body i and all bodies behind it.
 
     It is a tuple of the moments of inertia about the base's origin (6), first moments (3), and mass.
+
+    Args:
+        work: working array of the bodies, described in the module's docstring.
+        i: index of the body.
     """
     J = work[i, 36], work[i, 37], work[i, 38], work[i, 39], work[i, 40], work[i, 41]
     return J, three(work, i, 42), work[i, 45]
@@ -57,14 +64,25 @@ def inertia_of(work, i):
 
 @njit(**JOINED)
 def momentum(inertia, w, v):
-    """Return the angular and linear momentum of a body with `inertia` and twist (w, v)."""
+    """Return the angular and linear momentum of a body with `inertia` and twist (w, v).
+
+    Args:
+        inertia: moments of inertia (6), first moments (3), and mass, as `inertia_of` returns them.
+        w, v: angular and linear velocity (3,).
+    """
     J, h, mass = inertia
     return add(inertia_times(J, w), cross(h, v)), add(scaled(mass, v), cross(w, h))
 
 
 @njit(**JOINED)
 def wrench(inertia, w, v, e, a):
-    """Return moment and force I A + V ×* I V of a body with V = (w, v), A = (e, a), and its linear momentum."""
+    """Return moment and force I A + V ×* I V of a body with V = (w, v), A = (e, a), and its linear momentum.
+
+    Args:
+        inertia: moments of inertia (6), first moments (3), and mass, as `inertia_of` returns them.
+        w, v: angular and linear velocity (3,).
+        e, a: angular and linear acceleration (3,).
+    """
     angular, linear = momentum(inertia, w, v)
     n, f = momentum(inertia, e, a)
     return add(add(n, cross(w, angular)), cross(v, linear)), add(f, cross(w, linear)), linear
@@ -74,7 +92,12 @@ def wrench(inertia, w, v, e, a):
 def _body(tree, body, i, amount, rate, work):
     """Write pose, velocity, twist and acceleration of body i into `work`, computed from its parent's.
 
-    `amount` and `rate` are joint position and velocity; the joint acceleration is taken as zero.
+    The joint acceleration is taken as zero.
+
+    Args:
+        tree, body, work: arrays of the robot, described in the module's docstring.
+        i: index of the body.
+        amount, rate: joint position and velocity.
     """
     p, kind, scale = tree[i, 0], tree[i, 1], body[i, 22]
     x, y, z, place = three(body, i, 0), three(body, i, 3), three(body, i, 6), three(body, i, 9)
@@ -103,7 +126,12 @@ def _body(tree, body, i, amount, rate, work):
 
 @njit(**JOINED)
 def _load(body, i, work):
-    """Write the inertia of body i about the base's origin, and the wrench of its motion, into `work`."""
+    """Write the inertia of body i about the base's origin, and the wrench of its motion, into `work`.
+
+    Args:
+        body, work: arrays of the robot, described in the module's docstring.
+        i: index of the body.
+    """
     x, y, z, t = three(work, i, 0), three(work, i, 3), three(work, i, 6), three(work, i, 9)
     own, mass = (body[i, 12], body[i, 13], body[i, 14], body[i, 15], body[i, 16], body[i, 17]), body[i, 21]
     g, a, b = turned(work, i, three(body, i, 18)), inertia_times(own, x), inertia_times(own, y)
@@ -131,7 +159,15 @@ def _load(body, i, work):
 
 @njit(**JOINED)
 def dynamics(tree, body, linear, q, v, work, matrix, out):
-    """Write M(q) plus added inertia into `matrix` (lower triangle), and subtract c(q, v) + g(q) from `out` (n,)."""
+    """Write M(q) plus added inertia into `matrix` (lower triangle), and subtract c(q, v) + g(q) from `out` (n,).
+
+    Args:
+        tree, body, linear, work: arrays of the robot, described in the module's docstring; `linear` has the added
+            inertia.
+        q, v: (n,) joint positions and velocities.
+        matrix: (n, n) array to write.
+        out: (n,) array from which Coriolis, centrifugal and gravity torques are subtracted.
+    """
     count, n = tree.shape[0], q.shape[0]
     for j in range(n):
         for k in range(j + 1):
@@ -207,7 +243,13 @@ def substitute(matrix, vector):
 
 @njit(**JOINED)
 def seen(acts, t, motion):
-    """Return the sum of a motion (n,) over the joints, weighted as friction term t requires."""
+    """Return the sum of a motion (n,) over the joints, weighted as friction term t requires.
+
+    Args:
+        acts: array of friction terms, described in the module's docstring.
+        t: row of the term.
+        motion: (n,) positions or velocities of the joints.
+    """
     total = 0.0
     for k in range(motion.shape[0]):
         total += acts[t, 8 + k] * motion[k]
@@ -216,7 +258,14 @@ def seen(acts, t, motion):
 
 @njit(**JOINED)
 def _stop(memory, t, place, width):
-    """Return the state of friction term t's stop operator at a position, from state and position in `memory`."""
+    """Return the state of friction term t's stop operator at a position, from state and position in `memory`.
+
+    Args:
+        memory: (T, 2) states and positions, described in the module's docstring.
+        t: row of the term.
+        place: present position, weighted over the joints as the term requires.
+        width: travel over which the state changes by 1.
+    """
     return min(1.0, max(-1.0, memory[t, 0] + (place - memory[t, 1]) / width))
 
 
@@ -226,6 +275,12 @@ def act(code, acts, t, memory, q, v):
 
     The factor of load-dependent terms (the load) is not included. The values are those of
     `calib.dynamics.shape_kernels.shape`.
+
+    Args:
+        code: code of the term's shape.
+        acts, memory: arrays of friction terms, described in the module's docstring.
+        t: row of the term.
+        q, v: (n,) joint positions and velocities.
     """
     place = seen(acts, t, q)
     state = _stop(memory, t, place, acts[t, 1]) if code in (STOP, PRESLIDING) else 0.0
@@ -237,6 +292,11 @@ def _friction(linear, kinds, acts, memory, q, v, out):
     """Subtract friction and offsets, without load-dependent terms, from `out` (n,).
 
     Return whether there are load-dependent terms.
+
+    Args:
+        linear, kinds, acts, memory: arrays of drives and friction, described in the module's docstring.
+        q, v: (n,) joint positions and velocities.
+        out: (n,) torques.
     """
     n, loaded = v.shape[0], False
     for j in range(n):
@@ -260,8 +320,15 @@ def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
     """Replace the accelerations `out` (n,) by those with load-dependent friction.
 
     The load is the torque after friction minus added inertia times acceleration; friction depends on the load. Both are
-    iterated until they agree, which they do if the friction coefficients are below one. `matrix` contains the factors
-    of M. Return False if the iteration does not converge.
+    iterated until they agree, which they do if the friction coefficients are below one. Return False if the iteration
+    does not converge.
+
+    Args:
+        linear, kinds, acts, memory: arrays of drives and friction, described in the module's docstring.
+        q, v, tau: (n,) joint positions, velocities and drive torques.
+        matrix: factors of M.
+        loads: (n,) transmitted torques, from which the iteration starts and to which its result is written.
+        out: (n,) accelerations without load-dependent friction.
     """
     n = out.shape[0]
     plain, extra, change = out.copy(), np.zeros(n), np.empty(n)
@@ -299,7 +366,14 @@ def stiffness(kinds, acts, loads, v, matrix, unit):
     The bound is the trace of M⁻¹ D, which is never below the largest eigenvalue. D contains the steepest slopes of all
     smoothed signs whose steep range is near the current speed, not the local slopes, since a step into this range must
     not overshoot. The stiffness of friction with hysteresis counts by four times its natural frequency, so that no step
-    is longer than half a radian of this oscillation. `matrix` contains the factors of M; `unit` (n,) is working memory.
+    is longer than half a radian of this oscillation.
+
+    Args:
+        kinds, acts: arrays of friction terms, described in the module's docstring.
+        loads: (n,) transmitted torques.
+        v: (n,) joint velocities.
+        matrix: factors of the inertia matrix M.
+        unit: (n,) working memory.
     """
     total, springs, n = 0.0, 0.0, unit.shape[0]
     for t in range(kinds.shape[0]):
@@ -326,6 +400,12 @@ def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, 
     """Write the joint accelerations under drive torques tau (n,) into `out`, and factorise M into `matrix`.
 
     Return False if M is not positive definite, or load-dependent friction does not converge.
+
+    Args:
+        tree, body, linear, kinds, acts, memory, loads, work: arrays of the robot, described in the module's docstring.
+        q, v, tau: (n,) joint positions, velocities and drive torques.
+        matrix: (n, n) array to write.
+        out: (n,) array to write.
     """
     for j in range(q.shape[0]):
         out[j] = tau[j]
@@ -341,14 +421,24 @@ def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, 
 
 @njit(**OPTIONS)
 def _unstressed(kinds, acts, q, memory):
-    """Reset the states of friction with hysteresis to zero at positions q (n,)."""
+    """Reset the states of friction with hysteresis to zero at positions q (n,).
+
+    Args:
+        kinds, acts, memory: arrays of friction terms, described in the module's docstring.
+        q: (n,) joint positions.
+    """
     for t in range(kinds.shape[0]):
         memory[t, 0], memory[t, 1] = 0.0, seen(acts, t, q)
 
 
 @njit(**JOINED)
 def _remember(kinds, acts, q, memory):
-    """Update the states of friction with hysteresis to positions q (n,)."""
+    """Update the states of friction with hysteresis to positions q (n,).
+
+    Args:
+        kinds, acts, memory: arrays of friction terms, described in the module's docstring.
+        q: (n,) joint positions.
+    """
     for t in range(kinds.shape[0]):
         if kinds[t, 1] == STOP or kinds[t, 1] == PRESLIDING:
             place = seen(acts, t, q)
@@ -359,9 +449,13 @@ def _remember(kinds, acts, q, memory):
 def set_parameters(values, order, entries, shares, owners, body, linear, acts):
     """Write parameters (p,) into the arrays body, linear and acts; their other entries do not change.
 
-    order (B, 10): index in `values` of each standard parameter of a body, relative to the body's first one. entries (E,
-    3): row and column of `linear`, and index of the parameter. shares (E,): weights of these entries. owners (T,):
-    index of the parameter of each friction term.
+    Args:
+        values: (p,) standard parameters of the bodies, then parameters of the drive terms.
+        order: (B, 10) index in `values` of each standard parameter of a body, relative to the body's first one.
+        entries: (E, 3) row and column of `linear`, and index of the parameter.
+        shares: (E,) weights of these entries.
+        owners: (T,) index of the parameter of each friction term.
+        body, linear, acts: arrays of the robot, described in the module's docstring.
     """
     for i in range(order.shape[0]):
         for k in range(10):
@@ -377,7 +471,12 @@ def set_parameters(values, order, entries, shares, owners, body, linear, acts):
 def forward_dynamics(tree, body, linear, kinds, acts, order, entries, shares, owners, values, q, v, tau, out):
     """Write accelerations to `out` (N, n); return the first sample whose accelerations cannot be computed, or -1.
 
-    values (N, p): parameters of each sample. If its shape is (0, p), the parameters in body, linear and acts are used.
+    Args:
+        tree, body, linear, kinds, acts: arrays of the robot, described in the module's docstring.
+        order, entries, shares, owners: index arrays of `set_parameters`.
+        values: (N, p) parameters of each sample; of shape (0, p) if the parameters in body, linear and acts are used.
+        q, v, tau: (N, n) joint positions, velocities and drive torques.
+        out: (N, n) array to write.
     """
     n, count = q.shape[1], kinds.shape[0]
     work, matrix = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n))
@@ -397,8 +496,16 @@ def _advance(tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, 
 
     The number of steps follows from the stiffness of friction near standstill. On the negative real axis the method's
     stability function 1 + z + z²/2 + z³/6 + z⁴/24 is positive wherever it is stable: the velocity decays into the range
-    of the smoothed sign without changing its sign from step to step (chatter). Here abs(z) <= 2. slopes[0] must contain
-    the accelerations at the start.
+    of the smoothed sign without changing its sign from step to step (chatter). Here abs(z) <= 2.
+
+    Args:
+        tree, body, linear, kinds, acts, memory, loads, work: arrays of the robot, described in the module's docstring.
+        q, v: (n,) state, overwritten.
+        tau: (n,) drive torques.
+        period: duration [s].
+        slopes: (4, n) accelerations; row 0 must contain those at the start.
+        matrix: (n, n) working memory, with the factors of M at the start.
+        at, rate: (n,) working memory.
     """
     n = q.shape[0]
     pieces = int(0.5 * period * stiffness(kinds, acts, loads, v, matrix, at)) + 1
@@ -437,6 +544,13 @@ def _advance_midpoint(
 
     A step is at most `MIDPOINT_STEP` over friction's fastest decay rate. The rule's stability function 1 + z + z²/2 has
     no zero, so that the velocity does not change its sign; at the longest step it is 0.625.
+
+    Args:
+        tree, body, linear, kinds, acts, memory, loads, work: arrays of the robot, described in the module's docstring.
+        q, v: (n,) state, overwritten.
+        tau: (n,) drive torques.
+        period: duration [s].
+        slopes, matrix, at, rate: as in `_advance`.
     """
     n = q.shape[0]
     pieces = int(period * stiffness(kinds, acts, loads, v, matrix, at) / MIDPOINT_STEP) + 1
@@ -462,7 +576,16 @@ def _advance_midpoint(
 def advance_points(tree, body, linear, kinds, acts, order, entries, shares, owners, values, q, v, tau, period, gain):
     """Advance K states q, v (K, n), each with its own parameters (K, p), by a period under the same torque (n,).
 
-    M⁻¹ of the first state is written into gain (n, n). Return a status and the number of the state reached.
+    Return a status and the index of the last state reached.
+
+    Args:
+        tree, body, linear, kinds, acts: arrays of the robot, described in the module's docstring.
+        order, entries, shares, owners: index arrays of `set_parameters`.
+        values: (K, p) parameters of each state.
+        q, v: (K, n) states, overwritten.
+        tau: (n,) drive torques, held for the period.
+        period: duration [s].
+        gain: (n, n) array to which M⁻¹ of the first state is written.
     """
     n, count = q.shape[1], kinds.shape[0]
     work, matrix, slopes = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n)), np.empty((4, n))
@@ -493,8 +616,13 @@ def advance_points(tree, body, linear, kinds, acts, order, entries, shares, owne
 def command(gains, aim, speed, seen, rate, integral, period, wish):
     """Write the controller's feedback command (n,) into `wish`, from reference and measurement.
 
-    aim, speed: reference position and velocity. seen, rate: measured position and velocity. The rows of `gains` are
-    explained in `closed_loop`.
+    Args:
+        gains: (6, n) controller values, as in `closed_loop`.
+        aim, speed: (n,) reference position and velocity.
+        seen, rate: (n,) measured position and velocity.
+        integral: (n,) integral of the position error, updated.
+        period: control period [s].
+        wish: (n,) array to write.
     """
     for j in range(wish.shape[0]):
         error = aim[j] - seen[j]
@@ -504,7 +632,16 @@ def command(gains, aim, speed, seen, rate, integral, period, wish):
 
 @njit(**OPTIONS)
 def linearise_command(tree, model, linear, ahead, seen, rate, work, matrix, wish):
-    """Replace the commanded acceleration a = `wish` (n,) by the model's torque M(q) (a + ahead) + c(q, v) + g(q)."""
+    """Replace the commanded acceleration a = `wish` (n,) by the model's torque M(q) (a + ahead) + c(q, v) + g(q).
+
+    Args:
+        tree, linear, work: arrays of the robot, described in the module's docstring.
+        model: array `body` of the controller's model.
+        ahead: (n,) feedforward acceleration.
+        seen, rate: (n,) measured position and velocity, q and v of the model.
+        matrix: (n, n) working memory.
+        wish: (n,) command, overwritten.
+    """
     n = wish.shape[0]
     wanted = wish + ahead
     for j in range(n):
@@ -519,7 +656,15 @@ def linearise_command(tree, model, linear, ahead, seen, rate, work, matrix, wish
 
 @njit(**JOINED)
 def _reading(place, encoder, quantum, k, j):
-    """Return the encoder reading of joint j in period k at a true position, with noise and resolution."""
+    """Return the encoder reading of joint j in period k at a true position, with noise and resolution.
+
+    Args:
+        place: true position of the joint.
+        encoder: (N, n) noise of the measured positions; (0, n) for no noise.
+        quantum: (n,) resolution of the encoders; 0 for none.
+        k: index of the control period.
+        j: index of the joint.
+    """
     read = place + (encoder[k, j] if encoder.shape[0] else 0.0)
     return quantum[j] * np.floor(read / quantum[j] + 0.5) if quantum[j] > 0.0 else read
 
@@ -547,15 +692,24 @@ def closed_loop(
 ):
     """Run the control loop: measure, command, hold the torque for one period, integrate.
 
-    gains (6, n): kp, kd, ki, share of the reference's velocity, torque limit, limit of the integral. reference (4, N,
-    n): position, velocity, feedforward torque, feedforward acceleration (for the controller's `model`, which has 0 rows
-    if there is none). encoder, push (N, n) or (0, n): noise of the measured position, and torque that the model does
-    not contain. smoothing: weight of a new velocity sample in the controller's low-pass. late: delay in control
-    periods. q, v (n,): the state, which is overwritten. out (5, M, n): true q, v, a, measured q and applied torque,
-    every `every` periods. This number need not be an integer: sample m is at m · every periods, for which a part of a
-    period is integrated.
+    `every` need not be an integer: sample m is at m · every periods, for which a part of a period is integrated.
 
-    Return a status and the number of the period reached.
+    Args:
+        tree, body, linear, kinds, acts: arrays of the robot, described in the module's docstring.
+        model: array `body` of the controller's model; 0 rows if there is none.
+        gains: (6, n) kp, kd, ki, share of the reference's velocity, torque limit, limit of the integral.
+        reference: (4, N, n) position, velocity, feedforward torque, feedforward acceleration (for `model`).
+        encoder, push: (N, n) or (0, n), noise of the measured position, and torque that the model does not contain.
+        quantum: (n,) resolution of the encoders; 0 for none.
+        period: control period [s].
+        smoothing: weight of a new velocity sample in the controller's low-pass.
+        late: delay in control periods.
+        every: control periods per sample.
+        q, v: (n,) the state, which is overwritten.
+        out: (5, M, n) true q, v, a, measured q and applied torque at each sample.
+
+    Returns:
+        A status, and the index of the period reached.
     """
     count, n = reference.shape[1], q.shape[0]
     work, matrix, slopes = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n)), np.zeros((4, n))

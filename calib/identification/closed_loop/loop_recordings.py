@@ -164,6 +164,11 @@ def _compare(motion: Motion, reference: np.ndarray, joint: int, max_difference: 
     """Raise an error if a joint does not follow its `reference` (N,), and name a likely error of units.
 
     `max_difference`: largest deviation from the reference, relative to the joint's motion (our choice).
+
+    Args:
+        motion: the recorded motion.
+        reference: (N,) reference of the joint [rad or m].
+        joint: index of the joint.
     """
     q = motion.q[:, joint]
     spread = np.std(q)
@@ -306,6 +311,10 @@ def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
     """Return the slice of samples that are compared with the simulation: without settling time and filter borders.
 
     `settling_time`: time after which the simulated robot's initial state has no effect [s] (our choice).
+
+    Args:
+        motion: the recorded motion.
+        settling_time: time [s].
     """
     edge = max(border(motion.rate, float(motion.cutoff.min())), 4)
     settling_samples = int(np.ceil(settling_time * motion.rate))
@@ -380,7 +389,17 @@ def _fed_forward(
     reference: Reference,
     every: float,
 ) -> LoopController:
-    """Return the controller with feedforward torques along the reference, as the settings require."""
+    """Return the controller with feedforward torques along the reference, as the settings require.
+
+    Args:
+        controller: controller without feedforward.
+        loop: settings of the loop.
+        cad: standard parameters from the robot's description, for feedforward of kind ``cad``; None: unknown.
+        model: model of the robot.
+        motion: the recorded motion.
+        reference: reference at the controller's rate.
+        every: control periods per recorded sample.
+    """
     if loop.feedforward == "none":
         return controller
     if loop.feedforward == "recording":
@@ -401,8 +420,13 @@ def _fed_forward(
 def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
     """Return the case with the simulated motion at the recorded times, filtered like the recorded motion.
 
-    Low-pass and differences round off reversals of a motion. Since both motions are filtered equally, this affects W
-    and Z equally, so that they differ by noise only.
+    Low-pass and differences round off reversals of a motion. Since both motions are filtered equally, this affects the
+    observation matrix W and the instruments Z equally, so that they differ by noise only.
+
+    Args:
+        case: a gap-free part of a recording.
+        run: simulation of its loop.
+        loop: loop of the recording.
     """
     samples = simulated_samples(case, run.t, loop)
     q, v, a = followed(run.q, case.motion, samples)

@@ -68,6 +68,8 @@ def position_noise(plant: Plant, case: Case, loop: Loop) -> PositionNoise:
 
     Args:
         plant: robot to simulate; it hardly matters, as torques answer noise by the controller's gains.
+        case: the recording.
+        loop: its closed loop.
     """
     motion = case.motion
     noise = motion.cutoffs.noise
@@ -82,7 +84,12 @@ def position_noise(plant: Plant, case: Case, loop: Loop) -> PositionNoise:
     lags = LAGS + int(np.ceil(loop.controller.delay / loop.every))
 
     def answered(q: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Return the covariances (lags, n) of positions and later torques above the cut-off."""
+        """Return the covariances (lags, n) of positions and later torques above the cut-off.
+
+        Args:
+            q: (N, n) positions [rad or m].
+            tau: (N, n) torques at the same samples [N m or N].
+        """
         fast_q = q - low_pass(q, motion.rate, cutoff)
         fast_tau = tau - low_pass(tau, motion.rate, cutoff)
         count = len(q) - lags
@@ -114,6 +121,10 @@ def mean_signs(
     Args:
         columns: function of a case that returns its columns of signs.
         run: the noise-free run of the loop, at the recording's rate.
+        plant: the simulated robot.
+        case: the recording.
+        loop: its closed loop.
+        noise: standard deviations of the noise in the loop and in the log.
         width: as in `with_quiet_speed`.
     """
     true_means = []
@@ -157,6 +168,10 @@ def _in_loop(
 
     Args:
         sigma: (n,) standard deviations of the noise in the loop, all below 0 for the draw with its sign changed.
+        plant: the simulated robot.
+        case: the recording.
+        loop: its closed loop.
+        run: the noise-free run of the loop, whose N instants are used.
     """
     noisy = simulated_run(plant, case, loop, Sensing(sigma_q=sigma, every=HALF), SEED)
     places = np.arange(len(run.t)) * loop.every / HALF

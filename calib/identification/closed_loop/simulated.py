@@ -49,7 +49,14 @@ class LoopEstimate(MethodEstimate):
 def attempted_in_loop(
     method: str, problem: IdentificationProblem, loops: ClosedLoops, run: Callable[[], MethodEstimate]
 ) -> LoopEstimate:
-    """Return the result of `run` with the loops and its computing time; an estimation's failure becomes a status."""
+    """Return the result of `run` with the loops and its computing time; an estimation's failure becomes a status.
+
+    Args:
+        method: name of the method.
+        problem: data and settings, with which a failure is recorded.
+        loops: closed loops that `run` simulates.
+        run: function that makes the estimate.
+    """
     estimate = attempted(method, problem, run)
     if isinstance(estimate, LoopEstimate):
         return estimate
@@ -215,6 +222,10 @@ def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) 
     """Return the test of an estimate by instrumental variables (IV), with the closed loop of the problem.
 
     An IV estimate is its own comparison. For an estimate of another method, a failure of IV is part of the result.
+
+    Args:
+        problem: data and settings, with the closed loop.
+        estimate: the user's estimate.
     """
     loop_estimate = None
     if isinstance(estimate, LoopEstimate) and estimate.instrumental is not None:
@@ -249,7 +260,11 @@ def _distance(identification: Instrumental) -> list[Finding]:
 
 
 def _gains(identification: Instrumental) -> list[Finding]:
-    """Return the finding on joints whose stated gains differ from the gains during the recording."""
+    """Return the finding on joints whose stated gains differ from the gains during the recording.
+
+    Args:
+        identification: estimate by instrumental variables, with the gains that the simulation suggests.
+    """
     joints = [f"{identification.stray[j]:.2g} times at joint {j + 1}" for j in identification.off]
     if joints:
         return [finding("loop-gains-off", joints=joints)]
@@ -257,7 +272,11 @@ def _gains(identification: Instrumental) -> list[Finding]:
 
 
 def _torques(identification: Instrumental) -> list[Finding]:
-    """Return the finding on torque rows that are explained by the measured motion but not by the simulated motion."""
+    """Return the finding on torque rows that are explained by the measured motion but not by the simulated motion.
+
+    Args:
+        identification: estimate by instrumental variables, with the simulation's errors.
+    """
     case = identification.rows[0][0]
     direct = identification.direct
     iv_torques = identification.own
@@ -269,7 +288,11 @@ def _torques(identification: Instrumental) -> list[Finding]:
 
 
 def _biased(identification: Instrumental) -> list[Finding]:
-    """Return the finding that least squares is biased; none if the bias is small or the simulation fits poorly."""
+    """Return the finding that least squares is biased; none if the bias is small or the simulation fits poorly.
+
+    Args:
+        identification: estimate by instrumental variables, with its test of least squares.
+    """
     # standard deviations of a shift that is worth a word (our choice)
     shift = identification.shift
     min_shift = 1.0
@@ -332,7 +355,12 @@ def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test:
 
 
 def _factors(problem: IdentificationProblem, estimate: np.ndarray, reference: np.ndarray) -> tuple[float, ...]:
-    """Return for each torque row the ratio of two estimates' torques (regression slope)."""
+    """Return for each torque row the ratio of two estimates' torques (regression slope).
+
+    Args:
+        problem: data and settings.
+        estimate, reference: (p,) parameters; the ratios are torques of `estimate` over those of `reference`.
+    """
     factors = problem.pooled.factors[:, :, :-1]
     own_values = factors @ estimate
     reference_values = factors @ reference
@@ -343,7 +371,12 @@ def _factors(problem: IdentificationProblem, estimate: np.ndarray, reference: np
 
 
 def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopResults:
-    """Return the results of simulating an estimate's loop, in the form that is stored and printed."""
+    """Return the results of simulating an estimate's loop, in the form that is stored and printed.
+
+    Args:
+        problem: data and settings; without a loop the results are empty.
+        estimate: the user's estimate.
+    """
     test = compare_with_loop(problem, estimate)
     is_estimate = isinstance(estimate, LoopEstimate) and estimate.instrumental is not None
     table: tuple[tuple[object, ...], ...] = ()
@@ -408,7 +441,11 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
 
 
 def _table(identification: Instrumental) -> tuple[tuple[object, ...], ...]:
-    """Return a table that compares IV and least-squares estimates of the standard model, one row per parameter."""
+    """Return a table that compares IV and least-squares estimates of the standard model, one row per parameter.
+
+    Args:
+        identification: estimate by instrumental variables, with the least-squares estimate.
+    """
     estimate = identification.fit.estimate
     ordinary = identification.ordinary.estimate.values
     explained = 100.0 * identification.strength.partial_r2

@@ -55,7 +55,12 @@ def regular_plant(
 
 
 def simulated_runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
-    """Return noise-free simulations of the loops of all recordings."""
+    """Return noise-free simulations of the loops of all recordings.
+
+    Args:
+        plant: the simulated robot.
+        cases: gap-free parts of recordings, each with its loop.
+    """
     result: Runs = []
     for case, loop in cases:
         run = simulated_run(plant, case, loop, Sensing(every=loop.every))
@@ -64,7 +69,15 @@ def simulated_runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
 
 
 def simulated_run(plant: Plant, case: Case, loop: Loop, sensing: Sensing, seed: int = 0) -> SimulatedRun:
-    """Return the simulation of a recording's loop with the recording's payloads."""
+    """Return the simulation of a recording's loop with the recording's payloads.
+
+    Args:
+        plant: the simulated robot.
+        case: the recording, which has the payloads.
+        loop: its loop.
+        sensing: noise, resolution and sampling.
+        seed: seed of all noise.
+    """
     robot = plant.carrying(case.carried)
     controller = loop.controller
     if loop.design is not None:
@@ -82,6 +95,10 @@ def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tupl
 
     The robot is halfway, or nearer to `start` if that robot cannot be simulated.
 
+    Args:
+        start, end: robots with different parameters; `start` can be simulated.
+        cases: gap-free parts of recordings, each with its loop.
+
     Raises:
         CannotSimulate: if no robot near `start` can be simulated.
     """
@@ -96,7 +113,11 @@ def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tupl
 
 
 def distance_percent(runs: Runs) -> np.ndarray:
-    """Return the rms difference of simulated and recorded positions (n,), relative to the motion's rms [%]."""
+    """Return the rms difference of simulated and recorded positions (n,), relative to the motion's rms [%].
+
+    Args:
+        runs: simulations of the recordings' loops.
+    """
     n = runs[0][0][0].motion.n
     away, size = np.zeros((2, n))
     for (case, loop), run in runs:
@@ -109,7 +130,11 @@ def distance_percent(runs: Runs) -> np.ndarray:
 
 
 def error_ratio(runs: Runs) -> np.ndarray:
-    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN if noise hides the ratio."""
+    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN if noise hides the ratio.
+
+    Args:
+        runs: simulations of the recordings' loops.
+    """
     measured_errors = []
     expected_errors = []
     for (case, loop), run in runs:

@@ -36,7 +36,13 @@ LOWER = "these gains cannot stabilise this robot at this rate; lower kp and kd (
 
 
 def added_inertia(terms: Iterable[DriveTerm], values: np.ndarray, n: int) -> np.ndarray:
-    """Return the constant inertia matrix (n, n) of the drives: motor inertias and their couplings between joints."""
+    """Return the constant inertia matrix (n, n) of the drives: motor inertias and their couplings between joints.
+
+    Args:
+        terms: drive terms.
+        values: values of their parameters.
+        n: number of joints.
+    """
     result = np.zeros((n, n))
     for term, value in zip(terms, values, strict=True):
         if term.shape == "acceleration":
@@ -80,7 +86,11 @@ class Plant:
         return replace(self, parameters=parameters)
 
     def carrying(self, carried: Collection[str]) -> Plant:
-        """Return the robot with only the payloads of these labels; the parameters of other payloads become zero."""
+        """Return the robot with only the payloads of these labels; the parameters of other payloads become zero.
+
+        Args:
+            carried: labels of the payloads.
+        """
         carried_columns = IdentificationModel(self.bodies).carried_columns(carried)
         factors = np.append(carried_columns, np.ones(len(self.terms)))
         return self.with_parameters(self.parameters * factors)
@@ -92,7 +102,14 @@ class Plant:
         sensing: Sensing | None = None,
         seed: int | np.random.Generator = 0,
     ) -> SimulatedRun:
-        """Return the simulated motion of the robot that follows a reference, by `simulate`."""
+        """Return the simulated motion of the robot that follows a reference, by `simulate`.
+
+        Args:
+            controller: the controller.
+            reference: reference sampled at the controller's rate.
+            sensing: noise, resolution and sampling; None: no noise, one sample per control period.
+            seed: seed of all noise.
+        """
         return simulate(self, controller, reference, sensing, seed)
 
     def feed_forward(self, reference: Reference) -> np.ndarray:
@@ -106,7 +123,11 @@ class Plant:
         return matrices + added_inertia(self.terms, drives, self.bodies.n)
 
     def inertia_diagonal(self, q: np.ndarray) -> np.ndarray:
-        """Return the diagonal (n,) of the inertia matrix, motor inertia included, mean over joint positions (N, n)."""
+        """Return the diagonal (n,) of the inertia matrix, motor inertia included, mean over joint positions (N, n).
+
+        Args:
+            q: (N, n) joint positions [rad or m].
+        """
         return np.einsum("kii->i", self.inertia(q)) / len(q)
 
 
@@ -141,10 +162,10 @@ class SimulatedRun:
 
     Attributes:
         t: (M,) sample times [s].
-        q, v, a: (M, n) true motion.
-        measured: (M, n) positions measured by the encoders.
-        tau: (M, n) torques as recorded, with `Sensing.sigma_tau`.
-        torque: (M, n) torques that acted on the joints.
+        q, v, a: (M, n) true motion [rad or m, and per s, per s²].
+        measured: (M, n) positions measured by the encoders [rad or m].
+        tau: (M, n) torques as recorded, with noise of `Sensing.sigma_tau` [N m or N].
+        torque: (M, n) torques that acted on the joints [N m or N].
     """
 
     t: np.ndarray
@@ -260,7 +281,7 @@ def forward_dynamics(
 
     Args:
         plant: the robot.
-        q, v: (N, n) joint positions and velocities.
+        q, v: (N, n) joint positions and velocities [rad or m, and per s].
         tau: (N, n) drive torques [N m or N].
         parameters: (N, p) parameters of each sample; None: the plant's.
 
@@ -287,7 +308,13 @@ def forward_dynamics(
 
 
 def _draw(rng: np.random.Generator, sigma: np.ndarray, count: int) -> np.ndarray:
-    """Return white noise (count, n) with standard deviations sigma (n,), or an empty array if all are zero."""
+    """Return white noise (count, n) with standard deviations sigma (n,), or an empty array if all are zero.
+
+    Args:
+        rng: generator of random numbers.
+        sigma: (n,) standard deviations.
+        count: number of samples.
+    """
     if not np.any(sigma):
         return np.empty((0, len(sigma)))
     return rng.standard_normal((count, len(sigma))) * sigma
@@ -297,6 +324,10 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
     """Return low-passed noise x_k = p x_{k-1} + √(1 - p²) w_k with p = exp(-step), for white noise w (N, n).
 
     Its variance equals the variance of w.
+
+    Args:
+        white: (N, n) white noise w.
+        step: time step over the time constant of the low-pass.
     """
     if not len(white):
         return white
@@ -308,7 +339,7 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
 
 
 def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the index arrays by which `loop_kernels.set_parameters` writes into the arrays of `packed`."""
+    """Return the index arrays by which `loop_kernels.set_parameters` writes into the arrays of `packed(plant)`."""
     n = plant.bodies.n
     first = plant.inertial
     orders = np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10))
@@ -332,7 +363,7 @@ def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
 
 
 def packed(plant: Plant) -> Packed:
-    """Return the robot model as the arrays tree, body, linear, kinds and acts of `loop_kernels`."""
+    """Return the robot model `plant` as the arrays tree, body, linear, kinds and acts of `loop_kernels`."""
     bodies = plant.bodies.count
     n = plant.bodies.n
     parents = np.where(plant.bodies.parents < 0, bodies, plant.bodies.parents)
@@ -354,6 +385,10 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
     """Return placements and parameters of the bodies as the array `body` (B + 1, 23) of `loop_kernels`.
 
     Frames are rotated so that each joint moves about or along z.
+
+    Args:
+        bodies: the B bodies.
+        parameters: (10 B,) their standard parameters.
     """
     result = np.zeros((bodies.count + 1, 23))
     result[-1, :3] = -bodies.gravity
@@ -379,6 +414,11 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float 
 
     `ramp`: width over which the sign with a dead zone is smoothed, relative to its dead zone (a jump cannot be
     integrated).
+
+    Args:
+        terms: drive terms.
+        values: values of their parameters.
+        n: number of joints.
     """
     from calib.dynamics import shape_kernels
 
@@ -432,7 +472,12 @@ def failure(status: int, time: float, where: str | None = None) -> NotConverged:
 
 
 def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
-    """Return the torques (N, n) of the controller's robot model along a reference, drives included [N m or N]."""
+    """Return the torques (N, n) of the controller's robot model along a reference, drives included [N m or N].
+
+    Args:
+        believed: the controller's model.
+        reference: reference sampled at the controller's rate.
+    """
     model = IdentificationModel(believed.bodies, believed.terms)
     # instants at a time
     block = 4096
@@ -454,8 +499,8 @@ def tracking_error(
         robot: the robot that moves; for a real arm, its best available model.
         controller: its controller.
         reference: reference sampled at the controller's rate.
-        ahead: (N, n) feedforward torques, e.g. from `feed_forward`; None: those of the controller.
-        push: (N, n) additional torques; None: no additional torque.
+        ahead: (N, n) feedforward torques [N m or N], e.g. from `feed_forward`; None: those of the controller.
+        push: (N, n) additional torques [N m or N]; None: no additional torque.
     """
     run = simulate(robot, controller if ahead is None else controller.with_feedforward(ahead), reference, push=push)
     return np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0))

@@ -119,7 +119,11 @@ class _Law:
         self.speed_late = self.late + 0.5 * reference.period + lag
 
     def linearised(self, shift: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return residual torques (M, n) minus their means, and the control law's derivative by the shift (M, n)."""
+        """Return residual torques (M, n) minus their means, and the control law's derivative by the shift (M, n).
+
+        Args:
+            shift: time by which the reference is later than stated [s].
+        """
         controller = self.controller
         instants = self.t - self.late
         shifted = np.clip(instants - shift, self.t[0], self.t[-1])
@@ -166,7 +170,12 @@ class _Law:
 
 
 def _by_positions(reference: CubicSpline, measured: CubicSpline, t: np.ndarray) -> float:
-    """Return the shift [s] of the reference with which it is nearest to the measured positions, at times t (M,)."""
+    """Return the shift [s] of the reference with which it is nearest to the measured positions, at times t (M,).
+
+    Args:
+        reference, measured: reference and measured positions as splines in time.
+        t: (M,) times [s].
+    """
     shift = 0.0
     low = float(reference.x[0])
     high = float(reference.x[-1])

@@ -108,7 +108,7 @@ class FrictionSelection:
         """Return the selection without the terms that the final fit switched off.
 
         Args:
-            sigma: (k,) standard deviations of the selected terms in the final fit; zero if switched off.
+            sigma: (k,) standard deviations of the selected terms' parameters in the final fit; zero if switched off.
         """
         off = []
         joints = {}
@@ -143,10 +143,10 @@ class FrictionCandidates:
         rows: rows of these recordings in the base columns and standard drive terms, with time blocks numbered.
         loads: torques transmitted by the gears of each case (N, n), from a first fit; None if no term depends on them.
         decimator: filter of the rows.
-        std, inflation: (rows,) standard deviation and variance inflation of the first fit's residuals.
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation of the first fit's residuals.
         v0: (n,) smoothing of the Coulomb sign [rad/s or m/s].
         linear: (n,) whether each joint is prismatic.
-        apart: rows with a different unit, excluded from totals.
+        apart: indices of rows with a different unit, excluded from totals.
         prior: prior of the base parameters; None without one.
         torque_rows: kind of torques in the rows.
         coupled: pairs of joints, from 0, whose coupling is already in the model.
@@ -257,7 +257,7 @@ class _Bench:
         """Return the squared errors (blocks, rows) of the model with the base columns and these further columns.
 
         Args:
-            columns: indices of further columns.
+            columns: indices of further columns, counted from the first base column.
             folds: number of folds of the cross-validation; None: each time block is one.
         """
         return self.validation.errors(self._with_base(columns), folds)
@@ -315,7 +315,12 @@ class _Bench:
         return accepted, self.errors([*selected, *accepted]), _flat(at)
 
     def _rows(self, joints: tuple[int, ...], side: str) -> list[int]:
-        """Return the torque rows that terms of these joints affect, on the ``link`` or ``motor`` side."""
+        """Return the indices of the torque rows that terms of these joints affect, on one side of the gears.
+
+        Args:
+            joints: joints, from 0.
+            side: ``link`` or ``motor``.
+        """
         torque_rows = self.candidates.torque_rows
         rows: list[int] = []
         for joint in joints:
@@ -380,12 +385,20 @@ def _flat(joint_sets: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
 
 
 def _carries(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the rms error of cross-validation with two halves grew by a share of at most `MIN_GAIN`."""
+    """Return whether the rms error of cross-validation with two halves grew by a share of at most `MIN_GAIN`.
+
+    Args:
+        before, after: squared errors per time block without and with the tested terms.
+    """
     return bool(after.sum() <= (1.0 + MIN_GAIN) ** 2 * before.sum())
 
 
 def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the squared errors in held-out ranges of motion (k,) did not increase, in geometric mean."""
+    """Return whether the squared errors in held-out ranges of motion (k,) did not increase, in geometric mean.
+
+    Args:
+        before, after: (k,) squared errors in each range without and with the tested terms.
+    """
     positive = (before > 0.0) & (after > 0.0)
     if not positive.any():
         return True
@@ -393,7 +406,11 @@ def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _pays(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the squared errors per time block fell by enough in total, and in enough blocks."""
+    """Return whether the squared errors fell by a share of `MIN_GAIN` (rms), and in a share `MIN_BLOCKS_WON` of blocks.
+
+    Args:
+        before, after: squared errors per time block without and with the tested terms.
+    """
     positive = before > 0.0
     if not positive.any():
         return False
@@ -403,7 +420,12 @@ def _pays(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _terms(candidates: FrictionCandidates, names: Sequence[str]) -> dict[str, list[DriveTerm]]:
-    """Return the candidate terms of each named step, for all joints."""
+    """Return the candidate terms of each named step, for all joints.
+
+    Args:
+        candidates: rows, and the data on which terms depend.
+        names: names of the steps.
+    """
     terms: dict[str, list[DriveTerm]] = {name: [] for name in names}
     if "coupling" in terms:
         terms["coupling"] = _couplings(candidates)
@@ -430,6 +452,9 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
 
     A joint is in one coupling at most. Its motor turns with the sum or the difference of the joints, whichever explains
     more.
+
+    Args:
+        candidates: rows, and the data on which terms depend.
     """
     n = candidates.n
     if not candidates.torque_rows.motors_alone:
@@ -478,6 +503,9 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
 
 def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
     """Return about `COUPLING_ROWS` weighted samples of the recordings.
+
+    Args:
+        candidates: rows, and the data on which terms depend.
 
     Returns:
         regressor (M, n, b), torques (M, n), weights (M, n), and the list of q, v, a (n, M).

@@ -21,6 +21,10 @@ def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
     """Return the share (n,) of each joint's energy that friction dissipates, ∫ v_j τ_friction,j dt / ∫ |v_j τ_j| dt.
 
     The share is zero for joints at rest; noise does not count as motion.
+
+    Args:
+        dynamics: model with its parameter values.
+        cases: recordings.
     """
     model = dynamics.model
     n = model.n
@@ -86,12 +90,21 @@ def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarra
 
 
 def driving(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
-    """Return the mask (n,) of joints whose identified friction adds energy instead of dissipating it."""
+    """Return the mask (n,) of joints whose identified friction adds energy instead of dissipating it.
+
+    Args:
+        dynamics: model with its parameter values.
+        cases: recordings, along which the energy is computed.
+    """
     return np.asarray(_dissipated(dynamics, cases) < MIN_ENERGY_SHARE)
 
 
 def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
     """Return the joints, from 0, whose friction adds energy: their torques are reversed or exchanged between joints.
+
+    Args:
+        dynamics: model with its parameter values.
+        cases: recordings, along which the energy is computed.
 
     Raises:
         MeasurementError: if the friction of most of the moving joints adds energy.

@@ -132,7 +132,7 @@ class GearTravel:
     """Motion of the gears in the recordings.
 
     Attributes:
-        q, v: (N, n) positions and velocities.
+        q, v: (N, n) positions [rad or m] and velocities [per s].
         block: (N,) time block of each sample.
         moving: joints, from 0, that move enough.
     """
@@ -190,7 +190,7 @@ def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
 
     Args:
         track: motion of the gears.
-        residuals: (N, n) high-frequency parts of the unexplained torques.
+        residuals: (N, n) high-frequency parts of the unexplained torques [N m or N].
     """
     scores: dict[int, np.ndarray] = {}
     total = np.zeros(len(TURNS))
@@ -221,7 +221,7 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     Args:
         joint: joint, from 0.
         track: motion of the gears.
-        residual: (N,) unexplained torque, without its slow part, at the samples of `track`.
+        residual: (N,) unexplained torque [N m or N], without its slow part, at the samples of `track`.
         turns: motor turns per turn of each gear, from `find_turns`.
     """
     if not residual.any():
@@ -308,14 +308,24 @@ class _WaveCrossValidation:
         self._columns: dict[tuple[Wave, tuple[float, ...]], np.ndarray] = {}
 
     def columns(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> np.ndarray:
-        """Return the regressor columns (N, k) of the waves, in the order of `_terms`."""
+        """Return the regressor columns (N, k) of the waves, in the order of `_terms`.
+
+        Args:
+            waves: pairs of a gear's joint and order per turn.
+            nodes: frequencies of the gain's nodes [Hz].
+        """
         for wave in waves:
             if (wave, nodes) not in self._columns:
                 self._columns[wave, nodes] = _columns(self._track, wave, nodes)
         return np.hstack([self._columns[wave, nodes] for wave in waves])
 
     def explained_share(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> tuple[float, float]:
-        """Return the explained share of the residual's power on held-out blocks, and the best ridge of `RIDGES`."""
+        """Return the explained share of the residual's power on held-out blocks, and the best ridge of `RIDGES`.
+
+        Args:
+            waves: pairs of a gear's joint and order per turn.
+            nodes: frequencies of the gain's nodes [Hz].
+        """
         matrix = self.columns(waves, nodes)
         residual = self.residual
         squares = np.array([matrix[block].T @ matrix[block] for block in self._blocks])
@@ -340,7 +350,10 @@ class _WaveCrossValidation:
     def fit(self, waves: Sequence[Wave], nodes: tuple[float, ...], ridge: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the residual after fitting the waves (N,), and their parameters (k,).
 
-        `ridge` is in units of the mean information of a column.
+        Args:
+            waves: pairs of a gear's joint and order per turn.
+            nodes: frequencies of the gain's nodes [Hz].
+            ridge: weight of the parameters' squares, in units of the mean information of a column.
         """
         matrix = self.columns(waves, nodes)
         square = matrix.T @ matrix
@@ -352,7 +365,13 @@ class _WaveCrossValidation:
 
 
 def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarray:
-    """Return the regressor columns (N, k) of a wave along a motion of the gears, in the order of `_terms`."""
+    """Return the regressor columns (N, k) of a wave along a motion of the gears, in the order of `_terms`.
+
+    Args:
+        track: motion of the gears.
+        wave: pair of the gear's joint and order per turn.
+        nodes: frequencies of the gain's nodes [Hz].
+    """
     gear = wave[0]
     q = track.q[:, gear]
     v = track.v[:, gear]
@@ -394,7 +413,11 @@ def coherence(track: GearTravel, gear: int, residual: np.ndarray) -> np.ndarray:
 
 
 def _lobes(power: np.ndarray) -> np.ndarray:
-    """Return, for every N of `TURNS`, the sum of the coherence S(k) over the orders N, 2 N and 2 N + 2."""
+    """Return, for every N of `TURNS`, the sum of the coherence S(k) over the orders N, 2 N and 2 N + 2.
+
+    Args:
+        power: coherence S(k) of the orders k = 0, 1, …, from `coherence`.
+    """
     turns = np.array(TURNS)
     positive = np.maximum(power, 0.0)
     return positive[turns] + positive[2 * turns] + positive[2 * turns + 2]
@@ -440,7 +463,13 @@ def _climb(
 
 
 def _free(track: GearTravel, joint: int, residual: np.ndarray) -> list[tuple[Wave, ...]]:
-    """Return two sets of waves of the joint's gear: the most coherent order, and the most coherent pair k, k + 2."""
+    """Return two sets of waves of the joint's gear: the most coherent order, and the most coherent pair k, k + 2.
+
+    Args:
+        track: motion of the gears.
+        joint: joint, from 0.
+        residual: (N,) high-frequency part of its unexplained torque.
+    """
     power = coherence(track, joint, residual)
     order = MIN_ORDER + int(np.argmax(power[MIN_ORDER : MAX_ORDER + 1]))
     pairs = power[MIN_ORDER : MAX_ORDER - 1] + power[MIN_ORDER + 2 : MAX_ORDER + 1]
@@ -449,7 +478,12 @@ def _free(track: GearTravel, joint: int, residual: np.ndarray) -> list[tuple[Wav
 
 
 def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
-    """Return the high-pass part of a residual (N,), above twice the bandwidth of the motion, segment by segment."""
+    """Return the high-pass part of a residual (N,), above twice the bandwidth of the motion, segment by segment.
+
+    Args:
+        case: the recording.
+        residual: (N,) unexplained torque of one joint.
+    """
     motion = case.motion
     cutoff = min(2.0 * motion.cutoffs.dynamics, 0.4 * motion.rate)
     slow = []

@@ -8,6 +8,7 @@ tangent plane at this optimum β*, νᵀ β >= νᵀ β*. This gives the same op
 treats the plane as an equality (our choice; the cone is curved).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,22 +18,25 @@ from calib.dynamics import pseudo_inertia
 from calib.dynamics.base import Base
 from calib.dynamics.regressor_model import RegressorModel
 from calib.estimation.cone_program import minimise
+from calib.estimation.convex_sets import ConvexSet
 from calib.records import Frozen
 
 
 @dataclass(frozen=True, eq=False)
-class _Plane:
-    """Tangent plane νᵀ β >= νᵀ β* of the cone at an optimum β*.
+class Touching:
+    """Optimum β* (p,) on the cone, and the planes νᵀ β >= νᵀ β* that give it in place of the cone and of convex sets.
 
     Attributes:
-        normal: (p,) ν.
-        bound: νᵀ β*.
-        bodies: labels of the bodies at the limit of physical consistency.
+        values: β*.
+        normal: ν (p,) of the cone; None where it is inactive.
+        bodies: labels of the bodies on the border.
+        planes: ν (p,) of each convex set; None where it is inactive.
     """
 
-    normal: np.ndarray
-    bound: float
+    values: np.ndarray
+    normal: np.ndarray | None
     bodies: tuple[str, ...]
+    planes: tuple[np.ndarray | None, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,18 +53,26 @@ class BodyCone(Frozen):
     labels: tuple[str, ...]
     positive: np.ndarray
 
-    def touching(self, factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> _Plane | None:
-        """Return the cone's tangent plane at argmin ½ ‖R β - z‖² under lower <= A β <= upper and the cone.
+    def touching(
+        self,
+        factor: np.ndarray,
+        matrix: np.ndarray,
+        lower: np.ndarray,
+        upper: np.ndarray,
+        sets: Sequence[ConvexSet] = (),
+    ) -> Touching:
+        """Return tangent planes at argmin ½ ‖R β - z‖² under lower <= A β <= upper, the cone and convex sets.
 
-        The result is None if the cone is not binding.
+        β (p,) are the parameters of the columns, base parameters first.
 
         Args:
-            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ]; base columns first.
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem in β; base columns first.
             matrix: A (c, p).
             lower, upper: (c,) bounds, -inf and inf allowed.
+            sets: convex sets of β.
 
         Raises:
-            NotConverged: if no bodies satisfy the bounds.
+            NotConverged: if no bodies satisfy the bounds and sets.
         """
         p = len(factor) - 1
         count = len(self.labels)
@@ -97,28 +109,45 @@ class BodyCone(Frozen):
         limits = np.repeat([1.0, 0.0], [count, positive_count])
         offset = np.concatenate([limits, -edges])
         conditions = np.vstack([*rows, sides @ columns])
-        solution = minimise(R @ columns, z, conditions, offset, bodies)
+        scaled_sets: list[ConvexSet] = []
+        sets_of_unknowns: list[ConvexSet] = []
+        for convex in sets:
+            scaled = convex.of(np.diag(size / unit))
+            scaled_sets.append(scaled)
+            sets_of_unknowns.append(scaled.of(columns))
+        solution = minimise(R @ columns, z, conditions, offset, bodies, sets=sets_of_unknowns)
         b = columns @ solution.values
+        # of the gradient, from which on the cone or a set holds the optimum
+        min_multiplier = 1e-6 * max(float(np.abs(R.T @ z).max()), 1e-300)
+        planes: list[np.ndarray | None] = []
         # the gradient's part that the cone balances
         forces = solution.rows[len(offset) - len(edges) :]
-        gradient = (R.T @ (R @ b - z) - sides.T @ forces)[:base]
-        # of the gradient, from which on the cone holds the optimum
-        min_multiplier = 1e-6
-        if np.abs(gradient).max() < min_multiplier * max(float(np.abs(R.T @ z).max()), 1e-300):
-            return None
+        gradient = R.T @ (R @ b - z) - sides.T @ forces
+        for convex, multipliers in zip(scaled_sets, solution.sets):
+            push = convex.normal(multipliers)
+            gradient = gradient - push
+            binds = np.abs(push).max() >= min_multiplier
+            planes.append(push * unit / size if binds else None)
+        values = b * size / unit
+        if np.abs(gradient[:base]).max() < min_multiplier:
+            return Touching(values, None, (), tuple(planes))
         normal = np.zeros(p)
-        normal[:base] = gradient
+        normal[:base] = gradient[:base]
         eigenvalues = np.linalg.eigvalsh(bodies @ solution.values)
         # of a body's largest moment in those units, below which it counts as on the border
         max_on_border = 1e-4
         border = eigenvalues[:, 0] < max_on_border * np.maximum(eigenvalues[:, -1], max_on_border)
         labels = tuple(label for label, touches in zip(self.labels, border) if touches)
-        bound = float(normal @ b)
-        return _Plane(normal * unit / size, bound, labels)
+        return Touching(values, normal * unit / size, labels, tuple(planes))
 
 
 def cone_of(model: RegressorModel, base: Base) -> BodyCone:
-    """Return the cone of physically consistent base parameters of a model."""
+    """Return the cone of physically consistent base parameters of a model.
+
+    Args:
+        model: model of standard parameters.
+        base: its base parameters.
+    """
     labels = tuple(name.removeprefix("XX") for name in model.names[: model.inertial : 10])
     positive = [column.nonnegative for column in model.columns]
     return BodyCone(np.asarray(base.transform), labels, np.array(positive, dtype=bool))

@@ -10,13 +10,15 @@ Constraints add knowledge, not consistency: if they bind at wrong values, the es
 the bias of least squares in a closed loop.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
 
 from calib.errors import CalibError, require
 from calib.estimation.cone_program import from_free, minimise
+from calib.estimation.convex_sets import ConvexSet
 from calib.estimation.triangles import require_rank
 from calib.records import frozen, shaped
 
@@ -46,7 +48,11 @@ class Definite:
         return values[:, 0] - self.least, np.asarray(products[:, 0])
 
     def satisfied(self, sizes: np.ndarray) -> bool:
-        """Return whether the smallest eigenvalues, given minus `least` as `sizes` (K,), satisfy the constraint."""
+        """Return whether the smallest eigenvalues, given minus `least` as `sizes` (K,), satisfy the constraint.
+
+        Args:
+            sizes: smallest eigenvalue of each of the K matrices, minus `least`.
+        """
         # of the least eigenvalue, by which a matrix that did not enter may miss it (our choice)
         max_violation = 1e-3
         return bool((sizes >= -max_violation * self.least).all())
@@ -87,7 +93,8 @@ def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> t
 def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Return the covariance P C Pᵀ of an estimate under A b = d, from the covariance C of the unconstrained estimate.
 
-    P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A with Q = RᵀR. C may also be a covariance for correlated residuals.
+    P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A with Q = RᵀR, R (p, p) the triangular factor of the observation matrix. C may also be a
+    covariance for correlated residuals.
 
     Args:
         covariance: C (p, p).
@@ -131,6 +138,7 @@ class Constrained:
         binding: (c,) whether each constraint is binding, which indicates a too tight constraint or a biased estimate.
         normals: (c, p) derivatives of the slack at the optimum; for a binding matrix <A, Z> / trace Z with its
             multiplier Z.
+        planes: for each convex set the normal (p,) of the plane that touches it; None where the set does not bind.
     """
 
     values: np.ndarray
@@ -138,21 +146,31 @@ class Constrained:
     slack: np.ndarray
     binding: np.ndarray
     normals: np.ndarray
+    planes: tuple[np.ndarray | None, ...] = ()
 
 
 def within(
-    factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray, matrices: Definite | None = None
+    factor: np.ndarray,
+    matrix: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    matrices: Definite | None = None,
+    sets: Sequence[ConvexSet] = (),
 ) -> Constrained:
     """Return the optimum of min ½ ‖R b - z‖² under lower <= A b <= upper and definite matrices.
 
-    Equal bounds are an equality; infinite bounds are ignored. Multipliers, slack, binding and normals have the order:
-    finite lower bounds, finite upper bounds, matrices, equalities. Multipliers of equalities have either sign.
+    And in convex sets, whose planes at the optimum are in `Constrained.planes`, not among the normals.
+
+    R (p, p) and z (p,) are the data's triangle, b (p,) the unknowns. Equal bounds are an equality; infinite bounds are
+    ignored. Multipliers, slack, binding and normals have the order: finite lower bounds, finite upper bounds, matrices,
+    equalities. Multipliers of equalities have either sign.
 
     Args:
-        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ], R of full rank.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem in b, R of full rank.
         matrix: A (c, p); the identity for bounds on single parameters.
         lower, upper: (c,), -inf and inf allowed.
         matrices: matrices that must be positive definite; None: no matrices.
+        sets: convex sets of b.
 
     Raises:
         CalibError: for crossed bounds, and for equalities that contradict each other or fix all parameters.
@@ -176,6 +194,8 @@ def within(
     edges = np.concatenate([lower[low], -upper[high]])
     planes = _Planes(factor, rows, edges, matrix[equal], lower[equal])
     matrices = matrices or Definite(np.zeros((0, 1, 1, p)), 1.0)
+    if sets:
+        return planes.definite(matrices, sets)
     solution = planes.optimum(np.zeros(len(rows), dtype=bool))
     if (solution.slack[: len(rows)] < 0.0).any():
         solution = planes.bounded()
@@ -273,8 +293,8 @@ class _Planes:
         good = feasible and optimal and away <= max_move
         return exact if good else solution
 
-    def definite(self, matrices: Definite) -> Constrained:
-        """Return the optimum under inequalities and definite matrices, by cone programs.
+    def definite(self, matrices: Definite, sets: Sequence[ConvexSet] = ()) -> Constrained:
+        """Return the optimum under inequalities, definite matrices and convex sets, by cone programs.
 
         Few of many matrices are binding. The matrices with the smallest eigenvalues are added until all others are
         definite, and matrices that are not binding are removed. Since the minimum grows with every change of the set,
@@ -284,11 +304,12 @@ class _Planes:
         rows = self.scaled
         edges = self.edges
         small = Definite(matrices.matrices * self.unit, matrices.least)
+        small_sets = [convex.of(np.diag(self.unit)) for convex in sets]
         if matrices.likely is None:
             active = np.zeros(0, dtype=int)
         else:
             active = matrices.likely
-        # of the scaled problem, multipliers of matrices above which bind
+        # of the scaled problem, multipliers of matrices and sets above which bind
         min_multiplier = 1e-6
         # matrices that enter at once, the most indefinite (our choice)
         max_entering = 8
@@ -300,7 +321,7 @@ class _Planes:
                 active = np.argsort(small.least_eigenvalues(self.free / self.unit)[0])[:max_entering]
             goal = self.upper, self.target, rows[:c], -edges[:c]
             active_matrices = small.matrices[active]
-            solved = minimise(*goal, active_matrices, small.least, rows[c:], edges[c:])
+            solved = minimise(*goal, active_matrices, small.least, rows[c:], edges[c:], small_sets)
             b = solved.values
             mu = solved.rows
             pushes = solved.matrices
@@ -331,7 +352,13 @@ class _Planes:
         gaps = np.concatenate([slack, margins, np.zeros(len(rates))])
         multipliers = np.concatenate([mu, force, rates]) * self.length**2 / scales
         all_normals = all_rows * scales[:, None] / self.unit
-        return _frozen(b * self.unit, multipliers, gaps * scales, binding, all_normals)
+        optimum = _frozen(b * self.unit, multipliers, gaps * scales, binding, all_normals)
+        planes: list[np.ndarray | None] = []
+        for convex, dual in zip(small_sets, solved.sets):
+            normal = convex.normal(dual)
+            binds = np.abs(normal).max() > min_multiplier
+            planes.append(normal / self.unit if binds else None)
+        return replace(optimum, planes=tuple(planes))
 
 
 def _frozen(*parts: np.ndarray) -> Constrained:
@@ -340,7 +367,14 @@ def _frozen(*parts: np.ndarray) -> Constrained:
 
 
 def _widened(solution: Constrained, position: int, normals: np.ndarray, slack: np.ndarray) -> Constrained:
-    """Return the optimum with further inequalities, which are not binding, inserted at index `position`."""
+    """Return the optimum with further inequalities, which are not binding, inserted at index `position`.
+
+    Args:
+        solution: the optimum without the further inequalities.
+        position: index of the first inserted inequality in the order of `within`.
+        normals: (k, p) their derivatives.
+        slack: (k,) their distances to the bounds.
+    """
     zero = np.zeros(len(slack))
     multipliers = np.insert(solution.multipliers, position, zero)
     all_slack = np.insert(solution.slack, position, slack)

@@ -4,8 +4,9 @@ The methods with constraints are in `calib.identification.methods.estimators` an
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
@@ -14,6 +15,7 @@ from calib.config import strict
 from calib.config_types import Checked, Expect, Flag, Real, Text, Whole
 from calib.errors import Finding
 from calib.estimation.linear import LinearFit
+from calib.identification.methods.convex import function_in
 from calib.records import Number
 
 POSTURES = 50
@@ -89,6 +91,9 @@ class ConstraintSettings:
         bounds: name of a parameter → [lower, upper]; equal bounds fix it.
         sum: constraints on weighted sums of parameters.
         curved: constraints on functions of parameters.
+        file: Python file, executed, with a function ``constraints(beta)`` that returns CVXPY constraints on
+            ``beta["Fv1"]``.
+        convex: in Python that function itself.
     """
 
     signs: Flag = True
@@ -97,6 +102,34 @@ class ConstraintSettings:
     bounds: Mapping[str, Bounds] = field(default_factory=dict)
     sum: tuple[WeightedSum, ...] = ()
     curved: tuple[CurvedConstraint, ...] = ()
+    file: Text = ""
+    convex: Annotated[Callable[..., object] | None, Expect("a function, in Python alone"), _Json({"not": {}})] = None
+
+    @property
+    def function(self) -> Callable[..., object] | None:
+        """Function of parameters that returns CVXPY constraints, from Python or from the file; None without one.
+
+        Raises:
+            UsageError: for a file without such a function, see `calib.identification.methods.convex.function_in`.
+        """
+        if self.convex is None and self.file:
+            return function_in(Path(self.file))
+        return self.convex
+
+    @property
+    def by_function(self) -> bool:
+        """Whether a function states constraints."""
+        return self.convex is not None or bool(self.file)
+
+    @property
+    def of_user(self) -> "ConstraintSettings":
+        """What the user states, without those of the methods pc-*: signs, inertia and bodies."""
+        return replace(self, signs=False, inertia=0, bodies=False)
+
+    @staticmethod
+    def of(value: object) -> object:
+        """Return settings from a function of parameters; other values as they are."""
+        return {"convex": value} if callable(value) else value
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,7 +121,7 @@ def _sizes(u: np.ndarray) -> np.ndarray:
 
 
 def _differences(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray) -> np.ndarray:
-    """Return the Jacobian (m, k) of a function of u (k,), by central differences."""
+    """Return the Jacobian (m, k) of a function from u (k,) to m numbers at u, by central differences."""
     steps = np.diag(1e-5 * _sizes(u))
     slopes = []
     for step in steps:
@@ -191,6 +191,10 @@ def _rows(names: Sequence[str], row: Callable[[Mapping[str, float]], np.ndarray]
 def _parsed(text: str, location: str) -> tuple[ast.expr, tuple[str, ...]]:
     """Return the syntax tree of h and the names in it, from a formula ``h``, ``left >= right`` or ``left <= right``.
 
+    Args:
+        text: the formula.
+        location: name of the constraint, for messages.
+
     Raises:
         UsageError: for a text that is not such a formula.
     """
@@ -236,7 +240,8 @@ def tangents(
 
     Args:
         curved: the m constraints.
-        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ].
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem min ‖R β - z‖² in the parameters
+            β.
         start: (p,) β that satisfies the other constraints.
         solve: function that returns the optimum of a problem with p + m unknowns b, given its triangle (p + m + 1, p +
             m + 1) and further inequalities rows (2 m, p + m) b >= lower (2 m,), under the other constraints.
@@ -297,7 +302,13 @@ def tangents(
 
 
 def _share(merit: Callable[[np.ndarray], float], b: np.ndarray, step: np.ndarray) -> float:
-    """Return the largest of 1, ½, ¼, … by which a step can be multiplied without an increase of the merit function."""
+    """Return the largest of 1, ½, ¼, … by which a step can be multiplied without an increase of the merit function.
+
+    Args:
+        merit: merit function of parameters (p,).
+        b: (p,) parameters before the step.
+        step: (p,) change of the parameters.
+    """
     share = 1.0
     merit_now = merit(b)
     max_halvings = 30
@@ -311,6 +322,13 @@ def _elastic(factor: np.ndarray, b: np.ndarray, bend: np.ndarray, unit: np.ndarr
 
     It represents ½ ‖R x - z‖² + ½ (x - b)ᵀ K₊ (x - b) + Σ price t + ½ ‖length t‖², where K₊ is the positive part of
     `bend` and length = ‖z‖.
+
+    Args:
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ].
+        b: (p,) point at which the constraints are linearised.
+        bend: (p, p) curvature of the constraints, whose positive part is K₊.
+        unit: (p,) units of the parameters, in which K₊ is computed.
+        price: (m,) weights of the slack.
     """
     p = len(b)
     m = len(price)

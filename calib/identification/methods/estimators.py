@@ -27,12 +27,12 @@ def tls(
 ) -> LinearFit:
     """Estimate x of (W - ΔW) x = y - Δy with the smallest Σ (ΔW_kc / noise_c)² + (Δy_k / noise_y)², by TLS.
 
-    With exact columns first, [W y] = Q [R11 R12; 0 R22]. The right singular vector of R22 / noise for the smallest
-    singular value gives the noisy components of [x; -1], and back substitution the exact ones (Golub, Hoffman & Stewart
-    1987; Van Huffel & Vandewalle 1991, section 3.6). The noise level is σ² = s_min² / (r - p). The covariance (Fuller
-    1987, theorem 2.3.2, normal noise) is V = M⁻¹ σ_vv + r M⁻¹ (Σ_uu σ_vv - Σ_uv Σ_uvᵀ) M⁻¹ with M = WᵀW - r Σ_uu, Σ_uv
-    = -Σ_uu x and σ_vv = σ² (noise_y² + Σ noise_c² x_c²). For correlated rows with variance inflations τ_g it becomes V
-    + σ_vv M⁻¹ (Σ_g (τ_g - 1) W_gᵀ W_g) M⁻¹.
+    With exact columns first, the QR of [W y] is Q [R11 R12; 0 R22]. The right singular vector of R22 / noise for the
+    smallest singular value gives the noisy components of [x; -1], and back substitution the exact ones (Golub, Hoffman
+    & Stewart 1987; Van Huffel & Vandewalle 1991, section 3.6). The noise level is σ² = s_min² / (r - p). The covariance
+    (Fuller 1987, theorem 2.3.2, normal noise) is V = M⁻¹ σ_vv + r M⁻¹ (Σ_uu σ_vv - Σ_uv Σ_uvᵀ) M⁻¹ with M = WᵀW - r
+    Σ_uu, Σ_uv = -Σ_uu x and σ_vv = σ² (noise_y² + Σ noise_c² x_c²). For correlated rows with variance inflations τ_g it
+    becomes V + σ_vv M⁻¹ (Σ_g (τ_g - 1) W_gᵀ W_g) M⁻¹.
 
     Args:
         data: R factors of W and y.
@@ -92,6 +92,12 @@ def _null_direction(
 
     Singular values of pure noise are spread between 1 ± sqrt(columns / rows) (Marchenko & Pastur 1967). If the second
     smallest one is within this range of the smallest, the noise determines the solution.
+
+    Args:
+        factor: (p + 1, p + 1) R factor of [W y].
+        noise: (p + 1,) relative noise of the columns and of y; 0 for exact columns.
+        rows: number of rows.
+        names: names of the columns, for messages.
 
     Raises:
         Unidentifiable: if the noise determines the solution, or exact columns are dependent.
@@ -176,7 +182,7 @@ def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation:
 
     Args:
         pooled: R factors, one group per torque row.
-        std: (rows,) standard deviations of the residuals.
+        std: (rows,) standard deviations of the residuals [N m or N].
         exact: (p,) mask of columns without noise: ones (offsets) and signs.
         inflation: (rows,) variance inflation of the residuals; None: every row is independent.
     """
@@ -243,7 +249,11 @@ def _reweighted(
 
 
 def samples_of(problem: IdentificationProblem) -> Samples:
-    """Return the weighted rows of all recordings, grouped by sample."""
+    """Return the weighted rows of all recordings, grouped by sample.
+
+    Args:
+        problem: data and settings.
+    """
     rows = problem.rows
     weighted = [part.matrix * part.weight[:, :, None] for part in rows]
     matrix = np.concatenate(weighted)

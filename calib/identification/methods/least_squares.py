@@ -80,7 +80,7 @@ def _regularised(
     Args:
         problem: data and settings.
         prior: prior of the base parameters; None: no prior.
-        std, inflation: (rows,) standard deviations and variance inflations of the rows.
+        std, inflation: (rows,) noise standard deviation [N m or N] and variance inflation of each torque row.
         tempering: factor by which the prior's weight is increased.
 
     Returns:
@@ -114,6 +114,10 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
     For the values, the prior has `Prior.tempering` times the weight that it has for their covariance. Motor inertia is
     constrained to be positive and friction to be dissipative; the covariance ignores this. Friction is not constrained
     at joints whose data contradict dissipative friction, so that the error in the data remains visible.
+
+    Args:
+        problem: data and settings.
+        prior: prior of the base parameters.
     """
     pooled = problem.pooled
     base_count = problem.base.b
@@ -142,7 +146,7 @@ def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, 
     Args:
         problem: data and settings.
         free: (p,) unconstrained estimate.
-        std: (rows,) standard deviations, including variance inflation.
+        std: (rows,) noise standard deviation of each torque row [N m or N], times the root of its variance inflation.
         prior_rows: (k, p) whitened rows of prior and ridges.
     """
     terms, pooled = problem.terms, problem.pooled
@@ -171,7 +175,12 @@ def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, 
 
 
 def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
-    """Return the mask (n,) of joints at which the friction of an unconstrained estimate adds energy."""
+    """Return the mask (n,) of joints at which the friction of an unconstrained estimate adds energy.
+
+    Args:
+        problem: data and settings.
+        values: (p,) unconstrained estimate.
+    """
     model, base = problem.model, problem.base
     if not isinstance(model, IdentificationModel) or not model.torque_rows.motors_alone:
         return np.zeros(0, dtype=bool)

@@ -59,7 +59,7 @@ class IdentificationProblem:
         rows: observation matrix and torques of each case; p columns, base columns first, then additional friction.
         terms: (p,) drive term of each column; None for parameters of bodies.
         groups: (p,) ridge group of each column of additional friction; -1 for base columns.
-        noise: (rows,) standard deviation of the torques, up to a common factor; None: from their residuals.
+        noise: (rows,) standard deviation of the torques' noise, up to a common factor; None: from the residuals.
         prior: prior of the base parameters; None without one.
         loop: the closed loop in which the recordings were made; None if not stated.
         cad: standard parameters of the bodies from the robot's description, for a loop that feeds them forward; None:
@@ -270,7 +270,13 @@ class Method(ABC):
 
 
 def attempted(method: str, problem: IdentificationProblem, run: Callable[[], MethodEstimate]) -> MethodEstimate:
-    """Return the result of `run` with its computing time; a failure of the estimation becomes a status."""
+    """Return the result of `run` with its computing time; a failure of the estimation becomes a status.
+
+    Args:
+        method: name of the method.
+        problem: data and settings, with which a failure is recorded.
+        run: function that makes the estimate.
+    """
     began = time.perf_counter()
     try:
         estimate = run()

@@ -6,7 +6,8 @@ the regrouping of the base parameters. A bound on any other sum has no effect on
 TX40) and is refused. Inertia matrices M(q) at random postures are matrix inequalities: λ_min(S M(q; β) S) >=
 `MIN_EIGENVALUE`, with a scaling S that makes the mean diagonal one. Physically consistent bodies form a cone
 (`calib.identification.methods.body_cone`), which implies M(q) > 0. The user's own functions h(β) >= 0 may be nonlinear
-(`calib.identification.methods.curved`).
+(`calib.identification.methods.curved`); convex constraints in CVXPY are rows and convex sets
+(`calib.identification.methods.convex`).
 """
 
 from __future__ import annotations
@@ -22,11 +23,13 @@ from calib.dynamics.base import Base
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, NotConverged, UsageError, finding, refuse_option, require, suggestion
+from calib.estimation.convex_sets import ConvexSet
 from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import Triangles
 from calib.identification.methods.body_cone import BodyCone, cone_of
 from calib.identification.methods.constrained import Constrained, Definite, contradicting, restricted, within
 from calib.identification.methods.constraint_settings import Binding, ConstraintSettings, Held
+from calib.identification.methods.convex import UserConstraints, is_empty, user_constraints
 from calib.identification.methods.curved import Curved, make_curved, tangents
 from calib.identification.methods.method import IdentificationProblem
 from calib.records import Frozen, frozen
@@ -51,6 +54,7 @@ class Constraints(Frozen):
         likely: indices of the postures whose constraint was binding in a similar problem; None: unknown.
         curved: constraints h(β) >= 0.
         tangents: names of the rows that replace the curved constraints (`touched`).
+        sets: convex sets; touching: names of the rows that replace those that bind (`touched`), inactive: the others.
     """
 
     names: tuple[str, ...]
@@ -64,19 +68,26 @@ class Constraints(Frozen):
     likely: np.ndarray | None = None
     curved: tuple[Curved, ...] = ()
     tangents: tuple[str, ...] = ()
+    sets: tuple[ConvexSet, ...] = ()
+    touching: tuple[str, ...] = ()
+    inactive: tuple[str, ...] = ()
 
     def solve(self, factor: np.ndarray, free: np.ndarray | None = None) -> Constrained:
         """Return argmin ½ ‖R β - z‖² under these constraints, computed by `constrained.within`.
 
         Args:
-            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ].
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem in the parameters β.
             free: (p,) unconstrained β, which gives the scale of M(q); None: the least-squares solution of the triangle.
 
         Raises:
             NotConverged: with the last β, if no positive definite inertia satisfies the other constraints.
         """
-        if self.cone is not None or self.curved:
-            return self.touched(factor).solve(factor, free)
+        if self.cone is not None or self.curved or self.sets:
+            return self.touched(factor, free).solve(factor, free)
+        return self._optimum(factor, free)
+
+    def _optimum(self, factor: np.ndarray, free: np.ndarray | None) -> Constrained:
+        """Return the optimum under rows, inertia matrices and convex sets."""
         p = len(factor) - 1
         if free is None:
             upper_triangle = factor[:p, :p]
@@ -84,13 +95,14 @@ class Constraints(Frozen):
         postures = f"M(q) positive definite in {len(self.inertia)} postures"
         with _unsatisfied(f"no estimate satisfies {self} with {postures}: remove bounds, or record other motion"):
             definite = _definite(self.inertia, free, self.least, self.likely)
-            return within(factor, self.matrix, self.lower, self.upper, definite)
+            return within(factor, self.matrix, self.lower, self.upper, definite, self.sets)
 
     def __str__(self) -> str:
-        return "; ".join(self.names) or "them"
+        names = (*self.names, *(convex.name for convex in self.sets))
+        return "; ".join(names) or "them"
 
     def raised(self) -> Constraints | None:
-        """Return the constraints with a three times larger bound on M(q)'s smallest eigenvalue.
+        """Return the constraints with a three times larger bound on the inertia matrix M(q)'s smallest eigenvalue.
 
         The result is None if the bound would exceed `MAX_EIGENVALUE`. A robot may have a positive definite inertia
         matrix, but so little inertia in some direction that a sampled controller cannot stabilise it.
@@ -100,41 +112,76 @@ class Constraints(Frozen):
             return replace(self, least=least)
         return None
 
-    def touched(self, factor: np.ndarray) -> Constraints:
-        """Return the constraints with the cone and all curved constraints replaced by tangent planes at the optimum.
+    def touched(self, factor: np.ndarray, free: np.ndarray | None = None) -> Constraints:
+        """Return the constraints with the cone, convex sets and curved constraints replaced by planes at the optimum.
 
         Args:
             factor: (p + 1, p + 1) upper triangle [R z; 0 ρ], which defines the optimum.
+            free: (p,) β without constraints, from which the scale of M(q) is taken; None: that of the factor.
 
         Raises:
             NotConverged: if no estimate, or no physically consistent bodies, satisfy the other constraints.
         """
         if self.curved:
-            return self._flattened(factor).touched(factor)
-        if self.cone is None:
+            return self._flattened(factor).touched(factor, free)
+        if self.cone is None and not self.sets:
             return self
+        linear = replace(self, cone=None, sets=())
+        if self.cone is None:
+            optimum = self._optimum(factor, free)
+            return linear._with_planes(self.sets, optimum.planes, optimum.values)
         with _unsatisfied(f"no physically consistent bodies satisfy {self}: remove bounds"):
-            plane = self.cone.touching(factor, self.matrix, self.lower, self.upper)
-        if plane is None:
-            return replace(self, cone=None)
-        label = f"physically consistent bodies ({', '.join(plane.bodies) or 'all'} on the border)"
-        names = (*self.names, label)
-        matrix = np.vstack([self.matrix, plane.normal])
-        lower = np.append(self.lower, plane.bound)
+            touching = self.cone.touching(factor, self.matrix, self.lower, self.upper, self.sets)
+        linear = linear._with_planes(self.sets, touching.planes, touching.values)
+        if touching.normal is None:
+            return linear
+        label = f"physically consistent bodies ({', '.join(touching.bodies) or 'all'} on the border)"
+        with_plane = linear._with_row(label, touching.normal, touching.values)
+        return replace(with_plane, plane=label)
+
+    def _with_planes(
+        self, sets: Sequence[ConvexSet], planes: Sequence[np.ndarray | None], values: np.ndarray
+    ) -> Constraints:
+        """Return the constraints with the planes (p,) that touch convex sets at an optimum (p,); None: inactive."""
+        constraints = self
+        for convex, normal in zip(sets, planes):
+            if normal is None:
+                constraints = replace(constraints, inactive=(*constraints.inactive, convex.name))
+            else:
+                constraints = constraints._with_row(convex.name, normal, values)
+                constraints = replace(constraints, touching=(*constraints.touching, convex.name))
+        return constraints
+
+    def _with_row(self, name: str, normal: np.ndarray, values: np.ndarray) -> Constraints:
+        """Return the constraints with a plane νᵀ β >= νᵀ β*."""
+        names = (*self.names, name)
+        matrix = np.vstack([self.matrix, normal])
+        lower = np.append(self.lower, normal @ values)
         upper = np.append(self.upper, np.inf)
-        return replace(self, cone=None, plane=label, names=names, matrix=matrix, lower=lower, upper=upper)
+        return replace(self, names=names, matrix=matrix, lower=lower, upper=upper)
 
     def _flattened(self, factor: np.ndarray) -> Constraints:
-        """Return the constraints with the curved ones replaced by their tangent planes at the optimum."""
+        """Return the constraints with the curved ones replaced by their tangent planes at the optimum.
+
+        Args:
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ], which defines the optimum.
+        """
         linear = replace(self, curved=())
         m = len(self.curved)
+        p = len(factor) - 1
         start = linear.solve(factor).values
         upper_triangle = factor[:-1, :-1]
         least_squares = np.linalg.solve(upper_triangle, factor[:-1, -1])
         free = np.append(least_squares, np.zeros(m))
 
         def solve(triangle: np.ndarray, rows: np.ndarray, lower: np.ndarray) -> Constrained:
-            """Return the optimum of parameters and m further unknowns, under more inequalities rows · b >= lower."""
+            """Return the optimum of parameters and m further unknowns, under more inequalities rows · b >= lower.
+
+            Args:
+                triangle: (p + m + 1, p + m + 1) upper triangle of the problem.
+                rows: (k, p + m) rows of the further inequalities.
+                lower: (k,) their lower bounds.
+            """
             wider = np.pad(self.matrix, ((0, 0), (0, m)))
             names = ("",) * len(rows) + self.names
             matrix = np.vstack([rows, wider])
@@ -142,7 +189,8 @@ class Constraints(Frozen):
             padding = ((0, 0), (0, 0), (0, 0), (0, m))
             inertia = np.pad(self.inertia, padding)
             lower = np.append(lower, self.lower)
-            further = replace(linear, names=names, matrix=matrix, lower=lower, upper=upper, inertia=inertia)
+            sets = tuple(convex.of(np.eye(p, p + m)) for convex in self.sets)
+            further = replace(linear, names=names, matrix=matrix, lower=lower, upper=upper, inertia=inertia, sets=sets)
             return further.solve(triangle, free)
 
         names = tuple(constraint.name for constraint in self.curved)
@@ -182,6 +230,10 @@ def make_constraints(
     Raises:
         UsageError: for an unknown name, a bound without effect on the torques, or contradicting bounds.
     """
+
+    def row_of(weights: Mapping[str, float]) -> np.ndarray:
+        return _row(weights, base, names)
+
     requests: list[tuple[str, Mapping[str, float], float, float]]
     requests = []
     for name, bounds in settings.bounds.items():
@@ -205,9 +257,18 @@ def make_constraints(
     highs: list[float] = []
     for label, weights, low, high in requests:
         descriptions.append(_words(label, low, high))
-        rows.append(_row(weights, base, names))
+        rows.append(row_of(weights))
         lows.append(low)
         highs.append(high)
+    convex = UserConstraints((), ())
+    function = settings.function
+    if function is not None:
+        convex = user_constraints(function, row_of)
+    for constraint in convex.rows:
+        descriptions.append(constraint.name)
+        rows.append(constraint.row)
+        lows.append(constraint.lower)
+        highs.append(constraint.upper)
     matrix = np.reshape(rows, (-1, len(names)))
     lower = np.array(lows, dtype=float)
     upper = np.array(highs, dtype=float)
@@ -219,18 +280,17 @@ def make_constraints(
         refuse_option(
             "[constraints] contradict each other", f"{label}: no estimate satisfies them together; remove one of them"
         )
+    if convex.sets and is_empty(convex.sets, matrix, lower, upper):
+        label = "; ".join([*descriptions, *(convex_set.name for convex_set in convex.sets)])
+        refuse_option("[constraints] contradict each other", f"no estimate satisfies together {label}; remove one")
     cone = None
     if settings.bodies and model.inertial:
         cone = cone_of(model, base)
         # Physically consistent bodies have a positive definite inertia matrix at every posture.
         settings = replace(settings, inertia=0)
     inertia = _inertia(settings, model, base, len(names))
-
-    def row_of(weights: Mapping[str, float]) -> np.ndarray:
-        return _row(weights, base, names)
-
     curved = tuple(make_curved(constraint, row_of) for constraint in settings.curved)
-    return Constraints(tuple(descriptions), matrix, lower, upper, inertia, cone, curved=curved)
+    return Constraints(tuple(descriptions), matrix, lower, upper, inertia, cone, curved=curved, sets=convex.sets)
 
 
 def constraints_of(problem: IdentificationProblem) -> Constraints:
@@ -252,9 +312,9 @@ def hold(
 
     Args:
         fit: the unconstrained estimate.
-        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of its least-squares problem.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of its least-squares problem min ‖R β - z‖².
         data: R factors of the rows whose residuals give the noise, one group per torque row.
-        std: (g,) standard deviations of the groups.
+        std: (g,) noise standard deviations of the groups, in units of y.
         constraints: the constraints.
         stated_noise: whether `std` is the noise from which the covariance follows; otherwise σ² of the constrained
             estimate's residuals.
@@ -284,7 +344,13 @@ def hold(
 
 
 def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -> Held:
-    """Return the constraints, and which of them bind at a solution; the solution has the order of `within`."""
+    """Return the constraints, and which of them bind at a solution.
+
+    Args:
+        constraints: the constraints.
+        solution: the constrained optimum, in the order of `within`.
+        free: the unconstrained estimate.
+    """
     equal = constraints.lower == constraints.upper
     low = np.flatnonzero(np.isfinite(constraints.lower) & ~equal)
     high = np.flatnonzero(np.isfinite(constraints.upper) & ~equal)
@@ -302,7 +368,7 @@ def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -
         name = constraints.names[places[k]]
         origin = 0.0
         # told as h, by its plane, above zero
-        if name in constraints.tangents:
+        if name in (*constraints.tangents, *constraints.touching):
             origin = bound
         multiplier = float(solution.multipliers[k])
         value = float(row @ free.estimate.values - origin)
@@ -312,7 +378,8 @@ def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -
     tight = frozen(np.flatnonzero(solution.binding[places < 0]), int)
     findings = tuple(_findings(constraints, binding, len(tight)))
     normals = solution.normals[solution.binding]
-    return Held(constraints.names, tuple(binding), tight, free, normals, findings)
+    names = (*constraints.names, *constraints.inactive)
+    return Held(names, tuple(binding), tight, free, normals, findings)
 
 
 def _findings(constraints: Constraints, binding: Sequence[Binding], postures: int) -> Iterator[Finding]:
@@ -323,6 +390,8 @@ def _findings(constraints: Constraints, binding: Sequence[Binding], postures: in
         sigmas = abs(one.free - one.bound) / max(one.sigma, 1e-300)
         if one.name == constraints.plane:
             yield finding("held-to-bodies", name=one.name, sigmas=sigmas)
+        elif one.name in constraints.touching:
+            yield finding("held-to-convex", name=one.name, sigmas=sigmas)
         elif not one.equality or sigmas > max_sigmas:
             code = "against-equality" if one.equality else "on-its-bound"
             yield finding(code, name=one.name, free=one.free, sigma=one.sigma)
@@ -344,6 +413,11 @@ def _words(name: str, low: float, high: float) -> str:
 
 def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.ndarray:
     """Return the row a (p,) of a weighted sum of columns and standard parameters, so that the sum is aᵀ β.
+
+    Args:
+        weights: name of a column or standard parameter to its weight.
+        base: base parameters of the model.
+        names: (p,) names of the columns.
 
     Raises:
         UsageError: if the torques do not identify the sum, or a name is unknown.
@@ -372,7 +446,12 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
 
 
 def _without_effect(weights: Mapping[str, float], base: Base) -> str:
-    """Return the text why a weighted sum of standard parameters cannot be constrained."""
+    """Return the text why a weighted sum of standard parameters cannot be constrained.
+
+    Args:
+        weights: name of a standard parameter to its weight.
+        base: base parameters of the model.
+    """
     silent = [name for name in weights if name in base.without_effect]
     if silent:
         return f"{', '.join(silent)} has no effect on the torques of this robot: remove the bound"
@@ -386,6 +465,12 @@ def _inertia(settings: ConstraintSettings, model: RegressorModel, base: Base, p:
     """Return the tensor (K, n, n, p) of the inertia matrices at random postures, M(q_k) = tensor[k] β.
 
     K is 0 if the constraint is not requested, or the rows are not those of all joint torques.
+
+    Args:
+        settings: table [constraints], with the number K of postures.
+        model: the model.
+        base: its base parameters.
+        p: number of columns.
     """
     if not settings.inertia or not model.inertial or model.rows != model.n:
         return np.zeros((0, model.n, model.n, p))
@@ -406,6 +491,12 @@ def _definite(inertia: np.ndarray, free: np.ndarray, least: float, likely: np.nd
     """Return the constraint on the scaled inertia matrices S M(q) S; None without matrices.
 
     S scales the mean diagonal at the unconstrained estimate `free` (p,) to one.
+
+    Args:
+        inertia: (K, n, n, p) inertia matrices M(q_k) = inertia[k] β.
+        free: (p,) unconstrained estimate.
+        least: lower bound of the eigenvalues of S M(q) S.
+        likely: indices of matrices that were binding in a similar problem; None: unknown.
     """
     if not len(inertia):
         return None

@@ -71,7 +71,13 @@ def weigh(size: np.ndarray, joints: np.ndarray, gated: bool = True) -> np.ndarra
 
 @lru_cache
 def consistency(joints: int) -> float:
-    """Return c = E w / E[w d² / n], with which c Σ w e eᵀ / Σ w is a consistent estimate of S for normal residuals."""
+    """Return c = E w / E[w d² / n], with which c Σ w e eᵀ / Σ w is a consistent estimate of S for normal residuals.
+
+    S is the noise covariance of a sample, e its residual, d its Mahalanobis size, w(d) its weight.
+
+    Args:
+        joints: number n of joints in use in a sample.
+    """
     square = _quantiles(joints)
     size = np.sqrt(square)
     w = _weights(size, joints)
@@ -81,9 +87,10 @@ def consistency(joints: int) -> float:
 def variance_factor(size: np.ndarray, joints: np.ndarray) -> float:
     """Return the factor v of the weighted fit's covariance cov(x) = v (Σ w_k W_kᵀ S⁻¹ W_k)⁻¹.
 
-    cov(x) = a / b² (Σ W_kᵀ S⁻¹ W_k)⁻¹ with a = mean w² d² / n and b = mean(w + w' d / n) over the samples (Huber &
-    Ronchetti 2009, section 7.6), and the sum over all samples is the weighted sum over mean w. The step of w at the
-    gate is neglected, an error of a few per mille.
+    W_k (n, p) is the regressor of sample k, S (n, n) the noise covariance, w_k the weight. cov(x) = a / b² (Σ W_kᵀ S⁻¹
+    W_k)⁻¹ with a = mean w² d² / n and b = mean(w + w' d / n) over the samples (Huber & Ronchetti 2009, section 7.6),
+    and the sum over all samples is the weighted sum over mean w. The step of w at the gate is neglected, an error of a
+    few per mille.
 
     Args:
         size: (N,) Mahalanobis sizes.
@@ -113,7 +120,11 @@ def _weights(size: np.ndarray, joints: int, gated: bool = True) -> np.ndarray:
 
 @lru_cache
 def _quantiles(joints: int) -> np.ndarray:
-    """Return 4000 equally probable values of d² for `joints` joints, with which expectations are computed."""
+    """Return 4000 equally probable values of d², the squared Mahalanobis size of normal residuals.
+
+    Args:
+        joints: number of joints in a sample, the degrees of freedom of d².
+    """
     return np.asarray(chdtri(joints, 1.0 - (np.arange(4000) + 0.5) / 4000))
 
 
@@ -129,7 +140,7 @@ class Samples:
     Attributes:
         names, units: names and units of the p parameters.
         matrix: (N, n, p) regressors.
-        target: (N, n) torques.
+        target: (N, n) torques [N m or N].
         present: (N, n) mask of rows in use; rows of slow joints may be unused in single samples.
     """
 
@@ -179,7 +190,7 @@ def stack(
 
     Args:
         matrix: (N, n, p) regressors.
-        target: (N, n) torques.
+        target: (N, n) torques [N m or N].
         present: (N, n) mask of rows in use; None: all.
         names, units: names and units of the p parameters; None: x1, x2, … without units.
 
@@ -207,16 +218,16 @@ def stack(
 def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np.ndarray] | None = None) -> SampleFit:
     """Estimate x and S by iteratively reweighted least squares over whole samples (Maronna 1976), with a gate.
 
-    S, weights and x are computed in turn until x changes by less than 1e-4 of its standard deviation. The iteration
-    starts from a Cauchy fit of single rows with median-based standard deviations, because outliers would increase a
-    covariance estimated from all samples and so remain hidden. The covariance of x is that of the M-estimator,
-    `variance_factor`.
+    x (p,) are the parameters, S (n, n) is the noise covariance across joints. S, weights and x are computed in turn
+    until x changes by less than 1e-4 of its standard deviation. The iteration starts from a Cauchy fit of single rows
+    with median-based standard deviations, because outliers would increase a covariance estimated from all samples and
+    so remain hidden. The covariance of x is that of the M-estimator, `variance_factor`.
 
     Args:
         data: the samples.
         inflation: variance inflation >= 1 of all joints, explained in the module `linear`.
-        solve: function of a triangle [R z; 0 ρ] that returns x (p,), e.g. under constraints, which the covariance
-            ignores; None: least squares.
+        solve: function of the triangle [R z; 0 ρ] of the weighted least-squares problem that returns x (p,), e.g. under
+            constraints, which the covariance ignores; None: least squares.
 
     Raises:
         NotConverged: if the weights do not converge.
@@ -247,6 +258,9 @@ def row_irls(data: Samples) -> LinearFit:
 
     This is for outliers of single joints. The covariance is that of weighted rows, without the factor of the
     M-estimator.
+
+    Args:
+        data: the samples; ρ is the residual of a row.
 
     Raises:
         NotConverged: if the weights do not converge.
@@ -296,7 +310,13 @@ def _pack(
 
 
 def _sizes(residual: np.ndarray, noise: np.ndarray, present: np.ndarray) -> np.ndarray:
-    """Return the Mahalanobis sizes (e_kᵀ S⁻¹ e_k)^½ (N,) of residuals (N, n), computed with the rows in use."""
+    """Return the Mahalanobis sizes (e_kᵀ S⁻¹ e_k)^½ (N,) of residuals (N, n), computed with the rows in use.
+
+    Args:
+        residual: (N, n) residuals.
+        noise: (n, n) noise covariance S.
+        present: (N, n) mask of rows in use.
+    """
     patterns, pattern = _roots(noise, present)
     result = np.empty(len(residual))
     for k, root in enumerate(patterns):
@@ -310,6 +330,10 @@ def _roots(noise: np.ndarray, present: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
     The matrices (k, n, n) are L⁻¹ with L Lᵀ = S for the rows in use, and zero for the others; the pattern is an index
     (N,).
+
+    Args:
+        noise: (n, n) noise covariance S.
+        present: (N, n) mask of rows in use.
     """
     patterns, pattern_index = np.unique(present, axis=0, return_inverse=True)
     roots = np.zeros((len(patterns), *noise.shape))
@@ -322,7 +346,13 @@ def _roots(noise: np.ndarray, present: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _factor(data: Samples, noise: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Return the R factor of the whitened and weighted [W y], computed from blocks of samples."""
+    """Return the R factor of the whitened and weighted [W y], computed from blocks of samples.
+
+    Args:
+        data: the samples.
+        noise: (n, n) noise covariance, by which rows are whitened.
+        weights: (N,) weights of the samples.
+    """
     roots, pattern = _roots(noise, data.present)
     p = len(data.names)
     total = empty(data.names)
@@ -336,7 +366,12 @@ def _factor(data: Samples, noise: np.ndarray, weights: np.ndarray) -> np.ndarray
 
 
 def _triangles(data: Samples, weights: np.ndarray) -> Triangles:
-    """Return the R factors of all rows in use, one group per joint, weighted by `weights` (N, n)."""
+    """Return the R factors of all rows in use, one group per joint, weighted by `weights` (N, n).
+
+    Args:
+        data: the samples.
+        weights: (N, n) weights of the rows.
+    """
     root = np.sqrt(weights)
     groups = data.target.shape[1]
     total = empty(data.names, data.units, groups)
@@ -351,7 +386,12 @@ def _triangles(data: Samples, weights: np.ndarray) -> Triangles:
 
 
 def _spreads(data: Samples, residual: np.ndarray) -> np.ndarray:
-    """Return the robust standard deviation of each joint's residuals (n,), always above zero."""
+    """Return the robust standard deviation of each joint's residuals (n,), always above zero.
+
+    Args:
+        data: the samples.
+        residual: (N, n) residuals.
+    """
     spreads = []
     for joint_residual, present in zip(residual.T, data.present.T):
         spreads.append(robust.spread(joint_residual[present]))
@@ -363,6 +403,10 @@ def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
     """Return the share 1 - h_j / r_j (n,) of joint j's noise variance that remains in its r_j residuals after the fit.
 
     h_j is the leverage of the joint's rows.
+
+    Args:
+        data: the samples.
+        std: (n,) standard deviations of the joints' residuals [N m or N].
     """
     triangles = _triangles(data, np.ones(data.target.shape))
     inverse = solve_triangle(combine(triangles, std), data.names)[1]
@@ -371,7 +415,11 @@ def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
 
 
 def _consistent(data: Samples) -> np.ndarray:
-    """Return the factor (N,) of `consistency` for each sample, by its number of joints in use."""
+    """Return the factor (N,) of `consistency` for each sample, by its number of joints in use.
+
+    Args:
+        data: the samples.
+    """
     # By the number of joints in use; a sample without any has no weight.
     factors = [0.0]
     factors += [consistency(count) for count in range(1, data.target.shape[1] + 1)]
@@ -381,7 +429,13 @@ def _consistent(data: Samples) -> np.ndarray:
 def _scatter(data: Samples, residual: np.ndarray, scaled: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return the noise covariance S_ij = Σ c w e_i e_j / Σ w over samples with both rows in use.
 
-    Eigenvalues are kept positive. `scaled` (N,) are the products c w.
+    Eigenvalues are kept positive.
+
+    Args:
+        data: the samples.
+        residual: (N, n) residuals e.
+        scaled: (N,) products c w, with c of `consistency`.
+        weights: (N,) weights w.
     """
     present = data.present.astype(float)
     total_weight = np.maximum((present * weights[:, None]).T @ present, 1e-300)

@@ -69,6 +69,10 @@ def find_prior_bodies(chain: Chain, model: IdentificationModel) -> Iterator[Prio
     """Yield the candidate priors, among which the evidence selects.
 
     They are the CAD values alone, or without these, rods between the joints with several total masses.
+
+    Args:
+        chain: the arm, with its inertias if it has any.
+        model: its model, whose bodies get a prior.
     """
     is_payload = model.bodies.coordinates < 0
     if chain.inertias is not None and chain.inertias[:, 9].max() > 0.0:
@@ -82,7 +86,13 @@ def find_prior_bodies(chain: Chain, model: IdentificationModel) -> Iterator[Prio
 
 
 def _cad(chain: Chain, model: IdentificationModel, is_payload: np.ndarray) -> PriorBodies:
-    """Return the prior of a description's inertias, with missing and inconsistent ones replaced."""
+    """Return the prior of a description's inertias, with missing and inconsistent ones replaced.
+
+    Args:
+        chain: the arm with its inertias.
+        model: its model.
+        is_payload: (B,) mask of the bodies that are payloads.
+    """
     described = standard_parameters(chain).reshape(-1, 10)
     bodies = np.zeros((model.bodies.count, 10))
     bodies[: len(described)] = described
@@ -149,12 +159,21 @@ class BodyCost:
         return np.concatenate([np.ones(10 * self.bodies, bool), self.sizes > 0.0])
 
     def weights(self, gamma: float) -> np.ndarray:
-        """Return the prior weight of each body (B,) for the common weight γ."""
+        """Return the prior weight of each body (B,) for the common weight γ.
+
+        Args:
+            gamma: γ, weight of the divergence between a body and its prior.
+        """
         return self.lift * np.where(self.drawn, gamma, WEAK)
 
 
 def make_problem(information: Information, references: PriorBodies) -> BodyCost:
-    """Return the cost function of an identified model; the recorded torque gives prior sizes of drive terms."""
+    """Return the cost function of an identified model; the recorded torque gives prior sizes of drive terms.
+
+    Args:
+        information: identified model with the information of its data.
+        references: the prior bodies.
+    """
     model = information.dynamics.model
     inertial = 10 * model.bodies.count
     matrix = information.factor[:, :-1]
@@ -193,8 +212,9 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
 
     Args:
         problem: data, prior bodies and drive terms.
-        spared: index of a body (or B plus the index of a drive term) that may be inconsistent; None: none may.
-        pull: weight γ of the Euclidean prior; 0: no prior.
+        spared: index of a body (or the number of bodies plus the index of a drive term) that may be inconsistent; None:
+            none may.
+        pull: weight γ of the Euclidean prior towards the prior bodies; 0: no prior.
 
     Raises:
         NotConverged: if Clarabel finds no optimum.
@@ -227,7 +247,12 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
 
 
 def _euclidean_prior(problem: BodyCost, pull: float) -> np.ndarray:
-    """Return the Euclidean prior of weight `pull` as rows of [W y], in the coordinates of `_coordinates`."""
+    """Return the Euclidean prior of weight `pull` as rows of [W y], in the coordinates of `_coordinates`.
+
+    Args:
+        problem: data, prior bodies and drive terms.
+        pull: weight γ.
+    """
     basis = pseudo_inertia.UNITS.reshape(10, 16).T
     identity = np.eye(4).ravel()
     blocks, targets = [], []
@@ -247,6 +272,11 @@ def blame(problem: BodyCost, information: Information, count: int = 3) -> tuple[
     """Return the `count` bodies and terms whose constraints cost most, each with the distance without its constraint.
 
     The first entry of a pair is the name; distances are Mahalanobis distances from the data's optimum.
+
+    Args:
+        problem: data, prior bodies and drive terms.
+        information: identified model, which provides the names.
+        count: number of entries.
     """
     model = information.dynamics.model
     constraints = [(f"body {label}", i) for i, label in enumerate(model.bodies.labels)]
@@ -266,6 +296,9 @@ def _coordinates(problem: BodyCost) -> np.ndarray:
 
     ξ_i are the entries of Q_i in an orthonormal basis, with P_i = L Q_i Lᵀ and P_i⁰ = L Lᵀ; u are the drive terms in
     units of their prior sizes.
+
+    Args:
+        problem: data, prior bodies P_i⁰ and drive terms.
     """
     roots = np.linalg.cholesky(problem.references)[:, None]
     pseudo = roots @ pseudo_inertia.UNITS @ roots.transpose(0, 1, 3, 2)

@@ -58,7 +58,7 @@ class Information(Frozen):
 
     @property
     def best(self) -> float:
-        """Minimum of ‖R β - z‖² over all β, including physically inconsistent ones."""
+        """Minimum of ‖R β - z‖² (data's rows `factor`) over all β (b,), including physically inconsistent ones."""
         matrix = self.factor[:, :-1]
         target = self.factor[:, -1]
         unit = np.linalg.norm(matrix, axis=0)
@@ -158,7 +158,13 @@ def read(folder: str | Path, model: tuple[Chain, Dynamics] | None = None) -> Inf
 
 
 def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], standard: tuple[str, ...]) -> np.ndarray:
-    """Return the regrouping matrix T (b, p) from standard parameters; rows of additional friction are unit rows."""
+    """Return the regrouping matrix T (b, p) from standard parameters; rows of additional friction are unit rows.
+
+    Args:
+        names: names of the b estimated parameters.
+        groups: for each base parameter, its standard parameters and their coefficients.
+        standard: names of the p standard parameters.
+    """
     column_of = {name: column for column, name in enumerate(standard)}
     transform = np.zeros((len(names), len(standard)))
     for row, name in enumerate(names):
@@ -169,5 +175,10 @@ def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], stan
 
 
 def write(identification: Identification, folder: Path) -> None:
-    """Write the R factor [R z] of an identification's data to ``information.csv`` in `folder`."""
+    """Write the R factor [R z] of an identification's data to ``information.csv`` in `folder`.
+
+    Args:
+        identification: the result in memory.
+        folder: an existing folder.
+    """
     files.write_numbers(folder / INFORMATION, (*identification.names, "target"), _information(identification))

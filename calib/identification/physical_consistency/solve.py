@@ -277,14 +277,24 @@ def solve(problem: BodyCost, gamma: float, start: np.ndarray | None = None) -> n
 
 
 def _reference(problem: BodyCost) -> np.ndarray:
-    """Return the standard parameters (p,) at which all priors are smallest."""
+    """Return the standard parameters (p,) at which all priors are smallest.
+
+    Args:
+        problem: the cost, with prior bodies and drive terms.
+    """
     free_terms = np.where(problem.positive, problem.sizes, 0.0)
     terms = np.where(problem.sizes > 0.0, free_terms, problem.fixed)
     return np.concatenate([pseudo_inertia.to_standard(problem.references).ravel(), terms])
 
 
 def _descend(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
-    """Return the optimum (p,) by Newton's method from `values`, with steps halved until the cost decreases (Armijo)."""
+    """Return the optimum (p,) by Newton's method from `values`, with steps halved until the cost decreases (Armijo).
+
+    Args:
+        problem: the cost.
+        gamma: prior weight γ.
+        values: (p,) physically consistent parameters to start from.
+    """
     free = problem.free
     settled = SETTLED if problem.lift == 1.0 else 0.1 * problem.lift
     current_cost = cost(problem, gamma, values)
@@ -309,7 +319,13 @@ def _descend(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
 
 
 def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
-    """Return the cost J(χ) of the equation in the module's docstring; infinite for inconsistent parameters."""
+    """Return the cost J(χ), data term plus prior, by the module's docstring; infinite for inconsistent parameters χ.
+
+    Args:
+        problem: the cost.
+        gamma: prior weight γ.
+        values: (p,) standard parameters χ.
+    """
     residual = problem.factor[:, :-1] @ values - problem.factor[:, -1]
     pseudo = pseudo_inertia.from_standard(_bodies(problem, values))
     definite = np.linalg.eigvalsh(_scaled(problem, pseudo))[:, 0] > 0.0
@@ -330,7 +346,13 @@ def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
 
 
 def derivatives(problem: BodyCost, gamma: float, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gradient (p,) and Hessian (p, p) of the cost at parameters `values` (p,)."""
+    """Return gradient (p,) and Hessian (p, p) of the cost at parameters `values` (p,).
+
+    Args:
+        problem: the cost.
+        gamma: prior weight γ.
+        values: (p,) standard parameters χ.
+    """
     columns = problem.factor[:, :-1]
     target = problem.factor[:, -1]
     slope = columns.T @ (columns @ values - target)
@@ -359,7 +381,13 @@ def derivatives(problem: BodyCost, gamma: float, values: np.ndarray) -> tuple[np
 
 
 def _evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
-    """Return the evidence log p(data | γ) by Laplace's approximation at the optimum `values`, up to a constant."""
+    """Return the evidence log p(data | γ) by Laplace's approximation at the optimum `values`, up to a constant.
+
+    Args:
+        problem: the cost.
+        gamma: prior weight γ.
+        values: (p,) optimum for this weight.
+    """
     free = problem.free
     _, curvature = derivatives(problem, gamma, values)
     curvature = curvature[np.ix_(free, free)]
@@ -377,7 +405,13 @@ def _evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
 
 
 def _covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
-    """Return the inverse of the cost's Hessian (p, p) at `values`; zero for fixed parameters."""
+    """Return the inverse of the cost's Hessian (p, p) at `values`; zero for fixed parameters.
+
+    Args:
+        problem: the cost.
+        gamma: prior weight γ.
+        values: (p,) optimum for this weight.
+    """
     free = np.ix_(problem.free, problem.free)
     _, curvature = derivatives(problem, gamma, values)
     covariance = np.zeros((len(values), len(values)))
@@ -410,18 +444,34 @@ def _solved(curvature: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _bodies(problem: BodyCost, values: np.ndarray) -> np.ndarray:
-    """Return the standard parameters (B, 10) of the bodies among all parameters (p,)."""
+    """Return the standard parameters (B, 10) of the bodies among all parameters (p,).
+
+    Args:
+        problem: the cost, which gives the number B of bodies.
+        values: (p,) all parameters.
+    """
     return values[: 10 * problem.bodies].reshape(-1, 10)
 
 
 def _scaled(problem: BodyCost, pseudo: np.ndarray) -> np.ndarray:
-    """Return scaled pseudo-inertias L⁻¹ P L⁻ᵀ (B, 4, 4), P⁰ = L Lᵀ, which are of order one and definite if P is."""
+    """Return scaled pseudo-inertias L⁻¹ P L⁻ᵀ (B, 4, 4), P⁰ = L Lᵀ, which are of order one and definite if P is.
+
+    Args:
+        problem: the cost, with prior pseudo-inertias P⁰.
+        pseudo: (B, 4, 4) pseudo-inertias P.
+    """
     inverse = np.linalg.inv(np.linalg.cholesky(problem.references))
     return inverse @ pseudo @ inverse.transpose(0, 2, 1)
 
 
 def _notes(model: IdentificationModel, problem: BodyCost, values: np.ndarray) -> Sequence[str]:
-    """Return remarks on bodies thinner than a millimetre."""
+    """Return remarks on bodies thinner than a millimetre.
+
+    Args:
+        model: the model, which provides the bodies' names.
+        problem: the cost.
+        values: (p,) parameters.
+    """
     notes = []
     for label, body in zip(model.bodies.labels, _bodies(problem, values)):
         if pseudo_inertia.margin(body) < THIN_MARGIN:

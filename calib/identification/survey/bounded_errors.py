@@ -23,11 +23,15 @@ class _GeneralisedTLS(Method):
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return x of Σ_k (W_kᵀ Ω⁻¹ W_k - C_k) x = Σ_k W_kᵀ Ω⁻¹ y_k.
 
-        C_k = E[ΔW_kᵀ Ω⁻¹ ΔW_k] = Σ_i D_kiᵀ G D_ki / σ_i², where D_ki are the derivatives of row i of W by q, v, a, and
-        G is the covariance of their noise (`maximum_likelihood.noise_of_states`). x is the smallest generalised
-        singular vector of [W y] for the torque noise of the residuals (Van Huffel & Vandewalle 1989; Fuller 1987,
-        section 2.2). The covariance is that of theorem 2.2.1 there, with autocorrelated residuals. The method `ml`
-        weights each sample by its own noise and is more accurate if that noise is large.
+        W_k and y_k are regressor and torques of sample k, Ω is the covariance of the torque noise. C_k = E[ΔW_kᵀ Ω⁻¹
+        ΔW_k] = Σ_i D_kiᵀ G D_ki / σ_i², where D_ki are the derivatives of row i of W by q, v, a, and G is the
+        covariance of their noise (`maximum_likelihood.noise_of_states`). x is the smallest generalised singular vector
+        of [W y] for the torque noise of the residuals (Van Huffel & Vandewalle 1989; Fuller 1987, section 2.2). The
+        covariance is that of theorem 2.2.1 there, with autocorrelated residuals. The method `ml` weights each sample by
+        its own noise and is more accurate if that noise is large.
+
+        Args:
+            problem: data and settings.
 
         Raises:
             UsageError: for a model whose rows have no derivatives by q, v and a.
@@ -73,7 +77,12 @@ class _GeneralisedTLS(Method):
 
 
 def column_noise(states: NoisyStates, std: np.ndarray) -> np.ndarray:
-    """Return C = Σ_k E[ΔW_kᵀ Ω⁻¹ ΔW_k] (p, p) due to the noise in q, v and a, where Ω = diag(std²), std (rows,)."""
+    """Return C = Σ_k E[ΔW_kᵀ Ω⁻¹ ΔW_k] (p, p) due to the noise in q, v and a, where Ω = diag(std²), std (rows,).
+
+    Args:
+        states: all samples with noisy states; ΔW_k is the error of the regressor of sample k.
+        std: (rows,) standard deviations of the torques' noise [N m or N].
+    """
     p = states.matrix.shape[2]
     total = np.zeros((p, p))
     for part in states.parts:
@@ -104,6 +113,9 @@ class _SetMembership(Method):
         The bound e of each joint is the largest residual of weighted least squares, so that its estimate is in the set
         (our choice; Milanese & Belforte 1982 assume a given e). If no torque error is larger, the intervals certainly
         contain the true values; they are wide: 20 to 130 σ of weighted least squares in white noise.
+
+        Args:
+            problem: data and settings.
         """
         return attempted(self.name, problem, lambda: self._estimate(problem))
 

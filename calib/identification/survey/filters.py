@@ -52,6 +52,9 @@ class _KalmanFilter(Method):
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate of the parameters after the last sample.
 
+        Args:
+            problem: data and settings.
+
         Raises:
             UsageError: for a model other than a serial arm with motor torques.
         """
@@ -124,7 +127,11 @@ class _State:
 
 
 def _inertia(problem: IdentificationProblem) -> np.ndarray:
-    """Return the mean inertia (n,) of each joint, from the regression of its torque on its acceleration."""
+    """Return the mean inertia (n,) of each joint, from the regression of its torque on its acceleration.
+
+    Args:
+        problem: data and settings, with the recordings.
+    """
     n = problem.cases[0].motion.n
     cross = np.zeros(n)
     size = np.full(n, 1e-12)
@@ -139,6 +146,11 @@ def _inertia(problem: IdentificationProblem) -> np.ndarray:
 
 def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndarray) -> None:
     """Compute accelerations along the recordings, to check that a robot with parameters `values` can be simulated.
+
+    Args:
+        robot: model that is simulated.
+        problem: data and settings, with the recordings.
+        values: (p,) parameters.
 
     Raises:
         CalibError: if it cannot.
@@ -191,7 +203,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
         before: parameters before the segment.
         case: the recording.
         part: slice of the segment.
-        noise: (n,) standard deviation of the torque noise of a sample.
+        noise: (n,) standard deviation of the torque noise of a sample [N m or N].
     """
     motion = case.motion
     thin = _thin(case)
@@ -276,9 +288,9 @@ class _Stepping:
 
         Args:
             before: belief before the step.
-            tau: (s, n) torques.
+            tau: (s, n) torques [N m or N].
             period: duration of each torque [s].
-            torque: (n,) standard deviation of the torque noise.
+            torque: (n,) standard deviation of the torque noise [N m or N].
 
         Raises:
             CannotSimulate: if not even sigma points near the mean can be simulated.
@@ -324,7 +336,14 @@ class _Stepping:
         return result
 
     def _noise(self, gain: np.ndarray, period: float, torque: np.ndarray, size: int) -> np.ndarray:
-        """Return the effect N (L, n) of torque noise on the state during one step, with L = `size`."""
+        """Return the effect N (L, n) of torque noise on the state during one step, with L = `size`.
+
+        Args:
+            gain: (n, n) M⁻¹, inverse of the inertia matrix.
+            period: duration of the step [s].
+            torque: (n,) standard deviation of the torque noise.
+            size: number L of components of the state.
+        """
         result = np.zeros((size, self.n))
         result[: self.n] = 0.5 * period**2 * gain * torque
         result[self.n : 2 * self.n] = period * gain * torque
@@ -344,14 +363,24 @@ _DESCRIPTIONS = {
 
 
 def _filter(rule: str, source: str) -> _KalmanFilter:
-    """Return the method of a rule in the form that stores the covariance."""
+    """Return the method of a rule in the form that stores the covariance.
+
+    Args:
+        rule: ``ekf``, ``ukf`` or ``cdkf``.
+        source: authors and year.
+    """
     tuned = (*_TUNED, "α = 0.1") if rule == "ukf" else _TUNED
     description = _DESCRIPTIONS[rule]
     return _KalmanFilter(rule, _ASSUMES, Filter(rule, False), source=source, description=description, tunes=tuned)
 
 
 def _root_filter(plain: _KalmanFilter, source: str) -> _KalmanFilter:
-    """Return the square-root form of a filter method, which stores the root of the covariance."""
+    """Return the square-root form of a filter method, which stores the root of the covariance.
+
+    Args:
+        plain: the method that stores the covariance.
+        source: authors and year of the square-root form.
+    """
     root = Filter(plain.kind.rule, True)
     return replace(plain, name=f"sr{plain.name}", kind=root, source=source, description="the same, square-root form")
 

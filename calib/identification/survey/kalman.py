@@ -76,13 +76,25 @@ class Belief:
 
 
 def believe(mean: np.ndarray, sigma: np.ndarray, kind: Filter) -> Belief:
-    """Return the belief with mean (L,) and independent components of standard deviations sigma (L,)."""
+    """Return the belief with mean (L,) and independent components of standard deviations sigma (L,).
+
+    Args:
+        mean: (L,) mean of the state.
+        sigma: (L,) standard deviations.
+        kind: form of the covariance.
+    """
     spread = np.diag(sigma if kind.root else sigma**2)
     return Belief(np.array(mean, dtype=float), spread, kind.root)
 
 
 def points(before: Belief, kind: Filter, narrower: float = 1.0) -> np.ndarray:
-    """Return the sigma points (2 L + 1, L) of a belief, the mean first; `narrower` is a factor of their distance."""
+    """Return the sigma points (2 L + 1, L) of a belief, the mean first.
+
+    Args:
+        before: mean and covariance of a state of L components.
+        kind: rule of the filter, which gives the distance of the points from the mean.
+        narrower: factor of this distance.
+    """
     deviations = before.deviations
     gamma = narrower * _gamma(kind, len(before.mean))
     steps = gamma * deviations.T
@@ -134,7 +146,8 @@ def linearly_predicted(before: Belief, mean: np.ndarray, slopes: np.ndarray, noi
 def corrected(before: Belief, measured: np.ndarray, rows: int, std: np.ndarray) -> tuple[Belief, float]:
     """Return the belief corrected by a measurement of its first `rows` components, and the innovation's size.
 
-    The size is eᵀ (H P Hᵀ + R)⁻¹ e for innovation e; its mean is `rows` if the filter's noise levels are correct.
+    The size is eᵀ (H P Hᵀ + R)⁻¹ e for the innovation e (measured minus expected), with H P Hᵀ the covariance of the
+    measured components before and R = diag(std²); its mean is `rows` if the filter's noise levels are correct.
 
     Args:
         before: belief before the measurement.
@@ -174,7 +187,13 @@ def _packed(
 ) -> Belief:
     """Return the belief with covariance P = D Dᵀ + N Nᵀ + weight · extra extraᵀ.
 
-    D are the `deviations` (L, m) and N the `noise` (L, k).
+    Args:
+        mean: (L,) mean of the state.
+        deviations: D (L, m).
+        noise: N (L, k).
+        kind: form of the covariance.
+        weight: weight of the last part.
+        extra: (L,) vector of the last part.
     """
     wide = np.hstack([deviations, noise, np.sqrt(weight) * extra[:, None]])
     if kind.root:
@@ -184,6 +203,6 @@ def _packed(
 
 
 def _triangle(wide: np.ndarray) -> np.ndarray:
-    """Return the lower triangular matrix L with L Lᵀ = A Aᵀ, from A (L, k) by QR."""
+    """Return the lower triangular matrix L with L Lᵀ = A Aᵀ, from A = `wide` (L, k) by QR."""
     triangle = scipy.linalg.qr(wide.T, mode="r", check_finite=False, overwrite_a=True)[0]
     return np.asarray(triangle)[: len(wide)].T

@@ -130,7 +130,7 @@ class NoisyStates:
         columns: (p,) indices of the model's columns.
         smooth: (p,) mask of columns that can be differentiated by q, v and a.
         matrix: (M, n, p) observation matrix.
-        target: (M, n) torques.
+        target: (M, n) torques [N m or N].
         present: (M, n) mask of rows in use.
         parts: states of each recording.
     """
@@ -145,7 +145,12 @@ class NoisyStates:
 
 
 def noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> NoisyStates:
-    """Return all samples of a problem, with the covariance of the noise in q, v and a of each recording."""
+    """Return all samples of a problem, with the covariance of the noise in q, v and a of each recording.
+
+    Args:
+        problem: data and settings.
+        model: model with all friction terms.
+    """
     samples, (model, columns) = samples_of(problem), with_friction(problem, model)
     is_smooth = [term is None or term.form.slopes for term in problem.terms]
     smooth = np.array(is_smooth, dtype=bool)
@@ -171,6 +176,10 @@ def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
 
     It is computed from the impulse responses of low-pass, differences and decimation; the noise level is that of the
     log's spectrum.
+
+    Args:
+        motion: motion of one recording, with its filters.
+        decimator: filter and decimation of the rows.
     """
     result = np.empty((motion.n, 3, 3))
     cutoffs = np.stack([motion.cutoff, motion.velocity_cutoff], axis=1)
@@ -190,7 +199,13 @@ def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
 
 
 def _slopes(task: NoisyStates, part: _Recording, values: np.ndarray) -> np.ndarray:
-    """Return B (M, n, 3, n): the derivatives of the torques W β (first n) by q, v and a of each joint (3, n)."""
+    """Return B (M, n, 3, n): the derivatives of the torques W β (first n) by q, v and a of each joint (3, n).
+
+    Args:
+        task: all samples.
+        part: states of one recording, with M samples.
+        values: β (p,), parameters.
+    """
     differentiable = task.smooth & (part.present > 0.0)
     order = np.argsort(task.columns[differentiable])
     columns = task.columns[differentiable][order]
@@ -211,7 +226,13 @@ def _slopes(task: NoisyStates, part: _Recording, values: np.ndarray) -> np.ndarr
 
 
 def _residuals(task: NoisyStates, part: _Recording, values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the residuals r (M, n) of a recording, with G Bᵀ (M, 3, n, n) and B G Bᵀ (M, n, n)."""
+    """Return the residuals r (M, n) of a recording, with G Bᵀ (M, 3, n, n) and B G Bᵀ (M, n, n).
+
+    Args:
+        task: all samples.
+        part: states of one recording, with M samples.
+        values: (p,) parameters; B are the derivatives of the torques by q, v, a, and G is the covariance of these.
+    """
     by_state = _slopes(task, part, values)
     spread = np.einsum("kxj,mrxj->mkjr", part.noise.transpose(1, 2, 0), by_state)
     residual = task.target[part.own] - task.matrix[part.own] @ values
@@ -288,7 +309,13 @@ class _Round:
 
 
 def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
-    """Return the next iteration's result, from parameters (p,) and torque noise (n,)."""
+    """Return the next iteration's result, from parameters (p,) and torque noise (n,).
+
+    Args:
+        task: all samples.
+        values: (p,) parameters.
+        noise: (n,) variance of the torque noise.
+    """
     p = len(values)
     cross = np.zeros((p, p))
     score = np.zeros(p)
@@ -315,7 +342,15 @@ def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
 
 
 def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarray:
-    """Return W(x + error) - W(x) (M, n, p) for errors (M, 3, n) of the states; zero in columns without derivative."""
+    """Return the change W(x + error) - W(x) (M, n, p) of the regressor W for errors of the states x.
+
+    It is zero in columns without derivative.
+
+    Args:
+        task: all samples.
+        part: states x of one recording, with M samples.
+        error: (M, 3, n) errors of q, v and a.
+    """
     out = np.zeros_like(task.matrix[part.own])
     smooth = np.flatnonzero(task.smooth)
     for start in range(0, len(part.q), BLOCK):
@@ -336,7 +371,13 @@ def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarra
 
 
 def _packed(problem: IdentificationProblem, iteration: _Round, noise: np.ndarray) -> LinearFit:
-    """Return the fit of the last iteration; its covariance accounts for autocorrelated residuals."""
+    """Return the fit of the last iteration; its covariance accounts for autocorrelated residuals.
+
+    Args:
+        problem: data and settings.
+        iteration: result of the last iteration.
+        noise: (n,) variance of the torque noise.
+    """
     std = np.sqrt(noise)
     plain = wls(problem.pooled, std)
     p = len(iteration.values)

@@ -61,9 +61,10 @@ def hopfield(
 
         u̇ = -Wᵀ W x + Wᵀ y,    x = α tanh(u / 5)
 
-    by Euler steps (Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004; Leboutet et al. 2021). At rest x is the
-    ordinary least-squares estimate, if no neuron is saturated. The survey tunes the step for each robot, 3e-8 to 1e-6;
-    here it is half of the largest stable step, times `rate` (our choice).
+    by Euler steps, with W (r, p) the observation matrix and y (r,) the torques (Tank & Hopfield 1986; Atencia, Joya &
+    Sandoval 2004; Leboutet et al. 2021). At rest x is the ordinary least-squares estimate, if no neuron is saturated.
+    The survey tunes the step for each robot, 3e-8 to 1e-6; here it is half of the largest stable step, times `rate`
+    (our choice).
 
     Args:
         factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of [W y], not weighted.
@@ -117,7 +118,11 @@ class _Network(Method):
     steps: int = STEPS
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the trained network; its covariance includes the training error."""
+        """Return the estimate of the trained network; its covariance includes the training error.
+
+        Args:
+            problem: data and settings.
+        """
         return attempted(self.name, problem, lambda: self._estimate(problem))
 
     def _estimate(self, problem: IdentificationProblem) -> MethodEstimate:
@@ -138,7 +143,12 @@ class _Network(Method):
         )
 
     def trained(self, problem: IdentificationProblem, start: np.ndarray) -> tuple[np.ndarray, int]:
-        """Return the network's weights (p,) after training from start values (p,), and the number of steps."""
+        """Return the network's weights (p,) after training from start values (p,), and the number of steps.
+
+        Args:
+            problem: data and settings.
+            start: (p,) first weights.
+        """
         raise NotImplementedError
 
 
@@ -161,7 +171,13 @@ class _Hopfield(_Network):
 
 
 def _off(fit: LinearFit, values: np.ndarray, group_std: np.ndarray) -> LinearFit:
-    """Return a fit with other values (p,), with the outer product of their differences added to its covariance."""
+    """Return a fit with other values (p,), with the outer product of their differences added to its covariance.
+
+    Args:
+        fit: the fit of ordinary least squares.
+        values: (p,) other values.
+        group_std: standard deviations of their residuals, by torque row.
+    """
     away = values - fit.estimate.values
     covariance = fit.estimate.covariance + np.outer(away, away)
     estimate = replace(fit.estimate, values=values, covariance=covariance)

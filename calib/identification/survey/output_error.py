@@ -187,6 +187,9 @@ class _Comparison:
     def simulated(self, values: np.ndarray) -> None:
         """Simulate all loops with parameters (p,), to check that this is possible.
 
+        Args:
+            values: (p,) parameters of the problem.
+
         Raises:
             CalibError: if a loop cannot be simulated.
         """
@@ -200,7 +203,11 @@ class _Comparison:
             plant.run(controller, loop.reference, Sensing(every=loop.every))
 
     def linearised(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (M, r), zero if not in use, and the Jacobian (M, r, p) of the simulated signals."""
+        """Return residuals (M, r), zero if not in use, and the Jacobian (M, r, p) of the simulated signals.
+
+        Args:
+            values: (p,) parameters, at which the signals are simulated.
+        """
         residuals = []
         slopes = []
         noise = self.noise or (None,) * len(self.loops.pairs)
@@ -245,7 +252,11 @@ class _Comparison:
         return np.concatenate(residuals), np.concatenate(slopes)
 
     def with_noise(self, values: np.ndarray) -> _Comparison:
-        """Return the comparison with the recordings' noise in the loop, as their torques answer it."""
+        """Return the comparison with the recordings' noise in the loop, as their torques answer it.
+
+        Args:
+            values: (p,) parameters with which the loops are simulated.
+        """
         if self.robot.steps is not None:
             return replace(self, noise=(None,) * len(self.loops.pairs))
         noise: list[np.ndarray | None] = []
@@ -267,7 +278,16 @@ class _Comparison:
         relative: np.ndarray | None,
         drawn: np.ndarray | None,
     ) -> Sensitivities:
-        """Return the mean of runs with noise `drawn` in the loop and with its opposite; one run where there is none."""
+        """Return the mean of runs with noise `drawn` in the loop and with its opposite; one run where there is none.
+
+        Args:
+            values: (p,) parameters of the problem.
+            case: the recording, which has the payloads.
+            controller: controller of the robot.
+            loop: loop of the recording.
+            relative: (n, p) derivatives of the logarithm of the gains by the parameters; None: the gains are constant.
+            drawn: (N, n) noise of the measured positions [rad or m]; None for no noise.
+        """
         self.count[0] += 1
         first = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative, drawn)
         if drawn is None:
@@ -318,6 +338,10 @@ class _Comparison:
         """Return residuals (M r,) and Jacobian (M r, p), divided by std (r,).
 
         If the simulation fails, the residuals are huge and the Jacobian is zero.
+
+        Args:
+            values: (p,) parameters, at which the signals are simulated.
+            std: (r,) standard deviations of the residuals.
         """
         p = len(values)
         # residual of parameters that cannot be simulated: any step that can is better
@@ -330,7 +354,12 @@ class _Comparison:
         return (residual / std).ravel(), np.asfortranarray(scaled_slopes)
 
     def solved(self, values: np.ndarray, std: np.ndarray) -> nonlinear.Solution[np.ndarray]:
-        """Return the parameters that minimise the residuals divided by std (r,), with convergence."""
+        """Return the parameters that minimise the residuals divided by std (r,), with convergence.
+
+        Args:
+            values: (p,) first parameters.
+            std: (r,) standard deviations of the residuals.
+        """
         # at first
         first_damping = 1e-3
         # simulations with tangents per round
@@ -368,7 +397,12 @@ class _Comparison:
 
 
 def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of the estimate for white residuals."""
+    """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of the estimate for white residuals.
+
+    Args:
+        residual: (M, r) residuals divided by their standard deviations.
+        slopes: (M, r, p) their Jacobian.
+    """
     p = slopes.shape[2]
     flat = slopes.reshape(-1, p)
     orthonormal, _ = np.linalg.qr(flat)
@@ -390,7 +424,7 @@ def _packed(
         plain: the least-squares estimate, for names and units.
         values: (p,) parameters.
         residual, slopes: (M, r) residuals and (M, r, p) Jacobian.
-        std: (r,) standard deviations.
+        std: (r,) standard deviations of the residuals [rad, m, N m or N].
 
     Raises:
         Unidentifiable: if the simulated motion does not distinguish parameters.

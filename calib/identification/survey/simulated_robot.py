@@ -186,7 +186,7 @@ class Stepper:
         Args:
             parameters: (K, p) parameters of the robot for each state.
             q, v: (K, n) states.
-            tau: (n,) torque, held for the period.
+            tau: (n,) drive torques [N m or N], held for the period.
             period: duration [s].
 
         Raises:
@@ -212,7 +212,7 @@ class Stepper:
         Args:
             parameters: (p,) parameters of the robot.
             q, v: (n,) state.
-            tau: (n,) torque, held for the period.
+            tau: (n,) drive torques [N m or N], held for the period.
             period: duration [s].
             columns: number c of parameters in the Jacobian.
 
@@ -235,7 +235,12 @@ class Stepper:
 
 
 def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
-    """Return a robot prepared for single time steps, with derivatives by the parameters of indices `columns` (c,)."""
+    """Return a robot prepared for single time steps, with derivatives by the parameters of indices `columns` (c,).
+
+    Args:
+        plant: the robot.
+        columns: (c,) indices of the parameters.
+    """
     find = np.full(len(plant.parameters), -1)
     numbers = 2 * plant.bodies.n + np.arange(len(columns))
     find[np.asarray(columns, dtype=int)] = numbers
@@ -266,7 +271,12 @@ class BelievedRobot:
     steps: np.ndarray | None = None
 
     def at(self, values: np.ndarray, case: Case | None = None) -> Any:
-        """Return the simulated robot with parameters (p,) and the payloads of a case; None: all payloads."""
+        """Return the simulated robot with parameters (p,) and the payloads of a case; None: all payloads.
+
+        Args:
+            values: (p,) parameters of the problem.
+            case: recording with its payloads; None: all payloads are attached.
+        """
         parameters = np.zeros(len(self.plant.parameters))
         parameters[self.columns] = values
         plant = self.plant.with_parameters(parameters)
@@ -315,6 +325,10 @@ class BelievedRobot:
 
 def serial_arm(problem: IdentificationProblem, method: Method) -> IdentificationModel:
     """Return the model of a problem, which must be a serial arm with torque rows that the method supports.
+
+    Args:
+        problem: data and settings.
+        method: the method that simulates.
 
     Raises:
         UsageError: for any other model.
@@ -368,7 +382,12 @@ def believed_robot(problem: IdentificationProblem, method: Method, steps: np.nda
 
 
 def with_friction(problem: IdentificationProblem, model: IdentificationModel) -> tuple[IdentificationModel, np.ndarray]:
-    """Return a problem's model with all friction terms, and the index (p,) of each of its parameters in this model."""
+    """Return a problem's model with all friction terms, and the index (p,) of each of its parameters in this model.
+
+    Args:
+        problem: data and settings, with p parameters.
+        model: the problem's model with standard friction.
+    """
     extra = [term for term in problem.terms[problem.base.b :] if term is not None]
     model = model.with_terms(*extra)
     extra_columns = range(model.p - len(extra), model.p)

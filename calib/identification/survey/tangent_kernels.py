@@ -52,6 +52,11 @@ def _outward(tree, body, v, a, work, bodies_own, extended):
     """Write accelerations, ψ̇ and ψ̈, wrench, P and L of each body into `extended`, and its inertia into `bodies_own`.
 
     `work` must contain the results of `dynamics`.
+
+    Args:
+        tree, body, work, bodies_own, extended: arrays described in the module's docstring and in that of
+            `loop_kernels`.
+        v, a: (n,) joint velocities and accelerations.
     """
     count = tree.shape[0]
     for i in range(count):
@@ -99,6 +104,10 @@ def _slopes(tree, work, extended, by_q, by_v):
     """Add the bodies' part of K and D (n, n) to `by_q` and `by_v`.
 
     Composite quantities are summed from the tips to the base.
+
+    Args:
+        tree, work, extended: arrays described in the module's docstring and in that of `loop_kernels`.
+        by_q, by_v: (n, n) K and D, the derivatives of the torques by q and v.
     """
     count = tree.shape[0]
     for i in range(count - 1, -1, -1):
@@ -135,7 +144,12 @@ def _slopes(tree, work, extended, by_q, by_v):
 
 @njit(**OPTIONS)
 def _columns(tree, order, find, work, extended, out):
-    """Add the derivatives Y (n, c) by the bodies' parameters to `out`, for parameters that have a column."""
+    """Add the derivatives Y (n, c) by the bodies' parameters to `out`, for parameters that have a column.
+
+    Args:
+        tree, order, find, work, extended: arrays described in the module's docstring and in that of `loop_kernels`.
+        out: (n, c) derivatives of the torques by c parameters.
+    """
     count = tree.shape[0]
     for i in range(count):
         has_column = False
@@ -187,7 +201,14 @@ def _linearise(
 ):
     """Write K, D (n, n) and Y (n, c) of the inverse dynamics at q, v, a into `by_q`, `by_v` and `out`.
 
-    `work` must contain the results of `dynamics`.
+    Args:
+        tree, body, linear, kinds, acts, memory: arrays of the robot, described in the module `loop_kernels`.
+        order, entries, shares, owners, find: index arrays, described in the module's docstring.
+        q, v, a: (n,) joint positions, velocities and accelerations.
+        work: array of the bodies, with the results of `dynamics`.
+        bodies_own, extended: working arrays, described in the module's docstring.
+        by_q, by_v: (n, n) arrays to write.
+        out: (n, c) array to write.
     """
     n = q.shape[0]
     by_q[:] = 0.0
@@ -217,7 +238,14 @@ def _linearise(
 
 @njit(**OPTIONS)
 def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
-    """Write M⁻¹ (δtau - K δq - D δv - Y) into out (n, c); `matrix` contains the factors of M."""
+    """Write M⁻¹ (δtau - K δq - D δv - Y) into out (n, c); `matrix` contains the factors of M.
+
+    Args:
+        matrix: (n, n) factors of M.
+        by_q, by_v, columns: K, D (n, n) and Y (n, c).
+        dq, dv, dtau: (n, c) derivatives of position, velocity and drive torque by the parameters.
+        out: (n, c) derivatives of the acceleration.
+    """
     n, c = out.shape
     for j in range(n):
         for m in range(c):
@@ -246,7 +274,17 @@ def _advance_tangent(
 ):
     """Advance q, v (n,) and δq, δv (n, c) by one period, as `loop_kernels._advance` advances q, v; return a status.
 
-    `slopes[0]` need not contain the accelerations at the start.
+    Args:
+        plant: arrays tree, body, linear, kinds, acts of `loop_kernels`.
+        layout: index arrays order, entries, shares, owners, find.
+        memory, loads, work: arrays described in the module `loop_kernels`.
+        q, v: (n,) state, overwritten.
+        dq, dv: (n, c) its derivatives by the parameters, overwritten.
+        tau, dtau: (n,) and (n, c) drive torques, and their derivatives.
+        period: duration [s].
+        slopes, dslopes: (4, n) and (4, n, c) working memory for accelerations; it need not contain those at the start.
+        matrix: (n, n) working memory.
+        rooms: working arrays of `_workspace`.
     """
     tree, body, linear, kinds, acts = plant
     bodies_own, extended, by_q, by_v, columns, at, rate, dat, drate = rooms
@@ -298,7 +336,13 @@ def _advance_tangent(
 
 @njit(**OPTIONS)
 def _workspace(bodies, n, c):
-    """Return the working arrays of `_advance_tangent` for a number of bodies, n joints and c columns."""
+    """Return the working arrays of `_advance_tangent` for a number of bodies, n joints and c columns.
+
+    Args:
+        bodies: number of bodies.
+        n: number of joints.
+        c: number of columns.
+    """
     bodies_own, extended = np.empty((bodies, 10)), np.empty((bodies + 1, 36))
     square, wide = (np.empty((n, n)), np.empty((n, n))), np.empty((n, c))
     return (
@@ -318,8 +362,16 @@ def _workspace(bodies, n, c):
 def advance_linearised(plant, layout, values, q, v, tau, period, gain, dq, dv):
     """Advance a state q, v (n,) by one period under a constant torque (n,), and write its Jacobian; return a status.
 
-    dq, dv (n, 2 n + c): derivatives of the new state by q, v and the c parameters of `layout`, whose columns start at 2
-    n. M⁻¹ is written into gain (n, n).
+    Args:
+        plant: arrays tree, body, linear, kinds, acts of `loop_kernels`.
+        layout: index arrays order, entries, shares, owners, find; the columns of the c parameters in `find` start at 2
+            n.
+        values: (p,) parameters of the robot.
+        q, v: (n,) state, overwritten.
+        tau: (n,) drive torques.
+        period: duration [s].
+        gain: (n, n) array to which M⁻¹ of the first state is written.
+        dq, dv: (n, 2 n + c) arrays for the derivatives of the new state by q, v and the c parameters.
     """
     tree, body, linear, kinds, acts = plant
     order, entries, shares, owners, _ = layout
@@ -368,7 +420,20 @@ def _command_tangent(
 ):
     """Write the derivatives (n, c) of the command before saturation into `dwish`.
 
-    feedback (n,) is the feedback part of the command.
+    Args:
+        plant: arrays tree, body, linear, kinds, acts of `loop_kernels`.
+        layout: index arrays order, entries, shares, owners, find.
+        model: array `body` of the controller's model; 0 rows if there is none.
+        empty: empty array in place of `find` for the controller's model, whose parameters have no columns.
+        gains: (6, n) controller values, as in `loop_kernels.closed_loop`.
+        relative: (n, c) derivatives of the logarithm of each joint's gains by the parameters.
+        ahead: (n,) feedforward acceleration.
+        read, speed: (n,) measured position and velocity.
+        dread, dspeed, dintegral: (n, c) derivatives of measured position, measured velocity, and integral of the error.
+        feedback: (n,) feedback part of the command.
+        wish, work, matrix: working memory.
+        dwish: (n, c) array to write.
+        rooms: working arrays of `_workspace`.
     """
     bodies_own, extended, by_q, by_v, columns, at, _, dat, _ = rooms
     tree, linear = plant[0], plant[2]
@@ -401,9 +466,24 @@ def closed_loop_tangent(
 ):
     """Write the motion of `loop_kernels.closed_loop` and its tangents; return a status and a period.
 
-    The period is the number of the last one reached. relative (n, c): derivatives of the logarithm of each joint's
-    gains by the parameters; zero for constant gains. `out` (3, M, n): q, v, torque every `every` periods. `dout` (3, M,
-    n, c): their tangents. encoder (N, n) or (0, n): noise of the measured positions, on which the controller acts.
+    The period is the index of the last one reached.
+
+    Args:
+        plant: arrays tree, body, linear, kinds, acts of `loop_kernels`.
+        layout: index arrays order, entries, shares, owners, find.
+        model: array `body` of the controller's model; 0 rows if there is none.
+        gains: (6, n) controller values, as in `loop_kernels.closed_loop`.
+        relative: (n, c) derivatives of the logarithm of each joint's gains by the parameters; zero for constant gains.
+        reference: (4, N, n) position, velocity, feedforward torque, feedforward acceleration.
+        encoder: (N, n) or (0, n), noise of the measured positions, on which the controller acts.
+        period: control period [s].
+        smoothing: weight of a new velocity sample in the controller's low-pass.
+        late: delay in control periods.
+        every: control periods per sample.
+        q, v: (n,) the state, which is overwritten.
+        count: number of control periods.
+        out: (3, M, n) q, v and torque at each sample.
+        dout: (3, M, n, c) their tangents, i.e. derivatives by the parameters.
     """
     tree, linear, kinds = plant[0], plant[2], plant[3]
     n, c = relative.shape

@@ -107,7 +107,12 @@ def estimator(identification: Identification[RegressorModel]) -> _Estimator:
 
 
 def estimate(estimator: _Estimator, all_rows: Sequence[ObservationRows]) -> tuple[np.ndarray, np.ndarray]:
-    """Return φ (p,) and A⁻¹ (p, p) for given rows, by QR of the whitened rows."""
+    """Return φ (p,) and A⁻¹ (p, p) for given rows, by QR of the whitened rows.
+
+    Args:
+        estimator: weights of the rows, and prior.
+        all_rows: rows of all recordings.
+    """
     p = len(estimator.pull)
     no_target = np.zeros((len(estimator.beforehand), 1))
     factor = np.hstack([estimator.beforehand, no_target])
@@ -122,7 +127,13 @@ def estimate(estimator: _Estimator, all_rows: Sequence[ObservationRows]) -> tupl
 
 
 def rows_on(identification: Identification, chain: Chain, cases: Sequence[Case]) -> list[ObservationRows]:
-    """Return the rows of an identification, recomputed for another geometry; friction columns are unchanged."""
+    """Return the rows of an identification, recomputed for another geometry; friction columns are unchanged.
+
+    Args:
+        identification: the model and its rows.
+        chain: the arm with the other geometry.
+        cases: training data of the identification.
+    """
     model = make_model(chain, identification.settings)
     decimator = common_decimator(cases, identification.settings)
     base_count = identification.base.b
@@ -212,7 +223,7 @@ class GeometryUncertainty(Frozen):
 
     @property
     def covariance(self) -> np.ndarray:
-        """Total covariance (p, p): Σ_torque + S Σ_geometry Sᵀ."""
+        """Total covariance (p, p): Σ_torque (`torque`) + S Σ_geometry Sᵀ (`geometry`), with S the sensitivity."""
         return np.asarray(self.torque) if self.geometry is None else self.torque + self.geometry
 
     @property
@@ -298,6 +309,12 @@ def sensitivity(
 
     The first rms changes are with fixed parameters φ, the second with parameters estimated again. The last two columns
     of dφ/dg are tilts of gravity about the base's x and y axes [per rad].
+
+    Args:
+        identification: the model and its rows, with p parameters φ.
+        chain: the arm; g are the values of its K elements [m or rad], then two tilts of gravity [rad].
+        cases: training data of the identification.
+        progress: function that is called with a short text at each part; None: not called.
     """
     if not identification.dynamics.model.torque_rows.has_bodies:
         # Without bodies, no geometry affects the rows.
@@ -320,8 +337,8 @@ def solve_sensitivity(
     Args:
         identification: the model and its rows.
         cases: its training data.
-        differences: function of a case, a slice of its samples, R⁻¹ (y - W φ) and the decimator that returns ∂(W φ -
-            y)/∂g (M, rows, K) and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K).
+        differences: function of a case, a slice of its samples, R⁻¹ (y - W φ) (residuals of the estimate φ over their
+            variances R) and the decimator that returns ∂(W φ - y)/∂g (M, rows, K) and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K).
         samples: largest number of samples at the full rate; longer recordings are represented by pieces.
         progress: function that is called with a short text at each part; None: not called.
     """
@@ -387,7 +404,12 @@ def solve_sensitivity(
 
 
 def _neighbours(identification: Identification, chain: Chain) -> list[tuple[Bodies, Bodies]]:
-    """Return pairs of bodies with one geometric element, or one tilt of gravity, changed by +`STEP` and -`STEP`."""
+    """Return pairs of bodies with one geometric element, or one tilt of gravity, changed by +`STEP` and -`STEP`.
+
+    Args:
+        identification: the model, with its payloads.
+        chain: the arm.
+    """
     settings = identification.settings
     values = np.array(chain.values)
     pairs = []
@@ -409,6 +431,11 @@ def pieces(case: Case, decimator: Decimator, step: int = 1) -> list[tuple[slice,
     """Return every `step`-th piece of a case, as pairs of slices; with step 1 each segment is one piece.
 
     The first slice selects decimated rows, the second the full-rate samples on which these depend.
+
+    Args:
+        case: the recording.
+        decimator: filter and decimation of the rows.
+        step: 1 for all samples; k for every k-th piece only.
     """
     factor = decimator.factor
     size = max(PIECE // factor, MIN_PIECE)
@@ -486,7 +513,11 @@ def _differences(
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
-    """Return the root mean square of each column."""
+    """Return the root mean square of each column.
+
+    Args:
+        values: (M, columns) numbers.
+    """
     return np.sqrt(np.mean(values**2, axis=0))
 
 
@@ -560,7 +591,13 @@ def compare(
 
 
 def _gain(inverse: np.ndarray, weighting: _Estimator, rows: ObservationRows) -> np.ndarray:
-    """Return A⁻¹ Wᵀ R⁻¹ (p, M · rows): the change of the estimate per unit of each row's torque."""
+    """Return A⁻¹ Wᵀ R⁻¹ (p, M · rows): the change of the estimate per unit of each row's torque.
+
+    Args:
+        inverse: A⁻¹ (p, p), with A = Wᵀ R⁻¹ W plus the prior's information.
+        weighting: weights of the rows.
+        rows: M samples.
+    """
     weight = weights(weighting, rows, weighting.deviation**2)
     return inverse @ (stacked(rows) * weight[:, None]).T
 
@@ -570,7 +607,13 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
 
         dφ/dc = -(Wᵀ R⁻¹ W)⁻¹ Wᵀ R⁻¹ Σ_s ∂τ/∂s b_s,    s one of q, v, a of the joint, b_s the basis or its derivative
 
-    as in `sensitivity`, but without the part that is proportional to the residual.
+    with W the observation matrix, R the variances of its rows, τ the torques; as in `sensitivity`, but without the part
+    that is proportional to the residual. A model without bodies (rows ``drive``) feels no deflection.
+
+    Args:
+        found: the identification.
+        robot: its robot, with joint corrections.
+        cases: training data of the identification, with the motion of the links.
     """
     terms = robot.deflection
     chain = robot.complete
@@ -583,6 +626,8 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
     base_values = found.fitted.estimate.values[: found.base.b]
     standard = found.base.to_standard(base_values)[: model.inertial]
     pull = np.zeros((len(inverse), len(terms.terms)))
+    if not model.inertial:
+        return pull
     seen = 0
     every = -(-sum(len(case.motion) for case in cases) // DEFLECTION_SAMPLES)
     for rows, case in zip(found.rows, cases):
@@ -615,8 +660,8 @@ def _torque_slopes(bodies: Bodies, values: np.ndarray, states: Sequence[np.ndarr
     Args:
         bodies: the robot's bodies.
         values: (10 B,) standard parameters.
-        states: q, v, a, (N, n) each.
-        joint: joint j.
+        states: q, v, a, (N, n) each [rad or m, and per s, per s²].
+        joint: index of joint j, from 0.
     """
     result = np.zeros((3, *states[0].shape))
     for order in range(3):

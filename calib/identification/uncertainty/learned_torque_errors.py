@@ -174,7 +174,7 @@ class _Samples:
 
     Attributes:
         states: (3, M, n) q, v and a.
-        torque, error: (M, rows) recorded torque, and prediction error of the final model.
+        torque, error: (M, rows) recorded torque, and prediction error of the final model [N m or N].
         matrix: (M, rows, p) filtered columns.
         block: (M,) number of the time block; -1 for samples that are not used.
         trajectory, trajectory_block: (K, 2 n) q and v at up to the full rate, and their time blocks (K,).
@@ -206,7 +206,12 @@ class _Samples:
 
 
 def _collect_samples(identification: Identification, cases: Sequence[Case]) -> _Samples:
-    """Return motion and residuals of all recordings at their decimated samples."""
+    """Return motion and residuals of all recordings at their decimated samples.
+
+    Args:
+        identification: the model and its rows.
+        cases: the training recordings.
+    """
     dynamics = identification.dynamics
     decimator = common_decimator(cases, identification.settings)
     states = []
@@ -263,6 +268,10 @@ def _independent_runs(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarr
 
     Another block repeats a block's motion if it passes through at least half of its states
     (`calib.data.signals.persistency.repeats`). If this gives fewer than two runs, each block is a run.
+
+    Args:
+        samples: motion of all recordings.
+        blocks: numbers of the time blocks.
     """
     spread = np.maximum(samples.trajectory.std(axis=0), 1e-6)
     max_distance = SAME_STATE * np.sqrt(len(spread))
@@ -286,7 +295,13 @@ def _independent_runs(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarr
 
 
 def _estimate(identification: Identification, data: Triangles, blocks: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the parameters (p,) estimated from some time blocks, and a root (p, k) of their covariance."""
+    """Return the parameters (p,) estimated from some time blocks, and a root (p, k) of their covariance.
+
+    Args:
+        identification: the model, with weights and prior.
+        data: R factors by time block and torque row.
+        blocks: numbers of the time blocks in use.
+    """
     fitted = identification.fitted
     base_count = identification.base.b
     friction_group = np.asarray(identification.friction.groups, dtype=int)
@@ -319,7 +334,11 @@ def _estimate(identification: Identification, data: Triangles, blocks: Sequence[
 
 
 def _coulomb_friction(identification: Identification) -> np.ndarray:
-    """Return the Coulomb friction (rows,) of torque rows that contain a motor's friction, else zero [N m or N]."""
+    """Return the Coulomb friction (rows,) of torque rows that contain a motor's friction, else zero [N m or N].
+
+    Args:
+        identification: the model with its parameter values.
+    """
     # Recordings that are weighed apart repeat the rows of the model.
     coulomb = identification.rows[0].coulomb[: identification.dynamics.model.rows]
     return np.sum(np.abs(identification.fitted.estimate.values) * coulomb, axis=1)
@@ -329,6 +348,10 @@ def _standing_speeds(identification: Identification, friction: np.ndarray) -> np
     """Return the speeds (n,) below which joints count as at rest, the width of Coulomb's sign [rad/s or m/s].
 
     They are zero if no torque row contains friction.
+
+    Args:
+        identification: the model, with the width of Coulomb's sign.
+        friction: (rows,) Coulomb friction of the torque rows [N m or N].
     """
     n = identification.dynamics.model.n
     if not friction.any():
@@ -347,7 +370,7 @@ def _hold_out(
         identification: the model and its rows.
         samples: motion and residuals.
         run: numbers of the held-out blocks.
-        standing_speeds: (n,) speeds below which a joint counts as at rest.
+        standing_speeds: (n,) speeds below which a joint counts as at rest [rad/s or m/s].
     """
     block_count = samples.triangles.groups // len(identification.fitted.std)
     remaining = [block for block in range(block_count) if block not in run]
@@ -374,7 +397,7 @@ def _rest_floors(folds: Sequence[_HeldOut], friction: np.ndarray, weights: np.nd
 
     Args:
         folds: held-out runs.
-        friction: (rows,) Coulomb friction.
+        friction: (rows,) Coulomb friction [N m or N].
         weights: (rows, 3) κ, v and u in motion.
     """
     expected = weights[:, 1] + friction**2 / 3.0
@@ -398,6 +421,10 @@ def _variance_weights(folds: Sequence[_HeldOut], run_count: int) -> np.ndarray:
     In units of a row's mean square error, κ and u / v are comparable between rows. A row's errors are supplemented by
     those of all other rows, which count as `BORROWED` blocks, and by two expectations: that the covariance is correct
     (counting as one block), and that errors grow beyond the training range, which repeated motion hardly tests.
+
+    Args:
+        folds: held-out runs, then halves.
+        run_count: number of runs.
     """
     errors = np.concatenate([fold.errors for fold in folds])
     terms = np.concatenate([fold.variance_terms for fold in folds])

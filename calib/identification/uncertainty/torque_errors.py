@@ -59,7 +59,12 @@ class Uncertainty:
     covariance: np.ndarray
 
     def sigma(self, sampled: Sampled) -> np.ndarray:
-        """Return the largest standard deviation √(w Σ wᵀ) of each joint's torque along a motion (n,) [N m or N]."""
+        """Return the largest standard deviation √(w Σ wᵀ) of each joint's torque along a motion (n,) [N m or N].
+
+        Args:
+            sampled: times, positions, velocities and accelerations of the motion; w is the torque's regressor, Σ the
+                covariance.
+        """
         state = sampled.q, sampled.v, sampled.a
         variances = parameter_variances(self.dynamics, self.columns, self.covariance, *state, self.carried)
         return np.sqrt(variances.max(axis=0))[-sampled.q.shape[1] :]
@@ -67,6 +72,11 @@ class Uncertainty:
 
 def estimated_columns(dynamics: Dynamics, names: Sequence[str]) -> np.ndarray:
     """Return the regressor columns (k,) of the estimated parameters, by their names.
+
+    Args:
+        dynamics: the model.
+        names: names of the k estimated parameters; for a base parameter such as ``ZZ1R``, the column is that of
+            ``ZZ1``.
 
     Raises:
         ValueError: for a name that the model does not have.
@@ -163,7 +173,12 @@ class TorqueDiscrepancy:
     standing: tuple[float, ...] = ()
 
     def at_rest(self, v: np.ndarray, rows: int) -> np.ndarray:
-        """Return the mask (N, rows) of torque rows whose joint is at rest, from velocities v (N, n)."""
+        """Return the mask (N, rows) of torque rows whose joint is at rest, from velocities v (N, n).
+
+        Args:
+            v: (N, n) joint velocities [rad/s or m/s].
+            rows: number of torque rows.
+        """
         if not self.rest:
             return np.zeros((len(v), rows), dtype=bool)
         stands = np.abs(v) < np.array(self.standing)
@@ -177,6 +192,10 @@ class TorqueDiscrepancy:
         """Return the variance of unmodelled effects (N, rows) [N² m² or N²] for velocities v (N, n).
 
         It is v_j in motion, and `rest` while the joint is at rest.
+
+        Args:
+            v: (N, n) joint velocities [rad/s or m/s].
+            rows: number of torque rows.
         """
         moving = np.broadcast_to(np.array(self.floor), (len(v), rows))
         if not self.rest:
@@ -186,8 +205,12 @@ class TorqueDiscrepancy:
     def distance(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, rows: int) -> np.ndarray:
         """Return log(1 + d²) (N, rows), with d the distance of states q, v, a (N, n) from the training range.
 
-        d is the distance of the row's joint. For rows of other torques than those of single joints, d is the distance
-        of all joints together.
+        d has no unit: distances in q, v and a are divided by the standard deviations of the training data. It is that
+        of the row's joint; for rows of other torques than those of single joints, that of all joints together.
+
+        Args:
+            q, v, a: (N, n) states [rad or m, and per s, per s²].
+            rows: number of torque rows.
         """
         scaled = self._excess(q, v, a) / np.array(self.scale)[:, None]
         square = np.sum(scaled**2, axis=0)
@@ -203,7 +226,10 @@ class TorqueDiscrepancy:
         return self._excess(q, v, a) > MAX_OUTSIDE * training_range[:, None]
 
     def _excess(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the distances (3, N, n) of q, v, a of each joint from the training range; zero within it."""
+        """Return the distances (3, N, n) of q, v, a of each joint from the training range; zero within it.
+
+        They are in units of the standard deviations of the training data.
+        """
         states = np.stack([q, v, a])
         lower = np.array(self.lower)[:, None]
         upper = np.array(self.upper)[:, None]
@@ -338,7 +364,7 @@ def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicte
         errors: model of the errors.
         dynamics: the model that predicts.
         case: the recording.
-        predicted: (N, rows) predicted torques.
+        predicted: (N, rows) predicted torques [N m or N].
     """
     motion = case.motion
     count = len(motion)

@@ -18,7 +18,8 @@ class TorqueTest(NamedTuple):
     Attributes:
         recording: name of the held-out recording.
         row: name of the torque row.
-        rms: rms error of the predicted torque, as `Score.judged` counts it [N m or N].
+        rms: rms error of the predicted torque [N m or N], without what is above the identification band where that is
+            most of the error; NaN: the joint did not move.
         tolerance: largest accepted rms error [N m or N].
     """
 
@@ -27,34 +28,58 @@ class TorqueTest(NamedTuple):
     rms: float
     tolerance: float
 
+    def __str__(self) -> str:
+        """Return row, error and tolerance as text."""
+        return f"{self.row} {self.rms:.3g} (tolerance {self.tolerance:g})"
+
     @property
-    def passed(self) -> bool:
-        """Whether the error is within the tolerance; a joint that never moves has no error and passes."""
-        return not self.rms > self.tolerance
+    def passed(self) -> bool | None:
+        """Whether the error is within the tolerance; None for a joint that did not move, which is not tested."""
+        if np.isnan(self.rms):
+            return None
+        return self.rms <= self.tolerance
 
 
-def torque_tests(tolerances: Sequence[float], proofs: Mapping[str, Score], rows: Sequence[str]) -> list[TorqueTest]:
+def check_tolerances(tolerances: Sequence[float], joint_count: int) -> None:
+    """Raise a UsageError if there is neither one tolerance, nor one for each joint.
+
+    Args:
+        tolerances: tolerances of the joints; empty: none.
+        joint_count: number of joints.
+    """
+    count = len(tolerances)
+    message = f"tolerance_torque: {count} numbers for {joint_count} joints; give one for each joint, or one for all"
+    require(count in (0, 1, joint_count), message, UsageError)
+
+
+def torque_tests(
+    tolerances: Sequence[float], proofs: Mapping[str, Score], rows: Sequence[str], joint_count: int
+) -> list[TorqueTest]:
     """Return the worst result of each torque row over the held-out recordings; an empty list without tolerances.
 
     Args:
         tolerances: tolerance of each joint, or one for all joints [N m or N]; zero: this joint is not tested.
         proofs: name of a held-out recording -> score of the model.
         rows: names of the torque rows; with torques of motors and sensors, those of all joints one after the other.
+        joint_count: number of joints.
 
     Raises:
-        UsageError: if the number of tolerances does not match the joints.
+        UsageError: if the number of tolerances does not match the joints, or rows are not torques of joints.
     """
     if not tolerances or not proofs:
         return []
-    count = len(tolerances)
-    message = f"tolerance_torque: {count} numbers for {len(rows)} torques ({', '.join(rows)}); give one for each joint"
-    require(count == 1 or (len(rows) % count == 0 and len(rows) // count <= 2), message, UsageError)
-    by_row = np.resize(np.asarray(tolerances, dtype=float), len(rows))
+    check_tolerances(tolerances, joint_count)
+    message = f"tolerance_torque: the {len(rows)} rows {', '.join(rows)} are not torques of {joint_count} joints"
+    require(len(rows) % joint_count == 0, message, UsageError)
+    of_joint = np.broadcast_to(np.asarray(tolerances, dtype=float), joint_count)
+    of_row = np.tile(of_joint, len(rows) // joint_count)
     tests = []
-    for row, (name, tolerance) in enumerate(zip(rows, by_row)):
+    for number, (row, tolerance) in enumerate(zip(rows, of_row)):
         if not tolerance:
             continue
-        errors = {recording: float(np.nan_to_num(score.judged.rms[row])) for recording, score in proofs.items()}
-        worst = max(errors, key=lambda recording: errors[recording])
-        tests.append(TorqueTest(worst, name, errors[worst], float(tolerance)))
+        errors = {}
+        for recording, score in proofs.items():
+            errors[recording] = float(score.counted(score.floor_dominates).rms[number])
+        worst = max(errors, key=lambda recording: np.nan_to_num(errors[recording], nan=-1.0))
+        tests.append(TorqueTest(worst, row, errors[worst], float(tolerance)))
     return tests

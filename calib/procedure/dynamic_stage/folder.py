@@ -16,11 +16,16 @@ from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.physical_consistency import information
-from calib.identification.prediction import Dynamics, Score
+from calib.identification.prediction import Dynamics, Score, predict
 from calib.identification.rows import Case
-from calib.identification.uncertainty.torque_errors import TorqueErrorModel, TorqueIntervals, read_uncertainty
+from calib.identification.uncertainty.torque_errors import TorqueErrorModel, read_uncertainty
 from calib.procedure.dynamic_stage import geometry_tables
-from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome, ModelFindings
+from calib.procedure.dynamic_stage.identify import (
+    DynamicsAssessment,
+    IdentificationOutcome,
+    ModelFindings,
+    RecordingErrors,
+)
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport, metrics, on_bounds, with_current_keys
 from calib.procedure.dynamic_stage.verdict import Resting
@@ -157,9 +162,9 @@ class UnseenFolder:
             inputs: robot, recordings and options.
             assessment: the model's predictions and errors on the held-out recordings, and the verdict.
         """
+        nominal = geometry_tables.on_nominal_geometry(self.path.parent)
         for number, case in enumerate(inputs.unseen, 1):
-            predicted, intervals = assessment.predictions[case.name], assessment.intervals.get(case.name)
-            _write_torques(inputs, case, predicted, intervals, self.path / f"torques_{number}.csv")
+            _write_torques(inputs, case, assessment, nominal, self.path / f"torques_{number}.csv")
         files.write_json(self.report, UnseenReport.of(inputs, assessment))
 
     def read(self) -> UnseenReport:
@@ -238,13 +243,13 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     if identification.prior is not None or binding:
         information.write(identification, folder)
 
-    first = (*inputs.unseen, *inputs.cases)[0]
-    intervals = outcome.intervals.get(first.name)
-    _write_torques(inputs, first, outcome.predictions[first.name], intervals, folder / "torques_1.csv")
     gains = inputs.gains and GainRecord.of(inputs.gains, inputs.unit)
     model_table = robot.model_table if isinstance(robot, Mechanism) else to_table
     table = model_table(identification.dynamics, identification.base, inputs.unit)
     files.write_json(folder / MODEL, table | {"drive_gains": gains})
+    first = (*inputs.unseen, *inputs.cases)[0]
+    nominal = geometry_tables.on_nominal_geometry(folder)
+    _write_torques(inputs, first, outcome, nominal, folder / "torques_1.csv")
     if gains is not None:
         header = ("joint", f"gain [{gains.unit}]", f"sigma [{gains.unit}]", "told")
         rows = zip(inputs.chain.joint_names, plain(gains.values), plain(gains.sigma), gains.told)
@@ -253,24 +258,29 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
 
 
 def _write_torques(
-    inputs: IdentificationInputs, case: Case, predicted: np.ndarray, intervals: TorqueIntervals | None, path: Path
+    inputs: IdentificationInputs, case: Case, errors: RecordingErrors, nominal: Dynamics | None, path: Path
 ) -> Path:
     """Write a table of measured and predicted torques and joint positions of a recording, at about `TORQUE_RATE`.
 
-    If `intervals` are known, two columns are added: the expected standard deviation of the torque error, and whether
+    Where intervals are known, two columns are added: the expected standard deviation of the torque error, and whether
     the model extrapolates (1) or not (0). Recordings without a payload also get velocities and accelerations, which
     `read_torques` requires.
 
     Args:
         inputs: robot and options of the identification.
         case: the recording with N samples.
-        predicted: (N, rows) torques predicted by the model.
-        intervals: expected torque errors; None: unknown.
+        errors: torques predicted by the model, and their expected errors.
+        nominal: the model identified on the nominal geometry, whose torques are written too; None: none.
         path: path of the table.
     """
     motion = case.motion
     rows = np.arange(0, len(motion), max(1, round(motion.rate / TORQUE_RATE)))
+    predicted = errors.predictions[case.name]
     columns = {"measured": case.target[rows], "predicted": predicted[rows], "q": motion.q[rows]}
+    if nominal is not None:
+        undeflected = replace(case, link=None)
+        columns["nominal"] = predict(nominal, undeflected)[rows]
+    intervals = errors.intervals.get(case.name)
     if intervals is not None:
         nearest = np.searchsorted(intervals.index, rows)
         columns |= {"sigma": intervals.sigma[nearest], "extrapolated": intervals.beyond[nearest]}

@@ -15,14 +15,17 @@ Files in addition to those of every identification (``calib identify --out``)::
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from calib import files
+from calib.data.csv_table import read_table
 from calib.folders import write_covariance
+from calib.identification import model_file
+from calib.identification.prediction import Dynamics
 from calib.identification.uncertainty.geometry_uncertainty import (
     NOTHING,
     TILTS,
@@ -31,6 +34,7 @@ from calib.identification.uncertainty.geometry_uncertainty import (
 )
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.records import Number
+from calib.robot import calibrated
 
 # a shift, in σ_torque, that raises a σ by more than `NOTHING`
 MIN_SHIFT = float(np.sqrt((1.0 + NOTHING) ** 2 - 1.0))
@@ -167,6 +171,27 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
     if outcome.geometries is not None:
         table = _geometries(outcome.geometries, _essential_names(outcome))
         files.write_table(folder / GEOMETRIES, TwoGeometries._fields, table)
+
+
+def on_nominal_geometry(folder: Path) -> Dynamics | None:
+    """Return the model on the nominal (CAD) geometry that was identified beside the model in a folder.
+
+    None where there is no such estimate, as for a robot whose geometry was not calibrated.
+    """
+    table = folder / GEOMETRIES
+    if not table.is_file():
+        return None
+    nominal = calibrated.read(folder / calibrated.ROBOT).nominal
+    if nominal is None:
+        return None
+    dynamics = model_file.from_table(nominal, model_file.read_table(folder))
+    columns = {name: column for column, name in enumerate(dynamics.model.names)}
+    values = dynamics.values.copy()
+    estimates = read_table(table)
+    for name, value in zip(estimates.texts("name"), estimates.numbers("nominal", None)):
+        column = columns[name] if name in columns else columns[name.removesuffix("R")]
+        values[column] = value
+    return replace(dynamics, values=values)
 
 
 def _ranking(carried: GeometryUncertainty) -> np.ndarray:

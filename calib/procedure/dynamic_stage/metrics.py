@@ -24,6 +24,7 @@ from calib.identification.methods.constraint_settings import Binding
 from calib.identification.prediction import Score, relative_error_sigma
 from calib.identification.registry import METHODS
 from calib.identification.rows import Case
+from calib.identification.uncertainty.error_growth import error_growth
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
@@ -199,6 +200,8 @@ class ModelMetrics(JudgedMetrics):
     repeated: Mapping[str, float] = field(default_factory=dict)
     findings: ModelFindings | None = None
     error_density: Array | None = None
+    error_growth: Array | None = None
+    torque_variance: Array | None = None
     seed: int = 0
     schema: int = SCHEMA
 
@@ -233,6 +236,7 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         essential, steps = len(identification.elimination.kept), identification.elimination.steps
     method = identification.fitted.method
     filters = {case.name: FilterMetrics.of(case.motion) for case in (*inputs.cases, *inputs.unseen)}
+    growth = error_growth(identification.rows, identification.fitted.estimate.values)
     return ModelMetrics(
         **_judged(outcome),
         rows=identification.settings.torque_rows.numbered(inputs.chain.n),
@@ -256,6 +260,8 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         repeated=outcome.repeated,
         findings=outcome.findings,
         error_density=_error_density(identification, inputs.cases),
+        error_growth=growth.share,
+        torque_variance=growth.torque_variance,
         seed=outcome.seed,
     )
 

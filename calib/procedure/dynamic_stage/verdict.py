@@ -107,7 +107,10 @@ def judge(
         return figures, [*settle([training]), reason, *joints]
 
     name = max(moving, key=lambda recording: moving[recording].judged.total)
-    error = moving[name].judged.total
+    worst_score = moving[name]
+    error = worst_score.judged.total
+    # training and unseen motion are compared in the same frequencies
+    training_error = max((score.counted(worst_score.noisy).total for score in fit.values()), default=np.nan)
     totals = []
     if excitation and all(report.poor for report in excitation.values()):
         totals.append(finding("motion-poor"))
@@ -116,7 +119,6 @@ def judge(
     totals.append(training)
     times, most = error / max(training_error, 1e-300), limit("no-torque-transfer", "times", "marginal")
     totals.append(finding("no-torque-transfer", times=times, most=most))
-    worst_score = moving[name]
     figures = finding(
         "torque-errors",
         unseen=error,
@@ -364,13 +366,17 @@ def _payload_masses(identification: Identification[RegressorModel]) -> Iterable[
         if f"M{label}" not in masses:
             continue
         mass, sigma = masses[f"M{label}"]
-        if mass < -SURELY_ABSENT * sigma:
+        doubt = SURELY_ABSENT * sigma
+        stated_mass = payload.mass
+        if stated_mass is not None and abs(mass - stated_mass) <= doubt:
+            continue
+        if mass < -doubt:
             yield finding("payload-exchanged", label=label, mass=mass, sigma=sigma)
-        elif mass < SURELY_ABSENT * sigma:
+        elif mass < doubt:
             yield finding("payload-absent", label=label, mass=mass, sigma=sigma)
-        elif payload.mass is not None and abs(mass - payload.mass) > SURELY_ABSENT * sigma:
-            off = abs(mass - payload.mass) / payload.mass
-            yield finding("payload-mass", label=label, mass=mass, sigma=sigma, stated=payload.mass, off=off)
+        elif stated_mass is not None:
+            off = abs(mass - stated_mass) / stated_mass
+            yield finding("payload-mass", label=label, mass=mass, sigma=sigma, stated=stated_mass, off=off)
 
 
 def _unmodelled(identification: Identification) -> list[Finding]:

@@ -66,6 +66,8 @@ class DesignCondition:
 Progress = Callable[[str], None]
 Search = Callable[..., SearchResult]
 
+# relative difference of periods that comes from rounding to samples
+PERIOD_ROUNDING = 0.01
 # degree of splines, where a family does not state it
 DEFAULT_DEGREE = 5
 # over the period, at which condition numbers are reported
@@ -220,21 +222,21 @@ def search_motion(
     if picked is None:
         motion, problem = _searched(problem, goals, settings.starts, search, show)
     else:
-        motion, problem = _picked(problem, goals, picked, inputs)
+        motion, problem = _picked(problem, goals, picked, inputs, settings)
+    proposed = motion
 
     show("verifying")
     motion, problem = _with_whole_samples(motion, problem, settings.rate)
     with finishing():
         motion, proof = ensured(problem, motion, checked)
-    front = None if picked is None else picked.values
     stored = picked
     if picked is None and settings.front and not motion.interrupted:
         # the motion exists: what follows may be cut short
         with suppress(KeyboardInterrupt):
             front = _front(problem, inputs, motion, goals, settings.front, settings.evaluations, report)
-            front, motion, proof = _nearest_goals(front, problem, goals, inputs, (motion, proof), checked)
+            front, nearest, nearest_proof = _nearest_goals(front, problem, goals, inputs, (motion, proof), checked)
             motions = [_periodic(result, inputs, settings, problem.family) for result in front.found]
-            stored = StoredFront(front, tuple(motions))
+            motion, proof, stored = nearest, nearest_proof, StoredFront(front, tuple(motions))
     with finishing():
         playback = play(problem.family, motion, inputs, settings)
         condition_numbers = _condition_of(inputs, problem.family, motion, settings.repeat)
@@ -248,6 +250,8 @@ def search_motion(
     if goals and not problem.goals:
         goal_notes = ("interrupted before any motion met the goals",)
     goal_notes += missed(goals, values, inputs)
+    if picked is not None and not np.allclose(motion.x, proposed.x):
+        goal_notes += ("the motion of the front did not keep all limits between its samples, and was changed",)
     reached = []
     for goal, value in zip(goals, values):
         name, number = split_goal(goal.words)
@@ -260,7 +264,7 @@ def search_motion(
         proof=proof,
         condition=condition_numbers,
         goals=tuple(reached),
-        front=front,
+        front=None if stored is None else stored.values,
         playback=playback,
         notes=(*inputs.limits.notes, *inputs.model.notes, *notes, *inputs.columns.notes, *goal_notes, *playback.notes),
         outlook=outlook,
@@ -271,7 +275,11 @@ def search_motion(
 
 
 def _picked(
-    problem: ExcitationProblem, goals: Sequence[AttainmentGoal], front: StoredFront, inputs: ExcitationInputs
+    problem: ExcitationProblem,
+    goals: Sequence[AttainmentGoal],
+    front: StoredFront,
+    inputs: ExcitationInputs,
+    settings: ExcitationSettings,
 ) -> tuple[SearchResult, ExcitationProblem]:
     """Return the designed motion of a front, and the problem with the goals.
 
@@ -281,10 +289,19 @@ def _picked(
         front: front of an earlier design with the same settings.
         inputs: robot and model.
     """
-    joint_names, chain = front.designed.joint_names, inputs.chain
-    if joint_names != chain.joint_names:
-        joints, expected = ", ".join(joint_names), ", ".join(chain.joint_names)
+    stored, chain = front.designed, inputs.chain
+    if stored.joint_names != chain.joint_names:
+        joints, expected = ", ".join(stored.joint_names), ", ".join(chain.joint_names)
         raise UsageError(f"the front is of a robot with the joints {joints}; {chain.name} has {expected}")
+    shortest, longest = problem.stretch
+    factor = stored.period / problem.family.period
+    same_period = shortest * (1.0 - PERIOD_ROUNDING) <= factor <= longest * (1.0 + PERIOD_ROUNDING)
+    if not same_period or (stored.kind, stored.rate) != (settings.family, settings.rate):
+        of_front = f"{stored.kind}, {stored.period:g} s at {stored.rate:g} Hz"
+        of_settings = f"{settings.family}, {settings.period:g} s at {settings.rate:g} Hz"
+        raise UsageError(
+            f"the front's motions are {of_front}, the settings say {of_settings}; give the same, or design it again"
+        )
     motion = as_search_result(front.designed, problem.family)
     if goals:
         problem = replace(problem, goals=tuple(goals))

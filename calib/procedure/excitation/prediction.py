@@ -14,6 +14,9 @@ R is the number of rows that `calib identify` uses: twice the identification ban
 the rules of the identification. Before a log exists, σ_j is unknown: it consists of noise, and of friction that no term
 models. It is taken from the limits file ([noise]), or assumed as a share of the torque limits (stated, or
 `DEFAULT_NOISE`). All predicted σ except the geometry's part are proportional to it.
+
+After an identification, σ_j² is the spectral density of the errors that it left. Its share that grew with the torques'
+rates of change is scaled by the torques' variance on the new motion (`calib.identification.uncertainty.error_growth`).
 """
 
 from collections.abc import Callable, Sequence
@@ -63,12 +66,14 @@ class MotionPrediction:
         rows_per_joint: number of independent rows per joint.
         torque_sigma: (n,) rms over the typical task of the σ of the predicted torque [N m or N].
         torque_sigma_share: rms over the joints of `torque_sigma`, as a share of the torque limits.
+        error_growth: largest factor of a torque error's σ compared with that of the earlier motions; 1 without these.
     """
 
     seconds: float
     rows_per_joint: float
     torque_sigma: Array
     torque_sigma_share: float
+    error_growth: float = 1.0
 
 
 class PredictedSigma(NamedTuple):
@@ -353,9 +358,13 @@ def _prediction(
     motion = dense_motion(family, x, period / PERIOD_SAMPLES * np.arange(PERIOD_SAMPLES), factor)
     rows = 2.0 * _band(motion, period) * period * repeat
 
+    regressor = exact.regressor(motion.q, motion.v, motion.a)
+    growth = np.ones(regressor.shape[1])
     # rows are weighted by the stated density of the torques' errors, else by the noise of each independent row
     sigmas = inputs.columns.sigmas
     if sigmas is not None and inputs.errors_known:
+        growth = _growth(inputs, regressor)
+        sigmas = sigmas * growth
         weight = period * repeat / PERIOD_SAMPLES
         earlier = _information_root(inputs)
     else:
@@ -364,7 +373,7 @@ def _prediction(
         weight = rows / PERIOD_SAMPLES
         earlier = np.zeros((0, task.regressors.shape[2]))
     factors = np.sqrt(weight) / sigmas[:, None]
-    Y = exact.regressor(motion.q, motion.v, motion.a)[:, :, columns] * factors
+    Y = regressor[:, :, columns] * factors
     Y = Y.reshape(-1, len(task.regressors[0, 0]))
     geometry_torques = _geometry_torques(inputs, motion.q, motion.v, motion.a) * factors
     geometry_torques = geometry_torques.reshape(len(Y), -1)
@@ -372,7 +381,17 @@ def _prediction(
     information_shifts = earlier.T @ (earlier @ _shifts_before(inputs)) - Y.T @ geometry_torques
     shifts = root @ (root.T @ information_shifts)
     torque_sigma, share = _torque_sigma(inputs, task, root, shifts)
-    return MotionPrediction(period * repeat, rows, torque_sigma, share), root, shifts
+    prediction = MotionPrediction(period * repeat, rows, torque_sigma, share, float(growth.max()))
+    return prediction, root, shifts
+
+
+def _growth(inputs: ExcitationInputs, regressor: np.ndarray) -> np.ndarray:
+    """Return the factor (rows,) of the torque errors' σ on a motion with this regressor (N, rows, b); 1: not known."""
+    values = inputs.model.values
+    if inputs.prior is None or inputs.prior.growth is None or values is None:
+        return np.ones(regressor.shape[1])
+    torques = regressor @ values
+    return np.sqrt(inputs.prior.growth.factor(torques.var(axis=0)))
 
 
 def _band(motion: SampledMotion, period: float) -> float:
@@ -456,8 +475,9 @@ def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> l
     rows = [row for row in predicted if row.sigma_before]
     rows.sort(key=lambda row: row.sigma / (row.sigma_before or np.inf))
     gains = [f"{row.name} from ± {row.sigma_before:.3g} to ± {row.sigma:.3g} {row.unit}" for row in rows[:NAMED_GAINS]]
+    assumed = f"; torque errors assumed up to {outlook.own.error_growth:.2g} times those so far"
     return [
-        f"{head}{100 * outlook.before:.2g} % so far, with this motion {designed}{by_period}",
+        f"{head}{100 * outlook.before:.2g} % so far, with this motion {designed}{by_period}{assumed}",
         "most improved: " + "; ".join(gains),
     ]
 

@@ -11,6 +11,7 @@ from calib.dynamics.base import information
 from calib.errors import UsageError
 from calib.folders import COVARIANCE
 from calib.identification.identify_options import FileSettings
+from calib.identification.uncertainty.error_growth import ErrorGrowth
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.geometry_tables import TORQUE_COVARIANCE
 from calib.procedure.dynamic_stage.inputs import read_motion
@@ -62,12 +63,14 @@ class PriorMotions:
         information: (b, b) ∫ ωᵀω dt of the regressor ω (rows, b), restricted to the columns of the design, with the
             rows divided by `sigmas`.
         sigmas: (rows,) square root of the torque errors' spectral density that an identification states; None: 1.
+        growth: how these errors grow with the motion; None if unknown.
     """
 
     names: tuple[str, ...]
     seconds: float
     information: np.ndarray
     sigmas: np.ndarray | None = None
+    growth: ErrorGrowth | None = None
 
     def per_sample(self, count: int, duration: float) -> np.ndarray:
         """Return the information (b, b) of the earlier motions in units of one sample of a new motion.
@@ -108,12 +111,13 @@ def read_prior(
         return None
     column_count = len(model.exact.names)
     total = np.zeros((column_count, column_count))
-    sigmas = None
+    sigmas = growth = None
     names: list[str] = []
     identified: tuple[str, ...] = ()
     if after is not None:
         total, sigmas = _identified_information(after, model, geometry)
         names.append("what is identified")
+        growth = _growth(after, model)
         identified = tuple(IdentificationFolder(after).metrics().identification)
     row_sigmas = noise if sigmas is None else sigmas
     seconds = 0.0
@@ -126,7 +130,7 @@ def read_prior(
             q, v, a, rate = _recorded(text, chain)
         total += information(model.exact, q, v, a, row_sigmas) / rate
         seconds += len(q) / rate
-    return PriorMotions((*names, *paths), seconds, total, sigmas)
+    return PriorMotions((*names, *paths), seconds, total, sigmas, growth)
 
 
 def _identified_information(
@@ -171,6 +175,15 @@ def _identified_information(
         raise UsageError(f"{path} is not positive definite, so it is damaged; identify again")
     root_density = np.tile(np.sqrt(density), len(model.exact.loads))
     return np.linalg.inv(correlation) / scale, root_density
+
+
+def _growth(folder: Path, model: ExcitedModel) -> ErrorGrowth | None:
+    """Return how the torque errors of an identification grow with the motion; None for files of earlier versions."""
+    metrics = IdentificationFolder(folder).metrics()
+    if metrics.error_growth is None or metrics.torque_variance is None:
+        return None
+    loads = len(model.exact.loads)
+    return ErrorGrowth(np.tile(metrics.error_growth, loads), np.tile(metrics.torque_variance, loads))
 
 
 def designed_orders(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

@@ -80,6 +80,8 @@ def read(folder: Path) -> StoredFront:
     """
     path = folder / TABLE
     require(path.is_file(), f"{folder} has no {TABLE}: design the motion with --front 5 first", UsageError)
+    message = f"{folder}: its front was made by a version that kept no motions; design it again"
+    require((folder / FOLDER).is_dir(), message, UsageError)
     damaged = f"{path} is damaged ({{}}); design the motion again"
     with refused_as(UsageError, (OSError, ValueError, MeasurementError), damaged):
         table = read_table(path)
@@ -104,7 +106,7 @@ def as_search_result(motion: Periodic, family: Family) -> SearchResult:
     message = "the front was designed with other harmonics or another start; give the same ones, or design it again"
     with refused_as(UsageError, (ValueError, IndexError, BadInput), message):
         variables = family.variables(motion.coefficients)
-        for stored, again in zip(motion.coefficients, family.coefficients(variables), strict=True):
-            require(np.allclose(stored, again, atol=1e-6), "", ValueError)
+        for stored, nearest in zip(motion.coefficients, family.coefficients(variables), strict=True):
+            require(np.allclose(stored, nearest, atol=1e-6), "", ValueError)
     factor = motion.period / family.period
     return SearchResult(variables, factor, np.nan, np.array([]), (), 0, 1.0, 0.0)

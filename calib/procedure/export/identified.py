@@ -112,11 +112,14 @@ class ExportedPrediction:
     Attributes:
         file: table of the recording's torques, relative to the folder of the identification.
         exported, identified: shares of the exported robot and of the identified model [%].
+        tested: the exported robot's share that is compared with a tolerance [%]: without what is above the
+            identification band, where that is most of the error; None in files of earlier versions.
     """
 
     file: str
     exported: float
     identified: float
+    tested: float | None = None
 
     def __str__(self) -> str:
         return (
@@ -146,13 +149,20 @@ def exported_prediction(robot: IdentifiedRobot, folder: Path) -> ExportedPredict
             continue
         measured = motion["measured"]
         torque = dynamics.model.torque(dynamics.values, motion["q"], motion["v"], motion["a"], ())
-        one_percent = np.linalg.norm(measured) / 100.0
-        exported = float(np.linalg.norm(measured - torque) / one_percent)
-        identified = float(np.linalg.norm(measured - motion["predicted"]) / one_percent)
-        if score is not None:
-            exported, identified = score.without_floor(exported), score.without_floor(identified)
+        one_percent = float(np.linalg.norm(measured)) / 100.0
+        residual, change = measured - motion["predicted"], motion["predicted"] - torque
+        exported = float(np.linalg.norm(residual + change)) / one_percent
+        identified = float(np.linalg.norm(residual)) / one_percent
+        tested = exported
+        if score is not None and score.floor_dominates:
+            # noise is not correlated with the change of a prediction, so that its square need not be known
+            added = float(np.sum(change**2) + 2.0 * np.sum(residual * change)) / one_percent**2
+            in_band = score.counted(in_band=True).total
+            tested = float(np.sqrt(max(in_band**2 + added, 0.0)))
+            if score.noisy:
+                exported, identified = tested, in_band
         if worst is None or exported > worst.exported:
-            worst = ExportedPrediction(str(path.relative_to(folder)), exported, identified)
+            worst = ExportedPrediction(str(path.relative_to(folder)), exported, identified, tested)
     return worst
 
 

@@ -13,6 +13,7 @@ from calib.data.images.pixels import Pixels
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, finding
 from calib.geometry.accuracy import NATURE, errors
+from calib.geometry.checks.base_motion import base_motion
 from calib.geometry.checks.joint_range import JointRange
 from calib.geometry.checks.readings import repeated_readings
 from calib.geometry.diagnosis import Scale, length_factor, scale_of, wrong_angles, wrong_columns
@@ -166,7 +167,7 @@ def findings(
         sample.append(_as_positions(take(block, rows)))
 
     misread = _misread(nominal, sample) + _wrong_columns(nominal, sample, before, reach)
-    result = repeated_readings(nominal, sample) + (misread or _large_changes(fit, reach))
+    result = base_motion(blocks) + repeated_readings(nominal, sample) + (misread or _large_changes(fit, reach))
     result.append(finding("unexplained", rms=remains, reach=reach, share=remains / reach))
     if 0.0 < after < TOO_GOOD:
         arm, rms = ("nominal", before) if before < TOO_GOOD else ("calibrated", after)

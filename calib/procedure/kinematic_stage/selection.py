@@ -157,7 +157,7 @@ def choose(
     limits = read_limits(constraints, cell, source, settings.without)
     view = limits.camera
     if view is None:
-        jacobian = observation(cell, settings.kind, settings.sigmas, settings.seed)
+        jacobian = observation(cell, settings.kind, settings.sigmas, settings.seed, settings.reference)
     else:
         jacobian = view.observation(limits.lower, limits.upper, settings.seed)
     space = limits.space(jacobian)

@@ -70,6 +70,7 @@ class SelectionSettings:
         method: search method: detmax, polish, local, multistart, mlsl (NLopt's, global) or tabu
         candidates: number of poses to choose from
         sigmas: measurement σ of a position [m] and an orientation [rad], e.g. 1e-4,1e-4; default equal ones
+        reference: a frame on the robot's base is measured beside the target, with the same σ: the noise of both counts
         seed: reproduces everything random
         starts: number of random starting sets of multistart
         evaluations: largest number of index evaluations in one local search
@@ -85,6 +86,7 @@ class SelectionSettings:
     method: Method = "detmax"
     candidates: Annotated[int, Whole(1, 1_000_000)] = 2000
     sigmas: tuple[Sigma, Sigma] | None = None
+    reference: Flag = False
     seed: Seed = 0
     starts: Annotated[int, Whole(1)] = 8
     evaluations: Annotated[int, Whole(1)] = 5000

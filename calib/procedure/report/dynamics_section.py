@@ -210,6 +210,7 @@ def report_section(
     tolerance: float = 0.0,
     delivered: float | None = None,
     tolerances: Sequence[float] = (),
+    joint_count: int = 0,
 ) -> page.Section:
     """Return the report section on the dynamics: errors on held-out motion, torques, excitation, and parameters.
 
@@ -220,11 +221,12 @@ def report_section(
         tolerance: largest acceptable torque error on held-out motion [%]; 0: no tolerance.
         delivered: torque error of the exported robot on held-out motion [%]; None: unknown.
         tolerances: largest acceptable rms torque error of each joint, or one for all [N m or N]; empty: none.
+        joint_count: number of joints to which the tolerances apply; 0: as many as there are torque rows.
     """
     metrics, unseen = report.metrics, report.unseen
     blocks: list[page.Block] = [_error_table(unseen), _reference_table(unseen), _interval_table(unseen)]
     if tolerances:
-        blocks.insert(0, _test_table(unseen, tolerances))
+        blocks.insert(0, _test_table(unseen, tolerances, joint_count or len(unseen.rows)))
 
     torque_figures = [name for name in figures if name.startswith("torque_")]
     blocks.append(page.pictures("", figures, ("errors", "residuals")))
@@ -251,13 +253,21 @@ def report_section(
     return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, key_figures)
 
 
-def _test_table(unseen: UnseenReport, tolerances: Sequence[float]) -> page.ReportTable:
-    """Return the table of the computed-torque test: rms error of each torque row beside its tolerance."""
+def _test_table(unseen: UnseenReport, tolerances: Sequence[float], joint_count: int) -> page.ReportTable:
+    """Return the table of the computed-torque test: rms error of each torque row beside its tolerance.
+
+    Args:
+        unseen: report on the model's errors on held-out motion.
+        tolerances: tolerance of each joint, or one for all [N m or N].
+        joint_count: number of joints.
+    """
+    answers = {True: "yes", False: "no", None: "not tested"}
+    units = dict(zip(unseen.rows, unseen.units))
     rows = []
-    for test in torque_tests(tolerances, unseen.proofs, unseen.rows):
-        met = "yes" if test.passed else "no"
-        rows.append([test.row, f"{test.rms:.3g}", f"{test.tolerance:g}", met, test.recording])
-    header = ("torque", "rms error [N m or N]", "tolerance", "within", "recording")
+    for test in torque_tests(tolerances, unseen.proofs, unseen.rows, joint_count):
+        rms = "–" if test.passed is None else f"{test.rms:.3g} {units[test.row]}"
+        rows.append([test.row, rms, f"{test.tolerance:g} {units[test.row]}", answers[test.passed], test.recording])
+    header = ("torque", "rms error", "tolerance", "within", "recording")
     return page.ReportTable("Computed-torque test on unseen motion", header, rows, numbers=[1, 2])
 
 

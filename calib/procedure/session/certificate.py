@@ -124,7 +124,8 @@ def _dynamics(session: Session) -> StageRecord:
     delivered = None if predicted is None else predicted.exported
     exported = read_state(session).notes("export")
     tolerances = session.settings.dynamics.tolerance_torque
-    section = dynamics_section.report_section(report, figures, exported, allowed, delivered, tolerances)
+    joint_count = len(chain_of(session).joints)
+    section = dynamics_section.report_section(report, figures, exported, allowed, delivered, tolerances, joint_count)
     verdict = session.verdicts().stages["dynamics"]
     section = replace(section, verdict=verdict.level, reason=verdict.reason)
     stage = dynamics_pages.stage(report, section, session.plots, allowed)
@@ -262,6 +263,8 @@ def _instrument(session: Session, metrics: FitMetrics) -> str:
         sigma = f"σ {1e6 * instrument.sigma_position:g} µm"
     if instrument.sigma_orientation:
         sigma += f", {1e3 * instrument.sigma_orientation:g} mrad"
+    if instrument.reference:
+        sigma += ", seen from a frame on the base that was measured with every row"
     return f"{instrument.name}, {measures}, {sigma}"
 
 

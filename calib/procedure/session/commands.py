@@ -21,6 +21,7 @@ from calib.data.poses import IMAGES
 from calib.errors import UsageError, command_line, require
 from calib.folders import CERTIFICATE, PAGES, SESSION
 from calib.geometry.observability import targets_of
+from calib.procedure.dynamic_stage.computed_torque import check_tolerances
 from calib.procedure.excitation.coefficients import RUN, SAMPLES
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.kinematic_stage.folder import CORRECTED_URDF, TERMS, URDF
@@ -29,7 +30,7 @@ from calib.procedure.measuring.pose_limits import read_limits, tables_of
 from calib.procedure.report import page
 from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import steps
-from calib.procedure.session.dynamics_steps import pick_motion, unrecorded_payloads
+from calib.procedure.session.dynamics_steps import pick_motion, picked_front, unrecorded_payloads
 from calib.procedure.session.folder import POSES, UNSEEN, WAYS, Say, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
@@ -103,15 +104,21 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
             f"[deg] … {joints[-1]} [deg]; one row per image), board.toml (calib board makes boards), and camera.yaml "
             "if the lens is known (calib formats images)"
         )
+    base_frame = ""
+    if instrument.reference:
+        base_frame = " and, at the same time, the frame on the base"
     task = _numbered(
         f"Drive {poses}; at each let the arm settle.",
-        f"Measure the target's {instrument.measures} with the {instrument.name} and log the joint angles read back.",
+        f"Measure the target's {instrument.measures}{base_frame} with the {instrument.name} "
+        "and log the joint angles read back.",
         "At the end, measure the first three again to check for drift (optional, into drift.csv).",
     )
     columns = [f"{joint} [deg]" for joint in joints]
     columns += ["x [mm]", "y [mm]", "z [mm]"]
     if instrument.measures == "pose":
         columns += ["qx", "qy", "qz", "qw"]
+    if instrument.reference:
+        columns += ["base_x [mm]", "base_y [mm]", "base_z [mm]", "base_qx", "base_qy", "base_qz", "base_qw"]
     return task, (
         f"{' and '.join(files)}, one row per pose: {', '.join(columns)} (calib formats measurements), "
         "or joints and points apart, by calib join"
@@ -256,6 +263,7 @@ def new_session(
     seed: int = 0,
     program: str = "",
     tolerance_mm: float = 0.0,
+    reference: bool = False,
     certificate: Mapping[str, object] | None = None,
     **motion: object,
 ) -> Path:
@@ -274,6 +282,7 @@ def new_session(
         seed: seed of all random numbers.
         program: robot controller in whose language the poses are written, too (`calib program --list`); empty: none.
         tolerance_mm: largest accepted rms on held-out poses [mm]; 0: none.
+        reference: whether a frame on the robot's base is measured beside the target.
         certificate: keys of ``[certificate]``: entries of the certificate besides results; None: all are empty.
         motion: other keys of ``[dynamics]`` (``calib formats session``): torques, payloads, period …
 
@@ -290,6 +299,12 @@ def new_session(
     chain = load(robot, base or None, tip or None)
     if program:
         check_controller(program, chain.n)
+    of_instrument: dict[str, object] = {**asdict(device), "reference": reference}
+    if tool is not None:
+        of_instrument["tool"] = [*map(float, tool)]
+    tolerances = motion.get("tolerance_torque", ())
+    if isinstance(tolerances, Sequence):
+        check_tolerances(tolerances, chain.n)
     copied, named = _limits(limits, chain, source, dynamics)
     table = {
         "name": chain.name,
@@ -297,7 +312,7 @@ def new_session(
         "seed": seed,
         "fit": {"tolerance_mm": tolerance_mm},
         "robot": {"file": source.name, "given": str(robot), "base": base, "tip": tip, "controller": program},
-        "instrument": asdict(device) | ({} if tool is None else {"tool": [*map(float, tool)]}),
+        "instrument": of_instrument,
         "poses": {"fit": poses, "validation": validation, "constraints": named},
         "dynamics": {"wanted": dynamics, "limits": named, **motion},
         "certificate": dict(certificate or {}),
@@ -357,7 +372,8 @@ def go_on(
     with locked(session, say):
         if pick:
             step = steps.find(session, "excite")
-            steps.run_instead(session, step, partial(pick_motion, pick), say, progress, command)
+            make = partial(pick_motion, picked_front(session, pick))
+            steps.run_instead(session, step, make, say, progress, command)
         if again:
             steps.forget(session, steps.find(session, again))
         state = steps.run_next(session, say, progress, command)

@@ -125,9 +125,23 @@ def of_session(
         blocks: measurements for the fit.
         again: measurements repeated at the end.
     """
-    sigma, tolerance = session.settings.instrument.sigma_position, 1e-3 * session.settings.fit.tolerance_mm
+    instrument, tolerance = session.settings.instrument, 1e-3 * session.settings.fit.tolerance_mm
+    sigma = instrument.sigma_position
+    if instrument.reference and sigma:
+        sigma = _stated_sigma(blocks) or sigma
     trended = [one.finding(tolerance or noise_of_difference(sigma)) for one in trends(chain, blocks, again, sigma)]
     return [*repeats(chain, blocks, again, sigma), *trended]
+
+
+def _stated_sigma(blocks: Sequence[PoseMeasurements]) -> float:
+    """Return the rms of the positions' stated σ per axis [m], which seen from a base frame grow with the distance.
+
+    0 without stated σ.
+    """
+    squares = [block.sigma.ravel() ** 2 for block in blocks if isinstance(block, Positions) and block.sigma is not None]
+    if not squares:
+        return 0.0
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
 def repeats(

@@ -17,7 +17,7 @@ from calib.column_changes import Change
 from calib.data.recordings.recording import Recording, parse_cut
 from calib.data.recordings.recording_files import read_recording
 from calib.dynamics.torque_rows import torque_rows
-from calib.errors import CalibError, Finding, command_line, finding, refuse_data
+from calib.errors import CalibError, Finding, UsageError, command_line, finding, refuse_data, require
 from calib.identification.checks.recorded_motion import (
     EDGE_TIME,
     DesignedMotion,
@@ -83,25 +83,50 @@ def options_of(session: Session) -> IdentifyOptions:
 def _labels_in(name: str, labels: Iterable[str]) -> tuple[str, ...]:
     """Return the labels that are words of a recording's name, such as ``load`` of ``training_load_log``.
 
-    Digits may follow a label, as in ``training_load2_log``, unless the longer word is a label, too.
+    A number may follow a label, as in ``training_load2_log``; where a longer label matches, only this one counts.
+    Without such words the labels count with which a word begins, as in ``training_loaded_log``.
 
     Args:
         name: file name of the recording.
         labels: labels of all payloads.
     """
-    words = []
+    as_words = _spans(name, labels, r"(?![^\W_])")
+    return as_words or _spans(name, labels, "")
+
+
+def _spans(name: str, labels: Iterable[str], end: str) -> tuple[str, ...]:
+    """Return the labels at the beginnings of words in a name, without those inside a longer match.
+
+    Args:
+        name: the name.
+        labels: the labels.
+        end: pattern behind a label and its number.
+    """
+    matches = {}
     for label in labels:
-        word = re.compile(rf"(?<![^\W_]){re.escape(label)}(?![^\W\d_])", re.IGNORECASE)
-        if word.search(name):
-            words.append(label)
-    return tuple(label for label in words if not any(label != word and word.startswith(label) for word in words))
+        number = r"" if label[-1].isdigit() else r"\d*"
+        match = re.search(rf"(?<![^\W_]){re.escape(label)}{number}{end}", name, re.IGNORECASE)
+        if match is not None:
+            matches[label] = match.span()
+    longest = []
+    for label, (start, stop) in matches.items():
+        is_part = False
+        for rival, (first, last) in matches.items():
+            is_part = is_part or (first <= start and stop <= last and len(rival) > len(label))
+        if not is_part:
+            longest.append(label)
+    return tuple(longest)
 
 
 def unrecorded_payloads(session: Session) -> list[str]:
     """Return the labels of the session's payloads that no training recording carries."""
     if not session.settings.dynamics.payloads:
         return []
-    options = options_of(session)
+    try:
+        options = options_of(session)
+    except CalibError:
+        # the step that reads the options says what is wrong with them
+        return []
     carried = set()
     for path in session.brought("training"):
         carried.update(options.file_settings(str(path)).payload)
@@ -115,10 +140,21 @@ def excite(session: Session, say: Say) -> list[str | Note]:
         session: the session.
         say: called with progress texts.
     """
-    section = session.settings.dynamics
-    if not section.plan:
+    if not session.settings.dynamics.plan:
         return ["no motion was designed, since plan = false: the recordings may contain any motions"]
-    notes = _design(session, "training", _training_settings(session), say)
+    return _designs(session, say)
+
+
+def _designs(session: Session, say: Say, picked: StoredFront | None = None) -> list[str | Note]:
+    """Design both motions of a session, and return notes.
+
+    Args:
+        session: the session.
+        say: called with progress texts.
+        picked: front whose designed motion is the training motion; None: search.
+    """
+    section = session.settings.dynamics
+    notes = _design(session, "training", _training_settings(session), say, picked)
     if section.validation:
         notes += _design(session, "validation", _validation_settings(session), say)
     if session.named(section.limits) is None:
@@ -166,22 +202,27 @@ def _validation_settings(session: Session) -> ExcitationSettings:
     )
 
 
-def pick_motion(number: int, session: Session, say: Say) -> list[str | Note]:
-    """Make motion `number` of the front the training motion, design the validation motion for it, and return notes.
+def pick_motion(picked: StoredFront, session: Session, say: Say) -> list[str | Note]:
+    """Make the designed motion of a front the training motion, design the validation motion, and return notes.
 
     Args:
-        number: number of the motion in the front, from 1.
+        picked: the front of the session's training motion, with the motion to take as the designed one.
         session: the session.
         say: called with progress texts.
+    """
+    return _designs(session, say, picked)
+
+
+def picked_front(session: Session, number: int) -> StoredFront:
+    """Return the front of the session's training motion with motion `number`, from 1, as the designed one.
 
     Raises:
         UsageError: if the training motion has no front, or no such motion.
     """
-    picked = stored_front.read(session.path("6-excitation/training")).with_designed(number)
-    notes = _design(session, "training", _training_settings(session), say, picked)
-    if session.settings.dynamics.validation:
-        notes += _design(session, "validation", _validation_settings(session), say)
-    return notes
+    folder = session.path("6-excitation/training")
+    message = f"{folder} has no front: write front = 5 and a torque goal under [dynamics] of session.toml"
+    require((folder / stored_front.TABLE).is_file(), message, UsageError)
+    return stored_front.read(folder).with_designed(number)
 
 
 def _design(
@@ -219,7 +260,7 @@ def _design(
     motion_folder.write_design(designed, session.path("6-excitation") / name, draw)
 
     condition, columns = designed.condition, len(designed.inputs.model.exact.names)
-    notes = [
+    notes: list[str | Note] = [
         f"{name}: {designed.period:g} s, condition number {condition.raw:.3g} raw, {condition.normalised:.3g} "
         f"normalised, {columns} columns; all limits are respected"
     ]
@@ -230,9 +271,9 @@ def _design(
             choose = command_line("next", session.folder, "--pick", "N")
             table = session.path("6-excitation/training") / stored_front.TABLE
             notes.append(Note(f"{name}: {count} motions to choose from ({table}): {choose}", is_warning=True))
-        remarks = [*designed.inputs.limits.bounds.lines()]
-        remarks += [note for note in designed.notes if note not in designed.doubts]
-        notes += [f"{name}: {remark}" for remark in remarks]
+        for remark in (*designed.inputs.limits.bounds.lines(), *designed.notes):
+            if remark not in designed.doubts:
+                notes.append(f"{name}: {remark}")
     return notes
 
 
@@ -452,10 +493,11 @@ def _gathered(
     """
     motions = designed_motions(session)
     options = options_of(session)
-    # the options of a recording of the session that is not read here do not apply
-    brought = {path.name for path in session.brought("training", "unseen")}
-    read = {Path(parse_cut(recording)[0]).name for recording in (*training, *unseen)}
-    by_file = {name: entry for name, entry in options.files.items() if name in read or name not in brought}
+    # settings of recordings that are not read are refused
+    session_files = {path.name for path in session.brought("training", "unseen")}
+    used_files = {Path(parse_cut(recording)[0]).name for recording in (*training, *unseen)}
+    unused = session_files - used_files
+    by_file = {name: entry for name, entry in options.files.items() if Path(name).name not in unused}
     return inputs.gather(
         session.fit.path,
         training,
@@ -542,7 +584,7 @@ def _as_delivered(session: Session, gathered: inputs.IdentificationInputs, asses
 
     verdict = assessment.verdict
     exported = Export(session.robot_file, identified=session.identification.path)
-    errors = [score.judged.total for score in assessment.proofs.values()]
+    errors = [score.counted(score.floor_dominates).total for score in assessment.proofs.values()]
     error, model = max(errors, default=0.0), "identified model"
     predicted = None
     try:
@@ -550,9 +592,9 @@ def _as_delivered(session: Session, gathered: inputs.IdentificationInputs, asses
         predicted = exported.with_masses and exported.prediction
     except CalibError as reason:
         verdict = verdict.for_prediction(f"the dynamics cannot be exported: {reason}")
-    if predicted is not None:
-        error, model = predicted.exported, "exported robot"
-        figure = f"{error:.2f} % of the torque unexplained by the exported robot"
+    if predicted:
+        error, model = predicted.exported if predicted.tested is None else predicted.tested, "exported robot"
+        figure = f"{predicted.exported:.2f} % of the torque unexplained by the exported robot"
         verdict = replace(verdict, reason=f"{figure} (identified model: {verdict.reason})")
     section = session.settings.dynamics
     excesses = []
@@ -561,10 +603,10 @@ def _as_delivered(session: Session, gathered: inputs.IdentificationInputs, asses
             f"the {model} has an error of {error:.2f} %, above the tolerance of {section.tolerance_percent:g} %"
         )
     rows = gathered.options.settings.torque_rows.titles(gathered.chain.joint_names)
-    tests = torque_tests(section.tolerance_torque, assessment.proofs, rows)
-    failed = [f"{test.row} {test.rms:.3g} (tolerance {test.tolerance:g})" for test in tests if not test.passed]
+    tests = torque_tests(section.tolerance_torque, assessment.proofs, rows, len(gathered.chain.joints))
+    failed = ", ".join(str(test) for test in tests if test.passed is False)
     if failed:
-        excesses.append(f"rms torque errors [N m or N] of the identified model above tolerance: {', '.join(failed)}")
+        excesses.append(f"rms torque errors [N m or N] of the identified model above tolerance: {failed}")
     if not excesses:
         return verdict
     return Verdict("fail", "; ".join([verdict.reason, *excesses]))

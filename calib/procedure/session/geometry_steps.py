@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from calib import files
 from calib.data.images.coverage import image_words
 from calib.data.images.pixels import Pixels
-from calib.data.poses import IMAGES
+from calib.data.poses import IMAGES, MEASURED
 from calib.data.poses.fit_options import FileOptions, FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.data.poses.pose_lists import (
@@ -31,6 +31,7 @@ from calib.data.schema import Joints
 from calib.errors import CalibError, Finding, UsageError, finding
 from calib.extensions import Point
 from calib.folders import write_staged
+from calib.geometry.checks.base_motion import base_motion
 from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets_of
 from calib.identification.model_file import MODEL
 from calib.poses.candidates import draw_candidates
@@ -98,6 +99,7 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
             index=section.index,
             method=section.method,
             sigmas=sigmas,
+            reference=instrument.reference,
             seed=settings.seed,
         ),
         constraints=session.named(section.constraints),
@@ -215,18 +217,22 @@ def _options_of(session: Session, paths: Sequence[Path] = ()) -> FitOptions:
             plan = session.path(f"2-poses/{folder.UNSEEN if path in validation else folder.POSES}")
             if plan.exists():
                 by_file[path.name] = replace(options.for_file(path), planned=str(plan))
-    by_file = {name: _with_sigma(session, file_options) for name, file_options in by_file.items()}
-    return replace(options, sigma=_with_sigma(session, options).sigma, files=by_file)
+    by_file = {name: _with_instrument(session, file_options) for name, file_options in by_file.items()}
+    common = _with_instrument(session, options)
+    return replace(options, sigma=common.sigma, base_frame=common.base_frame, files=by_file)
 
 
-def _with_sigma(session: Session, options: FileOptions) -> FileOptions:
-    """Return a file's options in which the σ of a session's instrument replace missing σ."""
+def _with_instrument(session: Session, options: FileOptions) -> FileOptions:
+    """Return a file's options completed by a session's instrument: its σ, and whether it measures a base frame."""
     instrument, sigma = session.settings.instrument, options.sigma
     if instrument.sigma_position and sigma.position is None:
         sigma = replace(sigma, position=(instrument.sigma_position,) * 3)
     if instrument.sigma_orientation and sigma.orientation is None:
         sigma = replace(sigma, orientation=(instrument.sigma_orientation,) * 3)
-    return replace(options, sigma=sigma)
+    base_frame = options.base_frame
+    if instrument.reference and base_frame == FileOptions.base_frame:
+        base_frame = MEASURED
+    return replace(options, sigma=sigma, base_frame=base_frame)
 
 
 def describe(session: Session, say: Say) -> list[str]:
@@ -328,6 +334,7 @@ def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMea
         if planned is not None:
             remarks += check_against(planned, block)
         notes += [Note(f"{name}: {remark}") for remark in remarks]
+        notes += notes_of(base_motion([block]))
         if planned is not None:
             for note in notes_of(readback(planned, block)):
                 notes.append(Note(f"{name}: {note.text}", note.is_warning))

@@ -14,11 +14,12 @@ from calib.controllers.table import controller_named
 from calib.data.images.board import read_board
 from calib.data.images.lens import read_lens
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
+from calib.data.poses.measurements import Poses, Positions
 from calib.errors import CalibError, UsageError, one_of, refused_as, require
 from calib.procedure.answers import CAMERA, CELL, Answers, CertificateSection
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, checked_goal
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
-from calib.procedure.session.settings import NOTHING, InstrumentSection
+from calib.procedure.session.settings import NOTHING, InstrumentSection, check_labels
 from calib.records import FieldValues
 from calib.robot.library import resolve
 from calib.transforms import pose, to_xyz_rpy
@@ -100,6 +101,8 @@ class Question:
                 return not answers.cell
             case "cone" | "facing":
                 return "instrument" in cell_tables(instrument_at=answers.instrument_at)
+            case "reference":
+                return measures == Poses.kind
             case "mounting":
                 return camera
             case "lens" | "board" | "carried" | "stands":
@@ -126,6 +129,7 @@ def _questions() -> tuple[Question, ...]:
 DEFAULTS = {
     "robot": "",
     "instrument": "tracker",
+    "reference": "no",
     "tool": "0.05,0,0.05",
     "program": "none",
     "limits": "none",
@@ -172,12 +176,13 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
         case "goals":
             value = [] if is_empty else text.split()
         case "period":
-            value = Real(quantity="1").read(text)
+            with refused_as(UsageError, ValueError, f"--period {text}: expected a number of seconds"):
+                value = Real(quantity="1").read(text)
         case "front":
             value = int(text) if text.isdecimal() else text
         case "obstacles":
             value = [text]
-        case "dynamics" | "details":
+        case "dynamics" | "details" | "reference":
             value = {"y": True, "n": False}.get(text[:1].lower(), text)
     result = replace(answers, **{name: getattr(parse(Answers, {name: value}, ""), name)})
     if name == "program" and not is_empty:
@@ -208,6 +213,11 @@ def checked(answers: Answers) -> FieldValues:
         raise CalibError(
             f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}: leave it out"
         )
+    require(
+        not answers.reference or _measures(answers) in (Poses.kind, Positions.kind),
+        f"--reference applies to a target's pose or position; the instrument is {instrument}: leave it out",
+        UsageError,
+    )
     dynamics = answers.dynamics is not False
     for goal in answers.goals:
         checked_goal(goal)
@@ -217,6 +227,8 @@ def checked(answers: Answers) -> FieldValues:
         "goal": answers.goals,
         "period": answers.period,
         "front": answers.front,
+        "tolerance-percent": answers.tolerance_percent,
+        "tolerance-torque": answers.tolerance_torque,
     }
     for option, answer in of_dynamics.items():
         require(
@@ -236,6 +248,7 @@ def checked(answers: Answers) -> FieldValues:
     optional = {
         "payloads": stated_payloads(answers.payloads),
         "certificate": asdict(answers.certificate),
+        "reference": answers.reference,
         "tool": answers.tool,
         "program": answers.program,
         "torques": answers.torques,
@@ -266,6 +279,8 @@ def stated_payloads(texts: Sequence[str]) -> dict[str, dict[str, object]]:
             label not in payloads, f"--payload {text}: '{label}' is stated twice; give each payload a label", UsageError
         )
         payloads[label] = payload
+    with refused_as(UsageError, ValueError, "--payload: {}"):
+        check_labels(payloads)
     return payloads
 
 

@@ -12,6 +12,7 @@ motion does not help, since the remaining error is an effect that is not modelle
 """
 
 from dataclasses import replace
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -145,8 +146,9 @@ def _short_joints(session: Session, tolerance: float) -> list[_ShortParameter]:
     """
     report = session.identification.unseen.read()
     recordings = (report.proofs or report.fit).values()
-    worst = max(recordings, key=lambda recording: recording.raw.relative_error_percent.total).raw
-    if not tolerance or worst.relative_error_percent.total <= tolerance:
+    errors_in_motion = [recording.counted(recording.floor_dominates) for recording in recordings]
+    worst = max(errors_in_motion, key=attrgetter("total"))
+    if not tolerance or worst.total <= tolerance:
         return []
     n = session.identification.dynamics().model.n
     # the motors' rows come last
@@ -233,7 +235,10 @@ def promised(session: Session) -> tuple[str, ...]:
     played = folder / SAMPLES
     if session.settings.dynamics.repeats > 1:
         played = folder / RUN
-    task = f"play {played}, put its log into {session.path(f'7-recorded/{name}_log.csv')}; then: "
+    logs = [f"{name}_log.csv", *(f"{name}_{label}_log.csv" for label in session.settings.dynamics.payloads)]
+    paths = " and ".join(str(session.path(f"7-recorded/{log}")) for log in logs)
+    loads = " without and with each payload" if session.settings.dynamics.payloads else ""
+    task = f"play {played}{loads}, put the log into {paths}; then: "
     return (notes[0], f"if wanted, {task}{command_line('next', session.folder)}")
 
 

@@ -17,6 +17,7 @@ from calib.config import described, parse, read_toml, strict
 from calib.config_types import Checked, Expect, Flag, Holdout, Name, NotNegative, OneOf, Seed, Text, Whole, shown
 from calib.data.poses import Loss, Model
 from calib.data.poses.fit_options import FitOptions, MetresOrZero, RadiansOrZero
+from calib.data.poses.measurements import Poses, Positions
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.registry import METHODS
@@ -114,6 +115,8 @@ class InstrumentSection:
         measures: pose (position and orientation), position or pixels; nothing: the geometry is not fitted
         sigma_position: standard deviation of one measurement, per axis [m]; 0: estimated from the residuals
         sigma_orientation: standard deviation of one measurement, per axis [rad]; 0: estimated from the residuals
+        reference: true: a frame on the robot's base is measured with every row (columns base_x …), and the target is
+            seen from there
         tool: approximate position of the target in the tip's frame; for pose selection only
     """
 
@@ -122,6 +125,13 @@ class InstrumentSection:
     sigma_position: MetresOrZero = 0.0
     sigma_orientation: RadiansOrZero = 0.0
     tool: Annotated[tuple[float, float, float], Expect("three numbers [m]")] = (0.05, 0.0, 0.05)
+    reference: Flag = False
+
+    def __post_init__(self) -> None:
+        if self.reference and self.measures not in (Poses.kind, Positions.kind):
+            raise ValueError(
+                f"reference = true applies to poses and positions; the instrument measures {self.measures}"
+            )
 
 
 @strict
@@ -241,7 +251,7 @@ class DynamicsSection:
     payloads: Mapping[str, Annotated[Payload, Checked(mass_as_payload)]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        _check_labels(self.payloads)
+        check_labels(self.payloads)
         if self.repeats > MAX_SAMPLES / max(self.period * self.rate, 1e-300):  # a quotient: repeats may be huge
             raise ValueError(
                 f"period {self.period:g} s at rate {self.rate:g} Hz, repeated {self.repeats} times, is more than "
@@ -249,7 +259,7 @@ class DynamicsSection:
             )
 
 
-def _check_labels(labels: Iterable[str]) -> None:
+def check_labels(labels: Iterable[str]) -> None:
     """Raise a ValueError if a label occurs in the names of all recordings, which labels assign to payloads."""
     for label in labels:
         if label.lower() in RECORDING_WORDS:

@@ -184,13 +184,15 @@ class SessionStep:
             return ""
         if not kind:
             return ""
-        if not session.brought(kind):
-            return words
-        if kind == "training":
-            missing = dynamics_steps.unrecorded_payloads(session)
-            if missing:
-                return f"{words} with '{missing[0]}'; if there is none, remove [dynamics.payloads] from session.toml"
-        return ""
+        return "" if session.brought(kind) else words
+
+    def lacks(self, session: Session) -> str:
+        """Return a description of further recordings that a step waits for, unless it was completed without them."""
+        kind, words = self.brings
+        missing = dynamics_steps.unrecorded_payloads(session) if kind == "training" else []
+        if not missing:
+            return ""
+        return f"{words} with '{missing[0]}'; if there is none, remove [dynamics.payloads] from session.toml"
 
 
 ROBOT = NamedFile("robot", "file")
@@ -204,6 +206,8 @@ TOLERANCES = ("tolerance_percent", "tolerance_torque")
 # keys of [dynamics] on which a designed motion depends
 DESIGN_KEYS = (
     "plan",
+    "torques",
+    "payloads",
     "validation",
     "period",
     "harmonics",
@@ -292,7 +296,7 @@ STEPS = (
         "excite",
         "design the motions to record",
         dynamics_steps.excite,
-        reads=(FITTED_ROBOT, NamedFile("dynamics", "limits")),
+        reads=(FITTED_ROBOT, NamedFile("dynamics", "limits"), IDENTIFY_OPTIONS),
         makes=("6-excitation/training/*", "6-excitation/validation/*"),
         settings=(StepSetting("dynamics", DESIGN_KEYS), StepSetting("seed")),
         stage="dynamics",
@@ -432,9 +436,12 @@ def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
     if recorded.running == step.name:
         return State(step, READY, "was interrupted; will be repeated")
     entry = recorded.steps.get(step.name)
+    changes = "" if entry is None else changed_inputs(entry.inputs, _fingerprints(session, step))
+    lacking = step.lacks(session) if entry is None or changes else ""
+    if lacking:
+        return State(step, WAITING, lacking)
     if entry is None:
         return State(step, READY, step.purpose)
-    changes = changed_inputs(entry.inputs, _fingerprints(session, step))
     if changes:
         kinds, reason = step.kept
         if session.brought(*kinds):
@@ -561,16 +568,15 @@ def run_instead(session: Session, step: SessionStep, make: Make, say: Say, progr
     Raises:
         SessionError: if an earlier step is not completed, or people have carried out what the step planned.
     """
+    go_on = command_line("next", session.folder)
     for state in states(session):
+        kinds, reason = step.kept
         if state.step.name == step.name:
+            require(not session.brought(*kinds), f"step {step.name}: {reason}", SessionError)
+            message = f"step {step.name}: {state.words}; first repeat it: {go_on}"
+            require(state.kind == DONE, message, SessionError)
             break
-        require(
-            state.kind in (DONE, KEPT),
-            f"first complete the step {state.step.name}: {command_line('next', session.folder)}",
-            SessionError,
-        )
-    kinds, reason = step.kept
-    require(not session.brought(*kinds), f"step {step.name}: {reason}", SessionError)
+        require(state.kind in (DONE, KEPT), f"first complete the step {state.step.name}: {go_on}", SessionError)
     _run(session, replace(step, make=make), say, progress, command)
 
 

@@ -31,6 +31,9 @@ WORLD = "world"
 def convert(path: str) -> str:
     """Return the URDF text for an MJCF file; an ``.xml`` file that is already a URDF is returned unchanged.
 
+    Args:
+        path: the ``.xml`` file.
+
     Raises:
         RobotError: MuJoCo is missing or cannot read the file, or the model is not a serial arm.
     """
@@ -54,6 +57,9 @@ def _compiled(spec: NativeModel) -> NativeModel:
     """Return the compiled model, without meshes and textures if their files are missing.
 
     These files are not needed if the model contains masses.
+
+    Args:
+        spec: MuJoCo's specification of the model (``MjSpec``), parsed from the file.
     """
     try:
         return spec.compile()

@@ -73,14 +73,18 @@ def convert(path: str) -> str:
 
 
 def _nominal(a: list[float], d: list[float]) -> np.ndarray:
-    """Return the nominal table (6, 4) of θ, a, d, α [rad, m] from a type's lengths a and d."""
+    """Return the nominal table (6, 4) of θ, a, d, α [rad, m] from a type's lengths a and d (6 each) [m]."""
     half = np.pi / 2
     lengths = [0.0, *a, 0.0, 0.0, 0.0], [d[0], 0.0, 0.0, *d[1:]]
     return np.column_stack([np.zeros(6), *lengths, [half, 0.0, 0.0, half, -half, 0.0]])
 
 
 def _deltas(path: str) -> np.ndarray:
-    """Return the corrections (6, 4) to θ, a, d, α [rad, m] in a calibration file."""
+    """Return the corrections (6, 4) to θ, a, d, α [rad, m] in a calibration file.
+
+    Args:
+        path: the file ``calibration.conf``.
+    """
     with refused_as(RobotError, (OSError, UnicodeDecodeError), f"{path}: cannot be read: {{}}"):
         content = Path(path).read_text(encoding="utf-8")
     rows = []

@@ -15,7 +15,10 @@ def takes(path: str) -> bool:
 
 
 def urdf(path: str) -> str:
-    """Return the URDF text for the file at `path`; the path of a xacro file may be followed by arguments.
+    """Return the URDF text for the file at `path`; the path may be followed by arguments.
+
+    Args:
+        path: the file; for a xacro file or a ``calibration.conf``, arguments ``name:=value`` may follow.
 
     Raises:
         RobotError: a file that cannot be converted.

@@ -35,7 +35,11 @@ MAX_ABOVE = 4
 
 
 def split(path: str) -> tuple[str, dict[str, str]]:
-    """Return the file and the xacro arguments in a text such as ``arm.urdf.xacro name:=value``."""
+    """Return the file and the xacro arguments in a text such as ``arm.urdf.xacro name:=value``.
+
+    Args:
+        path: the text; without arguments, the path alone.
+    """
     file, *arguments_text = _ARGUMENTS.split(path, maxsplit=1)
     arguments: dict[str, str] = {}
     if arguments_text:
@@ -113,6 +117,9 @@ def _packages_for(file: Path) -> Iterator[None]:
     """Within this context, xacro's ``$(find NAME)`` finds packages by `package_folder`.
 
     Xacro looks packages up in ROS's package index, whose module is replaced meanwhile.
+
+    Args:
+        file: the robot description, from whose folder packages are searched.
     """
     from unittest.mock import patch  # slow to load
 

@@ -290,6 +290,10 @@ class _Axes:
         """Return whether the joints that depart from a body with a flange belong to a tool.
 
         A tool has single joints, or is a hand.
+
+        Args:
+            body: name of the body with the flange.
+            branches: joints that depart from the body.
         """
         if any(self._in_series(joint) or self._is_named_axis(joint) for joint in branches):
             return False
@@ -336,6 +340,10 @@ class _Axes:
 
         Fingers are shorter than the chain before them, of equal length, and not named as axes. With three or more
         branches, one may be longer by one joint (a thumb).
+
+        Args:
+            body: name of the body from which the branches depart.
+            branches: first joint of each branch.
         """
         if len(branches) < 2:
             return False
@@ -376,7 +384,7 @@ class _Axes:
 
 
 def _follows(before: str, name: str) -> bool:
-    """Return whether two names have a common beginning and then numbers n and n + 1: ``joint_1_s``, ``joint_2_l``."""
+    """Return whether `before` and `name` begin alike and end in numbers n and n + 1: ``joint_1_s``, ``joint_2_l``."""
     first = NUMBERED.match(before.lower())
     second = NUMBERED.match(name.lower())
     if first is None or second is None:
@@ -389,7 +397,12 @@ def _hangs(tree: UrdfTree, link: str, on: str) -> bool:
 
 
 def _frame(tree: UrdfTree, body: str) -> tuple[str, str]:
-    """Return the link at which an arm with the last body `body` ends, and the reason."""
+    """Return the link at which an arm with the last body `body` ends, and the reason.
+
+    Args:
+        tree: the URDF.
+        body: name of the arm's last body.
+    """
     links = [link for link, _ in tree.rigid(body)]
     for pattern, reason in ((TOOL0, "its tool frame (REP 199)"), (FLANGE, "its flange (REP 199)")):
         frames = [link for link in links if pattern.search(link)]
@@ -412,6 +425,10 @@ def _without_tools(tree: UrdfTree, body: str) -> list[str]:
     """Return the links fixed to a body, except grippers, sensors and links on these.
 
     The first one is the body's main link.
+
+    Args:
+        tree: the URDF.
+        body: name of the body.
     """
     prefix = body.lower()
     result: list[str] = []
@@ -431,7 +448,7 @@ def _without_tools(tree: UrdfTree, body: str) -> list[str]:
 
 
 def _leaves(tree: UrdfTree, links: Iterable[str]) -> list[str]:
-    """Return which of `links` have no descendant among `links`."""
+    """Return which of `links` have no descendant in `tree` that is also one of `links`."""
     links = list(links)
     before: set[str] = set()
     for link in links:

@@ -29,7 +29,7 @@ def mjcf_text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: n
 
     Args:
         chain: the arm.
-        bodies: (B, 10) standard parameters of the body after each moving element.
+        bodies: (B, 10) standard parameters of the body after each of B moving elements.
         armature, damping, friction: (n,) motor inertia, viscous and Coulomb friction of each joint [kg m², N m s/rad, N
             m, or kg, N s/m, N].
     """
@@ -73,7 +73,7 @@ def mjcf_text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: n
 
 
 def joint_name(chain: Chain, k: int) -> str:
-    """Return the MJCF joint name of the moving element k: the chain joint's name, or the name of a mimic follower."""
+    """Return the MJCF name of the joint that moves element k: the chain joint's name, or that of a mimic follower."""
     element = chain.elements[k]
     main = k in chain.moving.tolist()
     return chain.joints[element.joint or 0].name if main else element.name.removesuffix(".offset")
@@ -107,13 +107,18 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def link_frame(model: NativeModel, link: str) -> int:
-    """Return the index of a link's frame in Pinocchio's model; a joint of the same name is not meant."""
+    """Return the index of the frame of the link named `link` in Pinocchio's model; a joint of this name is ignored."""
     pin = import_module("pinocchio")
     return model.getFrameId(link, pin.FrameType.BODY)
 
 
 def driven_joints(model: NativeModel, chain: Chain) -> list[NativeModel]:
-    """Return Pinocchio's joints for the moving elements of a chain, including mimic followers."""
+    """Return Pinocchio's joints for the moving elements of a chain, including mimic followers.
+
+    Args:
+        model: Pinocchio's model of the same robot.
+        chain: the arm.
+    """
     return [model.joints[model.getJointId(joint_name(chain, k))] for k in chain.driven.tolist()]
 
 
@@ -173,6 +178,10 @@ def motion_torques(
 
 def pinocchio_model(source: str, mjcf: bool = False) -> NativeModel:
     """Return Pinocchio's model of a URDF or MJCF text; MJCF is written to a temporary file first.
+
+    Args:
+        source: URDF or MJCF text.
+        mjcf: whether the text is MJCF.
 
     Raises:
         RobotError: Pinocchio cannot read the text.

@@ -55,9 +55,14 @@ def parse(
     tip: str | None = None,
     joint_names: Sequence[str] | None = None,
 ) -> Chain:
-    """Return the chain from `base` to `tip` in a URDF text; `where` names the text in messages.
+    """Return the chain from `base` to `tip` in a URDF text.
 
-    The other arguments and the exceptions are those of `read`.
+    The exceptions are those of `read`.
+
+    Args:
+        source: text of the URDF.
+        where: name of the text in messages.
+        base, tip, joint_names: as in `read`.
     """
     tree = read_tree(source, where)
     return build(tree, ends(tree, base, tip, joint_names))
@@ -69,6 +74,12 @@ def ends(
     """Return the base and tip links of the chain.
 
     By default, the base is the root, and the tip is chosen from the tree (`calib.robot.formats.arm_ends`).
+
+    Args:
+        tree: the URDF.
+        base: name of the base link; None: the root.
+        tip: name of the tip link; None: chosen.
+        joint_names: joints with columns in a table; the arm ends with the last of them. None: all joints count.
 
     Raises:
         RobotError: the choice is ambiguous; the message lists the candidates.
@@ -87,7 +98,12 @@ def ends(
 
 
 def build(tree: UrdfTree, between: ArmEnds) -> Chain:
-    """Return the chain between two links of a checked URDF tree."""
+    """Return the chain between two links of a checked URDF tree.
+
+    Args:
+        tree: the URDF.
+        between: base and tip of the chain.
+    """
     path = tree.path(between.base, between.tip)
     actuated = [joint for joint in path if joint.actuated]
     index = {joint.name: j for j, joint in enumerate(actuated)}
@@ -119,7 +135,12 @@ def build(tree: UrdfTree, between: ArmEnds) -> Chain:
 
 
 def _unused_faults(tree: UrdfTree, path: list[JointTag]) -> list[str]:
-    """Return remarks on joints outside the chain `path` that have invalid limits."""
+    """Return remarks on joints outside the chain `path` that have invalid limits.
+
+    Args:
+        tree: the URDF.
+        path: joints of the chain.
+    """
     path_joints = {joint.name for joint in path}
     result = []
     for joint in tree.joints.values():
@@ -172,6 +193,10 @@ def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
     """Return the name of the actuated joint that moves `joint`, and ratio and offset of this motion.
 
     Chains of mimic joints are followed.
+
+    Args:
+        tree: the URDF.
+        joint: a moving joint; an independent one moves itself, with ratio 1 and offset 0.
     """
     ratio, offset, name = 1.0, 0.0, joint.name
     where = f"{tree.where}, line {joint.node.line}, joint '{joint.name}'"
@@ -191,7 +216,14 @@ def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
 
 
 def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint_names: Sequence[str] | None) -> None:
-    """Raise RobotError for a path that is not a serial arm, or whose joints differ from the measured ones."""
+    """Raise RobotError for a path that is not a serial arm, or whose joints differ from the measured ones.
+
+    Args:
+        tree: the URDF.
+        path: joints from base to tip.
+        base, tip: names of the two links, for messages.
+        joint_names: joints named in a measurement file; None: no comparison.
+    """
     actuated = [joint.name for joint in path if joint.actuated]
     if not actuated:
         refuse_robot(tree.where, f"no actuated joint between '{base}' and '{tip}'; choose another base or tip")
@@ -224,6 +256,10 @@ def _inertias(tree: UrdfTree, path: list[JointTag]) -> np.ndarray | None:
     """Return standard parameters (n, 10) about the frames after the joints' moving elements; None without masses.
 
     None also if the body after a mimic follower has mass, since there is only one row per joint.
+
+    Args:
+        tree: the URDF.
+        path: joints from base to tip.
     """
     rows = []
     for joint in path:

@@ -83,7 +83,11 @@ def converter(path: str | Path) -> DescriptionReader | None:
 
 
 def is_urdf(path: Path) -> bool:
-    """Return whether a file is a URDF, or can be converted to one, so that `text` returns its URDF text."""
+    """Return whether a file is a URDF, or can be converted to one, so that `text` returns its URDF text.
+
+    Args:
+        path: the file.
+    """
     return path.suffix == ".urdf" or converter(path) is not None
 
 
@@ -91,6 +95,9 @@ def text(path: str | Path) -> tuple[str, str]:
     """Return the text of a URDF file, with unchanged line ends, and its declared encoding (default UTF-8).
 
     Other descriptions are converted first; the encoding is then UTF-8.
+
+    Args:
+        path: the file; arguments for a converter may follow.
 
     Raises:
         RobotError: the file cannot be read, decoded or converted.
@@ -117,6 +124,10 @@ def text(path: str | Path) -> tuple[str, str]:
 
 def parse(source: str, where: str) -> Node:
     """Return the root element of an XML text; `where` names the text in messages.
+
+    Args:
+        source: the XML text.
+        where: name of the text in messages.
 
     Raises:
         RobotError: the text is not well-formed; the message has line and column.
@@ -161,6 +172,11 @@ def set_attributes(source: str, node: Node, values: dict[str, str]) -> list[tupl
     """Return the changes (for `edited`) that set attributes of a node.
 
     Existing attributes are changed in place; new ones are added after the last attribute.
+
+    Args:
+        source: the text that contains the node.
+        node: the XML element.
+        values: attribute name to new value.
     """
     data = source.encode("utf-8")
     end = node.start + 1 + len(node.tag.encode())
@@ -182,7 +198,13 @@ def set_attributes(source: str, node: Node, values: dict[str, str]) -> list[tupl
 
 
 def insert_child(source: str, node: Node, child: str) -> list[tuple[int, int, str]]:
-    """Return the change (for `edited`) that inserts a first child into a node, indented like the next child."""
+    """Return the change (for `edited`) that inserts a first child into a node, indented like the next child.
+
+    Args:
+        source: the text that contains the node.
+        node: the parent element.
+        child: text of the child element.
+    """
     data = source.encode("utf-8")
     attributes_end = max([match.end() for match in _attributes(data, node)], default=node.start)
     tag_end = data.index(b">", attributes_end) + 1
@@ -194,7 +216,12 @@ def insert_child(source: str, node: Node, child: str) -> list[tuple[int, int, st
 
 
 def _attributes(data: bytes, node: Node) -> Iterator[re.Match[bytes]]:
-    """Yield a regular-expression match (name, quoted value) for each attribute of a node."""
+    """Yield a regular-expression match (name, quoted value) for each attribute of a node.
+
+    Args:
+        data: UTF-8 bytes of the text.
+        node: the XML element.
+    """
     position = node.start + 1 + len(node.tag.encode())
     while match := _ATTRIBUTE.match(data, position):
         yield match
@@ -205,6 +232,10 @@ def with_comment(content: bytes, remark: str) -> bytes:
     """Return an XML file's bytes with the ASCII comment `remark` inserted after the XML declaration.
 
     A file in UTF-16 is returned unchanged.
+
+    Args:
+        content: bytes of the file.
+        remark: text of the comment, in ASCII.
     """
     if b"\0" in content[:4]:
         return content
@@ -303,7 +334,11 @@ class UrdfTree:
         return [link for link in self.bodies if link not in self.above]
 
     def link(self, name: str, role: str) -> str:
-        """Return `name` if a link has this name; `role` (base or tip) is used in the message otherwise.
+        """Return `name` if a link has this name.
+
+        Args:
+            name: name of the link.
+            role: ``base`` or ``tip``, for the message.
 
         Raises:
             RobotError: there is no such link; the message suggests the most similar name.
@@ -346,6 +381,10 @@ class UrdfTree:
 def read(source: str, where: str) -> UrdfTree:
     """Return the checked tree of a URDF text; `where` names the text in messages.
 
+    Args:
+        source: text of the URDF.
+        where: name of the text in messages.
+
     Raises:
         RobotError: broken XML, xacro commands, unknown joint types, missing parts, loops, links with two parents, or
             several angles larger than a full turn. The message has the line.
@@ -384,6 +423,10 @@ def read(source: str, where: str) -> UrdfTree:
 def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
     """Return a remark on a joint origin that is rotated by more than a full turn; () without one.
 
+    Args:
+        joints: joint name to joint.
+        where: name of the URDF in messages.
+
     Raises:
         RobotError: several such joints, whose angles are probably in degrees.
     """
@@ -405,7 +448,8 @@ def _large_angles(joints: dict[str, JointTag], where: str) -> tuple[str, ...]:
 def transform_body(body: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Return standard parameters (10,) transformed to another frame.
 
-    With R, p of the pose and mc = (MX, MY, MZ): mc' = R mc + M p, and I' = R I R' + S(p)'S(R mc) + S(R mc)'S(p) + M
+    With R, p of the pose, M the mass, mc = (MX, MY, MZ), I the inertia about the frame's origin, S(·) the skew matrix
+    of a vector, and a prime for the other frame: mc' = R mc + M p, and I' = R I R' + S(p)'S(R mc) + S(R mc)'S(p) + M
     S(p)'S(p)  (Khalil and Dombre, 2002, eq. 9.25, signs of the matrix).
 
     Args:
@@ -432,7 +476,13 @@ def _is_macro(node: Node) -> bool:
 
 
 def _fresh(node: Node, names: Iterable[str], where: str) -> str:
-    """Return the name of a link or joint; raise RobotError for a missing name or one of `names`."""
+    """Return the name of a link or joint; raise RobotError for a missing name or one of `names`.
+
+    Args:
+        node: the XML element <link> or <joint>.
+        names: names that are already used.
+        where: text for messages.
+    """
     name = node.attributes.get("name", "")
     require(name, f"{where}, line {node.line}: a <{node.tag}> without a name: add one", RobotError)
     require(name not in names, f"{where}, line {node.line}: a second {node.tag} named '{name}': rename one", RobotError)
@@ -475,7 +525,12 @@ def _end(node: Node, role: str, links: Iterable[str], where: str) -> str:
 
 
 def origin(node: Node, where: str) -> np.ndarray:
-    """Return the transform (4, 4) in a node's first <origin>; the identity if there is none."""
+    """Return the transform (4, 4) in a node's first <origin>; the identity if there is none.
+
+    Args:
+        node: the XML element that contains <origin>.
+        where: text for messages.
+    """
     tag = node.first("origin")
     if tag is None:
         return np.eye(4)
@@ -509,6 +564,11 @@ def _limits(node: Node, kind: str, where: str) -> tuple[float, float, float, flo
 
     Limits that are missing or beyond 1e9 are infinite; so are velocity and effort below `MIN_LIMIT`. The reason is that
     URDF requires velocity and effort, and files contain 0 for unknown values, and those of this toolkit 1e9.
+
+    Args:
+        node: the XML element <joint>.
+        kind: URDF type of the joint.
+        where: text for messages.
     """
     lower, upper, velocity, effort = -np.inf, np.inf, np.inf, np.inf
     tag = node.first("limit")
@@ -541,7 +601,12 @@ def _limits(node: Node, kind: str, where: str) -> tuple[float, float, float, flo
 
 
 def _body(node: Node, where: str) -> np.ndarray | None:
-    """Return the standard parameters (10,) of a link about the link's frame; None for a link without mass."""
+    """Return the standard parameters (10,) of a link about the link's frame; None for a link without mass.
+
+    Args:
+        node: the XML element <link>.
+        where: text for messages.
+    """
     link_where = f"{where}, line {node.line}, link '{node.attributes.get('name')}'"
     inertial = node.first("inertial")
     if inertial is None:

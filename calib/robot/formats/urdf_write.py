@@ -105,7 +105,11 @@ def hanging(tree: UrdfTree, path: list[JointTag], link: str) -> tuple[dict[str, 
 
 
 def centred(body: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return mass [kg], centre of mass (3,) [m] and the six moments about it [kg m²] from standard parameters (10,)."""
+    """Return a body's mass [kg], centre of mass (3,) [m], and the six moments about the centre of mass [kg m²].
+
+    Args:
+        body: (10,) standard parameters XX XY XZ YY YZ ZZ MX MY MZ M about the body's frame.
+    """
     mass = float(body[9])
     x, y, z = centre = body[6:9] / mass if mass else np.zeros(3)
     steiner = mass * np.array([y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y])
@@ -113,7 +117,11 @@ def centred(body: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def _inertial_parts(body: np.ndarray) -> dict[str, dict[str, str]]:
-    """Return the attributes of <origin>, <mass> and <inertia> for standard parameters (10,), by tag."""
+    """Return the attributes of <origin>, <mass> and <inertia> for standard parameters (10,), by tag.
+
+    Args:
+        body: (10,) standard parameters about the link's frame.
+    """
     mass, centre, moments = centred(body)
     inertia = {name: repr(float(moment)) for name, moment in zip(MOMENTS, moments)}
     xyz = " ".join(repr(float(coordinate)) for coordinate in centre)
@@ -138,7 +146,14 @@ def _tag(tag: str, values: Mapping[str, str]) -> str:
 
 
 def _child(source: str, node: Node, tag: str, values: dict[str, str]) -> list[tuple[int, int, str]]:
-    """Return the changes that set attributes of a node's first child with this tag, which is inserted if missing."""
+    """Return the changes that set attributes of a node's first child with this tag, which is inserted if missing.
+
+    Args:
+        source: the text that contains the node.
+        node: the parent element.
+        tag: tag of the child.
+        values: attribute name to new value.
+    """
     child = node.first(tag)
     if child is not None:
         return set_attributes(source, child, values)
@@ -148,7 +163,12 @@ def _child(source: str, node: Node, tag: str, values: dict[str, str]) -> list[tu
 def edit_file(source: str | Path, target: str | Path, nominal: Chain, calibrated: Chain) -> Path:
     """Write the URDF `source` with the calibrated geometry to `target`, in the encoding that the source declares.
 
-    The arguments are those of `edit`; the path of the new file is returned.
+    The path of the new file is returned.
+
+    Args:
+        source: the URDF of the nominal robot.
+        target: the file to write.
+        nominal, calibrated: the chain before and after calibration, as in `edit`.
     """
     content, encoding = text(source)
     return files.write(target, edit(content, nominal, calibrated, str(source)).encode(encoding))
@@ -232,7 +252,7 @@ def write_new(chain: Chain) -> str:
 
 
 def xml_text(root: ET.Element) -> str:
-    """Return the indented text of an XML tree."""
+    """Return the indented text of the XML tree `root`."""
     ET.indent(root)
     return ET.tostring(root, encoding="unicode").replace(" />", "/>") + "\n"
 
@@ -270,7 +290,12 @@ def _screw(axis: np.ndarray, amount: np.ndarray, slides: bool) -> np.ndarray:
 
 
 def _motion(element: Element, amount: float | np.ndarray) -> np.ndarray:
-    """Return the transform exp(sign · axis · amount) of an element, (4, 4), or (m, 4, 4) for amounts (m,)."""
+    """Return the transform exp(sign · axis · amount) of an element, (4, 4), or (m, 4, 4) for amounts (m,).
+
+    Args:
+        element: the element, which gives sign and axis.
+        amount: displacement along or about the axis [m or rad].
+    """
     axis = element.sign * np.eye(3)[AXES.index(element.axis) % 3]
     return _screw(axis, np.asarray(amount, dtype=float), element.axis[0] == "t")
 
@@ -293,6 +318,10 @@ def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
     """Return the URDF's joints from the first moving one to the tip; refuse joints that differ from the chain's.
 
     Joints are matched by name. If the URDF has none of the names, they are matched by the order of its longest chain.
+
+    Args:
+        tree: the URDF.
+        nominal: the chain to match.
     """
     names = nominal.joint_names
     named = any(name in tree.joints for name in names)
@@ -416,7 +445,13 @@ def _tip_origin(
 
 
 def _change(source: str, joint: JointTag, origin: np.ndarray) -> list[tuple[int, int, str]]:
-    """Return the changes that write a joint's new origin; values that are equal within 1e-12 are not rewritten."""
+    """Return the changes that write a joint's new origin; values that are equal within 1e-12 are not rewritten.
+
+    Args:
+        source: text of the URDF.
+        joint: the joint.
+        origin: (4, 4) the new origin.
+    """
     xyz, rpy = to_xyz_rpy(origin)
     values = {}
     if np.abs(xyz - joint.origin[:3, 3]).max() > UNCHANGED:
@@ -460,7 +495,14 @@ def _link_name(chain: Chain, k: int, joint: int, main: bool) -> str:
 
 
 def add_joint(root: ET.Element, name: str, kind: str, parent: str, child: str, origin: np.ndarray) -> ET.Element:
-    """Add a <joint> with its links and its origin (4, 4) to a URDF, and return the new XML element."""
+    """Add a <joint> with its links and its origin (4, 4) to a URDF, and return the new XML element.
+
+    Args:
+        root: the URDF's root element, to which the joint is added.
+        name, kind: name and URDF type of the joint.
+        parent, child: names of the two links.
+        origin: (4, 4) pose of the joint's frame in the parent link.
+    """
     xyz, rpy = to_xyz_rpy(origin)
     joint = ET.SubElement(root, "joint", name=name, type=kind)
     ET.SubElement(joint, "parent", link=parent)
@@ -472,7 +514,16 @@ def add_joint(root: ET.Element, name: str, kind: str, parent: str, child: str, o
 def _add_moving_joint(
     root: ET.Element, chain: Chain, element: Element, main: bool, parent: str, child: str, origin: np.ndarray
 ) -> None:
-    """Add a moving <joint> to a URDF; a joint's second element (`main` is False) becomes a mimic joint."""
+    """Add a moving <joint> to a URDF; a joint's second element (`main` is False) becomes a mimic joint.
+
+    Args:
+        root: the URDF's root element, to which the joint is added.
+        chain: the arm.
+        element: the moving element.
+        main: whether the element is the first one that its joint moves.
+        parent, child: names of the two links.
+        origin: (4, 4) pose of the joint's frame in the parent link.
+    """
     joint = chain.joints[element.joint or 0]
     if element.axis[0] == "t":
         kind = "prismatic"

@@ -24,7 +24,11 @@ def names() -> tuple[str, ...]:
 
 
 def path(name: str) -> Path:
-    """Return the path of a library robot's file, or of its simulated true parameters (``lwr4plus_truth``)."""
+    """Return the path of a library robot's file, or of its simulated true parameters (``lwr4plus_truth``).
+
+    Args:
+        name: name of a library robot; with the suffix ``_truth`` the true parameters.
+    """
     return Path(str(resources.files(__name__).joinpath(f"{name}.toml")))
 
 
@@ -61,7 +65,12 @@ def _check_ends(path: Path, chain: Chain, base: str | None, tip: str | None) -> 
 
 
 def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None = None) -> CalibratedChain:
-    """Return the calibrated robot for a name or path, with covariance and corrections; arguments as in `load`."""
+    """Return the calibrated robot for a name or path, with covariance and corrections if it was fitted.
+
+    Args:
+        robot: a library name, or a path, as in `load`.
+        base, tip: names of the links of a URDF between which the arm is; None: chosen from the tree.
+    """
     path = resolve(robot)
     if is_urdf(path):
         return CalibratedChain(load(path, base, tip), source=str(robot))

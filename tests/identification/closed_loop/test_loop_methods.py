@@ -143,6 +143,22 @@ def test_constraints_hold_in_every_round(robot, tmp_path, capsys, method):
     assert np.isfinite(read.factor).all() and read.best >= 0.0
 
 
+@pytest.mark.parametrize("method", ["iv", pytest.param("pc-iv", marks=pytest.mark.slow)])
+def test_user_function_holds_in_every_round(robot, tmp_path, capsys, method):
+    """A file of CVXPY constraints; `iv` satisfies it alone, without the constraints of `pc-iv`."""
+    train = log(tmp_path, "train.csv", 1, noise=1e-3)
+    limit = 0.9 * float(np.hypot(*planted.DRIVES["Fv"][:2]))
+    text = f"import cvxpy as cp\n\n\ndef constraints(beta):\n    return [cp.norm(beta['Fv1', 'Fv2']) <= {limit}]\n"
+    (tmp_path / "limits.py").write_text(text)
+    code, out = identify(robot, tmp_path, train, f"{GAINS}[constraints]\nfile = 'limits.py'", method)
+    assert code in (0, 1) and "binds; without it the estimate is" in " ".join(capsys.readouterr().out.split())
+    rows = {row["name"]: row for row in csv.DictReader((out / "estimate.csv").open())}
+    assert np.hypot(float(rows["Fv1"]["value"]), float(rows["Fv2"]["value"])) == pytest.approx(limit, rel=1e-5)
+    told = json.loads((out / "metrics.json").read_text())
+    assert told["method"] == method and len(told["constraints"]["binding"]) == 1
+    assert (len(told["constraints"]["names"]) == 1) == (method == "iv")
+
+
 @pytest.mark.slow
 def test_uncontrollable_estimate_ends(robot, tmp_path, capsys):
     """M(q) barely definite is nothing that a sampled controller can hold: it is kept away from singular, and told."""

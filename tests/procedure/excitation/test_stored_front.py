@@ -51,6 +51,7 @@ def test_picked_motion_is_the_front_s(folder: Path) -> None:
         ("tx40", SETTINGS, 99, "the front has the motions 1 to"),
         ("lwr4plus", SETTINGS, 1, "of a robot with the joints"),
         ("tx40", ExcitationSettings(period=6.0, harmonics=4), 1, "with other harmonics"),
+        ("tx40", ExcitationSettings(period=12.0, harmonics=5), 1, "6 s at 1000 Hz, the settings say"),
     ],
 )
 def test_unlike_picks_are_refused(

@@ -13,12 +13,14 @@ from calib import cli
 from calib.apps.viewer import viewer
 from calib.errors import UsageError
 from calib.geometry import installation
+from calib.procedure.excitation import coefficients
 from calib.results import scene_files as viewing
 from calib.results.scene import thinned
 from calib.results.scene_files import visuals
 from calib.robot.formats import urdf_write
 from calib.robot.kinematics import forward
 from calib.robot.library import load
+from calib.robot.tables import dumps
 from calib.simulation.cell import SimulatedInstrument, measure
 from calib.simulation.virtual_cells import perturbed_cell
 
@@ -56,9 +58,12 @@ def session(fitted, tmp_path) -> Path:
     wave = np.sin(t + np.arange(6))
     head = ["t", *(f"{letter}{k + 1}" for letter in "qva" for k in range(6))]
     table("6-excitation/training/trajectory.csv", head, np.hstack([t, wave, np.cos(t + np.arange(6)), -wave]))
-    head = ["t [s]", *(f"{what}{k + 1}" for what in ("measured_", "predicted_", "q") for k in range(6))]
+    head = ["t [s]"]
+    for what in ("measured_", "predicted_", "q", "sigma_", "nominal_"):
+        head += [f"{what}{k + 1}" for k in range(6)]
     (here / "8-dynamics/dynamics.json").write_text('{"kind": "motor", "unit": "N m"}')
-    table("8-dynamics/unseen/torques_1.csv", head, np.hstack([t + 0.5, wave, wave - 0.1, wave]))
+    sigma = np.full_like(wave, 0.05)
+    table("8-dynamics/unseen/torques_1.csv", head, np.hstack([t + 0.5, wave, wave - 0.1, wave, sigma, wave - 0.3]))
     return here
 
 
@@ -94,6 +99,54 @@ def test_fit_shows_poses_of_both_arms(fitted, tmp_path):
     assert "45 fitted poses: " in viewer.about(scene) and "15 unseen poses: " in viewer.about(scene)
 
 
+def test_held_out_poses_have_their_expected_interval(fitted, tmp_path):
+    """The radii of ``residuals.csv`` are drawn beside the errors of the rows that were held out."""
+    pytest.importorskip("rerun")
+    scene = viewer.write(fitted, tmp_path / "a.rrd")
+    measured = scene.measured[0]
+    with (fitted / "residuals.csv").open(newline="") as file:
+        stated = [float(row["interval95 [mm]"] or "nan") for row in csv.DictReader(file)]
+    assert 1e3 * measured.interval == pytest.approx(np.array(stated), nan_ok=True)
+    assert rows(tmp_path / "a.rrd")["/errors/interval95"] == np.isfinite(measured.interval).sum() == 15
+
+
+def test_torques_have_their_band_and_the_cad_geometry(session):
+    """Torques come with the interval that is expected to contain 95 %, and with those of the CAD geometry."""
+    (torques,) = viewing.read(session).torques
+    lower, upper = torques.band
+    assert upper - lower == pytest.approx(np.full((200, 6), 2 * 1.96 * 0.05))
+    assert 0.5 * (lower + upper) == pytest.approx(torques.predicted)
+    assert torques.measured - torques.nominal == pytest.approx(np.full((200, 6), 0.3))
+    assert "95 % light green" in viewer.about(viewing.read(session))
+    table = session / "8-dynamics/unseen/torques_1.csv"
+    plain = [",".join(line.split(",")[:19]) for line in table.read_text().splitlines()]
+    table.write_text("\n".join(plain))
+    (torques,) = viewing.read(session).torques
+    assert torques.band is None and torques.nominal is None
+
+
+def test_front_of_trade_offs_is_drawn(session, tmp_path):
+    """The front of a motion's folder is drawn with the designed motion marked; a damaged one is noted."""
+    pytest.importorskip("rerun")
+    folder = session / "6-excitation/training"
+    head = "motion,condition number,torque slack,not dominated,designed"
+    lines = [head, "1,30,0.9,True,False", "2,35,0.8,True,True", "3,40,0.85,False,False"]
+    (folder / "front.csv").write_text("\n".join(lines))
+    assert "no front is shown" in viewing.read(session).notes[-1]  # its motions are missing
+    for number in "123":
+        (folder / "front" / number).mkdir(parents=True)
+        motion = coefficients.Periodic(("a",), ("revolute",), 1.0, 100.0, 1, "fourier", (np.zeros(3),))
+        text = dumps(coefficients.table(motion, "ur5", ()))
+        (folder / "front" / number / "trajectory.toml").write_text(text)
+    scene = viewer.write(session, tmp_path / "f.rrd")
+    (front,) = scene.fronts
+    assert front.best.tolist() == [True, True, False] and front.designed == 1
+    assert front.drawn == pytest.approx(np.array([[0.0, 1.0], [0.5, 0.0], [1.0, 0.5]]))
+    assert front.labels[1] == "2: condition number 35, torque slack 0.8"
+    assert {"/front/training/motions", "/front/training/best"} <= constant(tmp_path / "f.rrd")
+    assert "motion 2 of 3 was designed" in viewer.about(scene)
+
+
 def test_arrows_are_the_reported_errors(fitted):
     """The arrows are the errors that the fit reports."""
     measured = viewing.read(fitted).measured[0]
@@ -117,10 +170,12 @@ def test_session_plays_on_one_clock(session, tmp_path):
     some = len(thinned(scene.played[0].t))
     assert some == 101  # 2 s at 50 Hz
     assert found["/world/chosen/poses"] == 7
-    elbow = r"elbow_joint\ motor\ torque"
+    elbow = "elbow_joint_motor_torque"
     assert scene.torques[0].rows[2] == "elbow_joint motor torque" and scene.torques[0].units == ("N m",) * 6
     assert found["/motion/position/elbow_joint"] == some and found["/limits/velocity/elbow_joint/upper"] == 2
-    assert found[f"/torques/{elbow}/measured"] == found[f"/residuals/{elbow}"] == 200
+    curves = ("measured", "predicted", "lower", "upper", "nominal")
+    assert [found[f"/torques/{elbow}/{curve}"] for curve in curves] == [200] * 5 and found[f"/residuals/{elbow}"] == 200
+    assert not [name for name in found if "\\" in name or " " in name]
     assert found["/world/robot/lines"] == 7 + 60 + 2 * some
     clocks = {}
     for chunk in chunks.RrdReader(str(tmp_path / "s.rrd")).store().stream():

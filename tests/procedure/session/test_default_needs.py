@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.identification.prediction import PredictionErrors, RelativeErrors, Score
 from calib.procedure.session.second_round import promised
 
 HEADER = "name,unit,value,sigma,rsd,essential\n"
@@ -14,9 +15,11 @@ HEADER = "name,unit,value,sigma,rsd,essential\n"
 def session(folder: Path, errors: list[float], rows: str, **section: Any) -> Any:
     """Return what the end reads of a complete session: joints' errors on unseen motion [%], rows of the estimate."""
     (folder / "estimate.csv").write_text(HEADER + rows)
-    raw = Made(relative_error_percent=Made(total=max(errors), joints=np.array(errors)), rms=np.ones(len(errors)))
-    report = Made(proofs={"unseen": Made(raw=raw)}, fit={})
-    stated = {"plan": True, "tolerance_percent": 0.0, "sigma_percent": 0.0} | section
+    joints = np.array(errors)
+    part = PredictionErrors(RelativeErrors(max(errors), joints), np.ones(len(errors)), 100)
+    score = Score(part, part, part, part, 0.0 * joints, 0.0 * joints, (None,) * len(errors), 20.0, 1.0)
+    report = Made(proofs={"unseen": score}, fit={})
+    stated = {"plan": True, "tolerance_percent": 0.0, "sigma_percent": 0.0, "payloads": {}} | section
     columns = [Made(name="Fs2", form=Made(slopes=False)), Made(name="Fv1", form=Made(slopes=True))]
     return Made(
         dynamic=True, needs=bool(stated["tolerance_percent"] or stated["sigma_percent"]), folder=folder,

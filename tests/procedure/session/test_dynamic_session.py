@@ -316,6 +316,11 @@ def test_front_motion_is_picked_before_recording(waiting: Session, capsys: pytes
     assert run("next", waiting.folder, "--pick", number) == 0
     assert stored_front.read(waiting.path("6-excitation/training")).values.designed == number - 1
     assert kinds(waiting)["excite"] == steps.DONE
+    assert run("next", waiting.folder, "--pick", 99) == 2
+    assert kinds(waiting)["excite"] == steps.DONE, "a pick that is refused changes nothing"
+    edit(path, 'goals = ["wrist=0.5"]', 'goals = ["wrist=0.4"]')
+    assert run("next", waiting.folder, "--pick", 1) == 2
+    edit(path, 'goals = ["wrist=0.4"]', 'goals = ["wrist=0.5"]')
     capsys.readouterr()
     waiting.path("7-recorded").mkdir(exist_ok=True)
     waiting.path("7-recorded/training_log.csv").write_text("t\n")

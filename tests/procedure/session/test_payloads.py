@@ -58,14 +58,18 @@ def test_payloads_survive_the_settings_file(tmp_path: Path) -> None:
 
 def test_labels_are_words_of_names(tmp_path: Path) -> None:
     """A label counts as a word of a file's name, with digits behind it; of two labels the longer one counts."""
-    session = begin(tmp_path / "cell", "tx40", "cmm", 5, 0, payloads={"load": 1.0, "load2": 2.0, "a": 3.0})
+    payloads = {"Load": 1.0, "load2": 2.0, "a": 3.0, "big_load": 4.0}
+    session = begin(tmp_path / "cell", "tx40", "cmm", 5, 0, payloads=payloads)
     labels = {
         "training_log.csv": (),
-        "training_LOAD_log.csv": ("load",),
+        "training_LOAD_log.csv": ("Load",),
         "training_load2_log.csv": ("load2",),
-        "training_load3_log.csv": ("load",),
+        "training_load3_log.csv": ("Load",),
+        "training_load20_log.csv": ("Load",),
+        "training_loaded_log.csv": ("Load",),
+        "training_big_load_log.csv": ("big_load",),
         "validation_unload_log.csv": (),
-        "training_a_load_log.csv": ("load", "a"),
+        "training_a_load_log.csv": ("Load", "a"),
     }
     for name in labels:
         session.path(f"7-recorded/{name}").write_text("t\n")
