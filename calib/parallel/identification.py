@@ -31,6 +31,7 @@ from calib.parallel.robots import ParallelMechanism, refuse_unread
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, ModelFindings, RecordingErrors, errors_of
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, gather
 from calib.procedure.dynamic_stage.verdict import (
+    PAYLOAD_FINDINGS,
     excitation_notes,
     friction_drives,
     judge,
@@ -239,7 +240,8 @@ def _judged(
         kind = "platform"
     figures, rules = judge(errors.fit, errors.proofs, errors.repeated, errors.excitation, labels, kind)
     resting = resting_parameters(identification)
-    verdict = with_prior(Verdict.of(figures, rules), resting)
+    of_payloads = [item for item in parameter_findings(identification) if item.code in PAYLOAD_FINDINGS]
+    verdict = with_prior(Verdict.of(figures, [*of_payloads, *rules]), resting)
     return with_duration(verdict, errors.excitation), rules
 
 

@@ -18,8 +18,8 @@ class TorqueTest(NamedTuple):
     Attributes:
         recording: name of the held-out recording.
         row: name of the torque row.
-        rms: rms error of the predicted torque [N m or N], without what is above the identification band where that is
-            most of the error; NaN: the joint did not move.
+        rms: rms error of the identified model's torque over the whole recording [N m or N], without what is above the
+            identification band where that is most of the error; NaN: unknown.
         tolerance: largest accepted rms error [N m or N].
     """
 
@@ -34,7 +34,7 @@ class TorqueTest(NamedTuple):
 
     @property
     def passed(self) -> bool | None:
-        """Whether the error is within the tolerance; None for a joint that did not move, which is not tested."""
+        """Whether the error is within the tolerance; None if it is unknown: the joint is not tested."""
         if np.isnan(self.rms):
             return None
         return self.rms <= self.tolerance
@@ -79,7 +79,8 @@ def torque_tests(
             continue
         errors = {}
         for recording, score in proofs.items():
-            errors[recording] = float(score.counted(score.floor_dominates).rms[number])
+            whole = score.filtered if score.floor_dominates else score.raw
+            errors[recording] = float(whole.rms[number])
         worst = max(errors, key=lambda recording: np.nan_to_num(errors[recording], nan=-1.0))
         tests.append(TorqueTest(worst, row, errors[worst], float(tolerance)))
     return tests

@@ -229,7 +229,8 @@ def assess(
     rules += plain.worse_than_plain({name: shares for name, shares in references.items() if name in proofs})
     of_proofs = {name: scored.intervals[name] for name in proofs if name in scored.intervals}
     rules += judging.too_narrow(of_proofs, labels)
-    verdict = Verdict.of(figures, [*implausible, *rules])
+    of_payloads = [item for item in findings.noticed if item.code in judging.PAYLOAD_FINDINGS]
+    verdict = Verdict.of(figures, [*of_payloads, *implausible, *rules])
     verdict = judging.with_prior(verdict, findings.rests)
     verdict = judging.with_duration(verdict, scored.excitation)
 

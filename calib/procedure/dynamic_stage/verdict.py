@@ -29,6 +29,8 @@ MOVES = 0.1
 BEND = 1e-4
 # sigmas below zero from which on a drive's inertia or friction is called negative
 SURELY = 2.0
+# findings on payloads, which decide the verdict
+PAYLOAD_FINDINGS = ("payload-exchanged", "payload-absent", "payload-mass", "payload-centre")
 # sigmas from which on a payload's identified mass differs from zero, or from its stated mass (our choice)
 SURELY_ABSENT = 3.0
 # neighbouring rows that count as one from which on a residual is unmodelled dynamics, not noise
@@ -366,6 +368,8 @@ def _payload_masses(identification: Identification[RegressorModel]) -> Iterable[
         if f"M{label}" not in masses:
             continue
         mass, sigma = masses[f"M{label}"]
+        if payload.com is not None and mass > SURELY_ABSENT * sigma:
+            yield from _payload_centre(label, payload.com, mass, masses)
         doubt = SURELY_ABSENT * sigma
         stated_mass = payload.mass
         if stated_mass is not None and abs(mass - stated_mass) <= doubt:
@@ -377,6 +381,30 @@ def _payload_masses(identification: Identification[RegressorModel]) -> Iterable[
         elif stated_mass is not None:
             off = abs(mass - stated_mass) / stated_mass
             yield finding("payload-mass", label=label, mass=mass, sigma=sigma, stated=stated_mass, off=off)
+
+
+def _payload_centre(
+    label: str, com: Sequence[float], mass: float, estimates: Mapping[str, tuple[float, float]]
+) -> Iterable[Finding]:
+    """Yield a finding if a payload's identified centre of mass is not the stated one.
+
+    Args:
+        label: label of the payload.
+        com: (3,) stated centre of mass in the tip's frame [m].
+        mass: identified mass [kg].
+        estimates: value and σ of the base parameters by name, among them the first moments [kg m].
+    """
+    squares, doubts = [], []
+    for axis, stated in zip("XYZ", com):
+        moment = estimates.get(f"M{axis}{label}")
+        if moment is None:
+            return
+        value, sigma = moment
+        squares.append((value / mass - stated) ** 2)
+        doubts.append((sigma / mass) ** 2)
+    off, doubt = float(np.sqrt(sum(squares))), float(np.sqrt(sum(doubts)))
+    if off > SURELY_ABSENT * doubt:
+        yield finding("payload-centre", label=label, off=off, doubt=doubt)
 
 
 def _unmodelled(identification: Identification) -> list[Finding]:

@@ -66,6 +66,8 @@ class DesignCondition:
 Progress = Callable[[str], None]
 Search = Callable[..., SearchResult]
 
+# relative change of a front's condition number that is noted: it is stated at the search's samples (our choice)
+MAX_FRONT_CHANGE = 0.1
 # relative difference of periods that comes from rounding to samples
 PERIOD_ROUNDING = 0.01
 # degree of splines, where a family does not state it
@@ -252,6 +254,8 @@ def search_motion(
     goal_notes += missed(goals, values, inputs)
     if picked is not None and not np.allclose(motion.x, proposed.x):
         goal_notes += ("the motion of the front did not keep all limits between its samples, and was changed",)
+    if picked is not None:
+        goal_notes += _other_values(picked, condition_numbers)
     reached = []
     for goal, value in zip(goals, values):
         name, number = split_goal(goal.words)
@@ -308,6 +312,21 @@ def _picked(
     dense = dense_motion(problem.family, motion.x, _instants(problem.family, motion), motion.factor)
     regressor = inputs.model.exact.regressor(dense.q, dense.v, dense.a)
     return replace(motion, merit=merit(problem, exact_values(problem, dense, regressor))), problem
+
+
+def _other_values(front: StoredFront, condition: DesignCondition) -> tuple[str, ...]:
+    """Return a note if the front states another condition number for its designed motion than it has now.
+
+    Args:
+        front: the front.
+        condition: condition numbers of the motion with the present options.
+    """
+    name = front.values.names[0]
+    now = condition.raw if name.endswith("raw") else condition.normalised
+    stored = float(front.values.values[front.values.designed, 0])
+    if not name.startswith("cond") or abs(now - stored) <= MAX_FRONT_CHANGE * stored:
+        return ()
+    return (f"front.csv states {name} {stored:.3g} for this motion; with the present options it has {now:.3g}",)
 
 
 def _periodic(motion: SearchResult, inputs: ExcitationInputs, settings: ExcitationSettings, family: Family) -> Periodic:

@@ -232,7 +232,9 @@ def missed(goals: Sequence[AttainmentGoal], values: Sequence[float], inputs: Exc
     """
     notes = []
     for goal, value in zip(goals, values):
-        if value > goal.goal + TOLERANCE * abs(goal.goal):
+        # a torque goal of 0.1 is a slack of 0.9
+        scale = 1.0 - goal.goal if isinstance(goal.objective, TorqueSlack) else abs(goal.goal)
+        if value > goal.goal + TOLERANCE * scale:
             notes.append(f"goal {goal.words} is missed: {goal.stated(value):.4g}")
     of_torque = any(isinstance(goal.objective, TorqueSlack) for goal in goals)
     if of_torque and not inputs.model.friction:

@@ -250,6 +250,8 @@ def report_section(
     noticed = (*report.metrics.noticed, *report.unseen.noticed)
     blocks.append(page.Text("Notes on the dynamics", as_notes(warnings_of(report), noticed), "note"))
     key_figures = _key_figures(unseen, tolerance, delivered)
+    if tolerances:
+        key_figures += _test_figures(unseen, tolerances, joint_count or len(unseen.rows))
     return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, key_figures)
 
 
@@ -269,6 +271,26 @@ def _test_table(unseen: UnseenReport, tolerances: Sequence[float], joint_count: 
         rows.append([test.row, rms, f"{test.tolerance:g} {units[test.row]}", answers[test.passed], test.recording])
     header = ("torque", "rms error", "tolerance", "within", "recording")
     return page.ReportTable("Computed-torque test on unseen motion", header, rows, numbers=[1, 2])
+
+
+def _test_figures(unseen: UnseenReport, tolerances: Sequence[float], joint_count: int) -> list[page.KeyFigure]:
+    """Return the key figure of the computed-torque test: the torque that is nearest to its tolerance, or most above it.
+
+    Args:
+        unseen: report on the model's errors on held-out motion.
+        tolerances: tolerance of each joint, or one for all [N m or N].
+        joint_count: number of joints.
+    """
+    units = dict(zip(unseen.rows, unseen.units))
+    results = torque_tests(tolerances, unseen.proofs, unseen.rows, joint_count)
+    tests = [test for test in results if test.passed is not None]
+    if not tests:
+        return []
+    worst = max(tests, key=lambda test: test.rms / test.tolerance)
+    unit = units[worst.row]
+    name = f"rms torque error (identified model), {worst.row}"
+    error, allowed = f"{worst.rms:.3g} {unit}", f"{worst.tolerance:g} {unit}"
+    return [page.KeyFigure(name, "", error, "", worst.recording, allowed, page.met(worst.rms, worst.tolerance))]
 
 
 def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.ReportTable:

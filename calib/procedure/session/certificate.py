@@ -128,7 +128,7 @@ def _dynamics(session: Session) -> StageRecord:
     section = dynamics_section.report_section(report, figures, exported, allowed, delivered, tolerances, joint_count)
     verdict = session.verdicts().stages["dynamics"]
     section = replace(section, verdict=verdict.level, reason=verdict.reason)
-    stage = dynamics_pages.stage(report, section, session.plots, allowed)
+    stage = dynamics_pages.stage(report, section, session.plots, allowed or max(tolerances, default=0.0))
     return _with_arrival(stage, _arrival_notes(session, "7-recorded", "predict"))
 
 

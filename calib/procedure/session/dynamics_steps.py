@@ -568,6 +568,10 @@ def predict(session: Session, say: Say) -> list[str | Note]:
     folder.unseen.write(gathered, assessment)
     earlier = folder.metrics().warnings
     new_warnings = [warning for warning in assessment.warnings if warning not in earlier]
+    carried = {label for case in gathered.unseen for label in case.carried}
+    for label in session.settings.dynamics.payloads:
+        if unseen and label not in carried:
+            notes.append(Note(f"payload '{label}' is in no validation recording: its model is not validated", True))
     return [*notes, str(assessment.verdict), *as_notes(new_warnings, assessment.noticed)]
 
 
@@ -596,6 +600,10 @@ def _as_delivered(session: Session, gathered: inputs.IdentificationInputs, asses
         error, model = predicted.exported if predicted.tested is None else predicted.tested, "exported robot"
         figure = f"{predicted.exported:.2f} % of the torque unexplained by the exported robot"
         verdict = replace(verdict, reason=f"{figure} (identified model: {verdict.reason})")
+    elif verdict.level == "pass" and assessment.proofs:
+        # recordings with payloads test the identified model alone
+        words = "the exported robot is not tested: no unseen recording is without payload"
+        verdict = Verdict("marginal", f"{words}; {verdict.reason}")
     section = session.settings.dynamics
     excesses = []
     if section.tolerance_percent and error > section.tolerance_percent:

@@ -303,15 +303,16 @@ def _payload(text: str) -> tuple[str, dict[str, object]]:
     label, equals, mass = (part.strip() for part in labelled_mass.partition("="))
     payload: dict[str, object] = {}
     try:
-        require(label.isidentifier(), "the label", ValueError)
+        require(label.isidentifier(), f"'{label}' is no label: letters, digits and _ only", ValueError)
         if equals:
             payload["mass"] = Real(above=0, most=MAX_MASS, unit="kg", quantity="1").read(mass.removesuffix("kg"))
         if position:
             payload["com"] = _lengths(position, 3, MAX_HELD)
-    except ValueError:
+    except ValueError as fault:
         form = "label=kg, e.g. loaded=3.28, label=kg at x,y,z with the centre of mass in the tip's frame [m], or label"
         raise UsageError(
-            f"--payload {text}: expected {form} (the label goes into the file's name; what is not stated is identified)"
+            f"--payload {text}: {fault}; expected {form} (the label goes into the file's name; what is not stated is "
+            "identified)"
         ) from None
     return label, payload
 

@@ -4,6 +4,7 @@ Lengths are in m, angles in rad. The dataclasses of this module define every key
 comment.
 """
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from operator import attrgetter
@@ -56,7 +57,7 @@ NOTHING = "nothing"
 # of a designed motion (our choice): 160 MB per joint and derivative
 MAX_SAMPLES = 20_000_000
 # words in the names of all recordings of a session, besides the numbers of further rounds
-RECORDING_WORDS = ("training", "validation", "log", "round")
+RECORDING_WORDS = ("training", "validation", "log", "round", "none")
 # letters of a file's name
 MAX_NAME = 200
 # where comments begin and end
@@ -262,7 +263,7 @@ class DynamicsSection:
 def check_labels(labels: Iterable[str]) -> None:
     """Raise a ValueError if a label occurs in the names of all recordings, which labels assign to payloads."""
     for label in labels:
-        if label.lower() in RECORDING_WORDS:
+        if label.lower() in RECORDING_WORDS or re.fullmatch(r"round\d+", label.lower()):
             raise ValueError(f"payloads: '{label}' is a part of all recordings' names; choose another label")
 
 

@@ -31,7 +31,7 @@ def test_mass_and_centre_are_read(text: str, payload: dict[str, object]) -> None
 
 @pytest.mark.parametrize("text", ["3.28", "load=", "load=-1", "load=nan", "load=1 at 0,0", "load=1 at 9,0,0", "a b=1"])
 def test_invalid_payload_shows_its_form(text: str) -> None:
-    with pytest.raises(UsageError, match="expected label=kg"):
+    with pytest.raises(UsageError, match=r"--payload .*; expected label=kg"):
         stated_payloads([text])
 
 
