@@ -65,7 +65,7 @@ def true_error(block: Positions) -> float:
     return float(1e3 * np.sqrt(np.mean(np.sum((turn.apply(points) - truth) ** 2, axis=1))))
 
 
-def test_moving_base_costs_nothing_with_a_base_frame(tmp_path):
+def test_base_frame_removes_the_drift(tmp_path):
     """With 1 mm of drift a fit by base frames is as accurate as without drift; one without them is not."""
     errors = {}
     for drift in (0.0, 1e-3):
@@ -112,7 +112,7 @@ def test_still_series_rarely_seem_to_move(rows, stated):
     assert np.mean([spread_of(series + drift, sigma).exceeds for series in noise[:100]]) >= 0.95
 
 
-def test_jumping_instrument_is_seen_by_its_stated_sigma(tmp_path):
+def test_jumps_are_judged_by_stated_sigma(tmp_path):
     """Where every row has its place of the instrument, successive rows tell nothing, but the stated σ does."""
     block = measured(tmp_path, 0.0, 2)
     assert block.base is not None and block.base_sigma is not None
@@ -123,7 +123,7 @@ def test_jumping_instrument_is_seen_by_its_stated_sigma(tmp_path):
     assert only(replace(jumping, base_sigma=np.full((len(base), 6), np.nan))).code == "base-frame-still"
 
 
-def test_base_frame_that_measures_nothing_is_named(tmp_path):
+def test_empty_base_frames_are_named(tmp_path):
     """A constant base frame adds no noise and is named; so are metres under a header of millimetres."""
     block, alone = (measured(tmp_path, 0.0, 4, mode) for mode in ("measured", "ignored"))
     assert block.base is not None
@@ -143,7 +143,8 @@ def test_base_frame_that_measures_nothing_is_named(tmp_path):
     assert only(replace(block, base=base)).code == "base-frame-quiet"
 
 
-def test_blocks_without_base_frame_are_silent(tmp_path):
+def test_no_base_frame_no_finding(tmp_path):
+    """Blocks without base frame are silent."""
     assert not base_motion([measured(tmp_path, 1e-3, 0, "ignored")])
 
 

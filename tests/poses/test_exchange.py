@@ -129,7 +129,7 @@ def test_other_indices_beat_d_optimal_sets(index):
 
 
 @pytest.mark.parametrize("index", ["O2", "O3", "O4", "O5", "cond"])
-def test_every_index_finds_the_best_of_all_sets(index):
+def test_every_index_finds_the_best_set(index):
     """Without restarts a third of these searches ends at a local optimum."""
     for seed in range(4):
         jacobians = np.random.default_rng(seed).normal(size=(13, 2, 6))
@@ -141,7 +141,7 @@ def test_every_index_finds_the_best_of_all_sets(index):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("index", ["O3", "O4"])
-def test_single_singular_values_reach_the_optimum_of_the_arm(index):
+def test_arm_optimum_is_reached(index):
     """7 of 18 poses of the LWR4+, against all 31,824 sets."""
     jacobians = ARM[:18]
     squares = jacobians.transpose(0, 2, 1) @ jacobians
@@ -250,7 +250,7 @@ def test_bound_is_tight_with_few_candidates(spare):
 
 
 @pytest.mark.parametrize("index", ["cond", "O3"])
-def test_as_many_poses_as_candidates_are_all_of_them(index):
+def test_all_candidates_can_be_chosen(index):
     """Where every candidate is chosen there is nothing to exchange."""
     chosen = select_poses(ARM[:20], 20, SearchSettings(index))
     assert chosen.indices.tolist() == list(range(20))

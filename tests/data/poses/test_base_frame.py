@@ -86,7 +86,7 @@ def read(path, **options) -> Poses:
     return block
 
 
-def test_rows_without_base_frame_are_left_out(tmp_path):
+def test_rows_without_base_frame_are_named(tmp_path):
     """Rows in which the base frame is empty or nan are left out, and named."""
     path, head, rows = rows_of(tmp_path)
     rows[2][-7:] = [""] * 7
@@ -97,7 +97,7 @@ def test_rows_without_base_frame_are_left_out(tmp_path):
     assert len(read(path, base_frame="ignored")) == 12
 
 
-def test_file_without_base_frame_reads_as_ever(tmp_path):
+def test_ignored_base_frame_changes_nothing(tmp_path):
     """Ignored columns of a base frame leave the measurement as if they were not there."""
     path, head, rows = rows_of(tmp_path)
     ignored = read(path, base_frame="ignored")

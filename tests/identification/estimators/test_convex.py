@@ -95,7 +95,7 @@ def test_optimum_is_that_of_another_solver(seed):
     assert np.abs((solution.values - expected) * unit).max() < 1e-3
 
 
-def test_norm_and_body_cone_are_taken_together(problem):
+def test_norm_and_bodies_hold_together(problem):
     """Of bodies that can exist, under a norm: each of both holds, and the misfit is not below that of either alone."""
     free = METHODS["pc-wls"].estimate(problem).estimate
     pair = tuple(next(name for name in problem.base.names if name.startswith(prefix)) for prefix in ("MX2", "ZZ2"))

@@ -110,7 +110,7 @@ def test_the_share_that_does_not_grow_stays():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2])
-def test_the_predicted_sigma_of_a_faster_motion_is_reached(seed, tmp_path):
+def test_predicted_sigma_is_reached(seed, tmp_path):
     """The median is within 0.8 and 1.25 of the prediction, and 91 and 45 % of the parameters within 30 %."""
     arm = SimulatedArm.of(calib.load("tx40").chain)
     settings = calib.ExcitationSettings(period=PERIOD, starts=1, evaluations=150, outlook=False, seed=seed)

@@ -99,7 +99,7 @@ def test_fit_shows_poses_of_both_arms(fitted, tmp_path):
     assert "45 fitted poses: " in viewer.about(scene) and "15 unseen poses: " in viewer.about(scene)
 
 
-def test_held_out_poses_have_their_expected_interval(fitted, tmp_path):
+def test_held_out_poses_have_intervals(fitted, tmp_path):
     """The radii of ``residuals.csv`` are drawn beside the errors of the rows that were held out."""
     pytest.importorskip("rerun")
     scene = viewer.write(fitted, tmp_path / "a.rrd")
@@ -110,7 +110,7 @@ def test_held_out_poses_have_their_expected_interval(fitted, tmp_path):
     assert rows(tmp_path / "a.rrd")["/errors/interval95"] == np.isfinite(measured.interval).sum() == 15
 
 
-def test_torques_have_their_band_and_the_cad_geometry(session):
+def test_torques_have_band_and_cad_geometry(session):
     """Torques come with the interval that is expected to contain 95 %, and with those of the CAD geometry."""
     (torques,) = viewing.read(session).torques
     lower, upper = torques.band

@@ -106,7 +106,7 @@ def test_camera_is_asked_for_its_own_place():
         assert sum(question.open(given) for question in QUESTIONS if question.name in CAMERA) == others
 
 
-def test_unknown_program_is_refused_when_typed() -> None:
+def test_program_is_checked_when_typed() -> None:
     """The question is asked again at once, so that no answer is lost at the end."""
     ask = {question.name: question for question in QUESTIONS}
     answers = with_answer(Answers(), ask["robot"], "lwr4plus")

@@ -65,7 +65,8 @@ def test_question_is_about_targets_only():
         checked(Answers("ur5", "camera", reference=True))
 
 
-def test_reference_of_images_is_refused_in_the_file(tmp_path):
+def test_reference_of_images_is_refused(tmp_path):
+    """Reference of images is refused in the file."""
     session = begin(tmp_path / "cell", "ur5", "camera", 5, 0, dynamics=False)
     edit(session.path("session.toml"), "reference = false", "reference = true")
     with pytest.raises(SessionError, match="reference = true applies to poses and positions"):
