@@ -74,7 +74,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     [loop]                           # the closed loop they came from: see calib.identification.loop
     controller = "identify"
     [constraints]                    # what parameters must satisfy, for the methods pc-*; with a file ols, wls, iv, too
-    file = "constraints.py"          # a Python file that is executed: its function constraints(beta) returns a list of
+    # file = "constraints.py"         # a Python file that is executed: its function constraints(beta) returns a list of
                                      # CVXPY constraints: [beta["M3"] >= 2, cp.norm(beta["MX2", "MY2"]) <= 0.3]
     signs = true                     # inertia and friction of drives are not negative
     inertia = 50                     # random postures in which M(q) is positive definite; 0: not asked

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+import pinocchio_model
 import pytest
 
 import calib
 from calib.data.recordings.recording import Recording
 from calib.identification.uncertainty.error_growth import ErrorGrowth, _growing_share
 from calib.robot.chain import Chain
-from tests.support.pinocchio_model import model as pinocchio_model
 
 PERIOD = 10.0
 STEP = 1e-3
@@ -46,7 +46,7 @@ class SimulatedArm:
 
     @classmethod
     def of(cls, chain: Chain) -> "SimulatedArm":
-        model = pinocchio_model(chain)
+        model = pinocchio_model.model(chain)
         model.armature[:] = ROTOR
         data = model.createData()
         postures = np.random.default_rng(0).uniform(-1.0, 1.0, (50, model.nq))
