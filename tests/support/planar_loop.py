@@ -6,7 +6,8 @@ Absolute angles φ = cumsum(q), links of length l with mass m at c from the join
     h_j = Σ_k μ_jk sin(φ_j - φ_k) φ̇_k² + g cos φ_j Σ_i m_i a_ij
 
 A PD controller at 1 kHz acts on measured positions and their backward difference, its torque is held over the period;
-classical Runge–Kutta steps of 0.25 ms. Sensors read the mean of what is before and after the torque's step.
+classical Runge–Kutta steps of 0.25 ms. Torque sensors read the mean over a period, centred: the accelerations at the
+instants alone are not those of the motion in between.
 """
 
 from dataclasses import dataclass
@@ -61,23 +62,27 @@ def accelerations(q, v, tau, arm, drives):
 
 
 @njit(cache=True)
+def behind_drives(q, v, tau, arm, drives):
+    """Return the torques (3,) that the links take from the drives."""
+    matrix, torque = rigid(q, v, arm)
+    return matrix @ accelerations(q, v, tau, arm, drives) + torque
+
+
+@njit(cache=True)
 def run(q_ref, v_ref, kp, kd, noise, arm, drives):
     """Return true positions, commanded torques and torques behind the drives, each (N, 3)."""
     period = 1.0 / RATE
     q, v, step = q_ref[0].copy(), v_ref[0].copy(), period / STEPS
     before = q + noise[0] - period * v
-    held = np.zeros(3)
     out = np.zeros((3, len(q_ref), 3))
+    behind = np.zeros((STEPS + 1, 3))
     for k in range(len(q_ref)):
         seen = q + noise[k]
         tau = kp * (q_ref[k] - seen) + kd * (v_ref[k] - (seen - before) / period)
         before = seen
-        matrix, torque = rigid(q, v, arm)
         out[0, k], out[1, k] = q, tau
-        jump = accelerations(q, v, tau, arm, drives) + accelerations(q, v, held, arm, drives)
-        out[2, k] = 0.5 * matrix @ jump + torque
-        held = tau
-        for _ in range(STEPS):
+        for part in range(STEPS):
+            behind[part] = behind_drives(q, v, tau, arm, drives)
             a1 = accelerations(q, v, tau, arm, drives)
             v2 = v + 0.5 * step * a1
             a2 = accelerations(q + 0.5 * step * v, v2, tau, arm, drives)
@@ -87,6 +92,11 @@ def run(q_ref, v_ref, kp, kd, noise, arm, drives):
             a4 = accelerations(q + step * v3, v4, tau, arm, drives)
             q = q + step / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
             v = v + step / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+        behind[STEPS] = behind_drives(q, v, tau, arm, drives)
+        # the mean from half a period before an instant to half a period after it
+        out[2, k] += (behind[0] + 4.0 * behind[1] + behind[2]) / 12.0
+        if k + 1 < len(q_ref):
+            out[2, k + 1] += (behind[2] + 4.0 * behind[3] + behind[4]) / 12.0
     return out
 
 
