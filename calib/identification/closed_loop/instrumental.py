@@ -369,6 +369,7 @@ class _Friction:
 
     def columns(self, case: Case) -> np.ndarray:
         """Return the columns (M, rows, k) of the terms on a case's motion."""
+        assert self.loads is not None, "there are terms"
         motion = case.motion
         load = self.model.transmitted(self.loads, motion.q, motion.v, motion.a, case.carried)
         return observe_terms(self.terms, case, self.decimator, load, self.model.torque_rows)
