@@ -64,7 +64,7 @@ def test_04_compensate(tmp_path, capsys):
 @pytest.mark.slow
 def test_03_session_as_script(tmp_path):
     said = run("03_session_as_script.py", tmp_path)
-    assert "Bring" in said and "marginal: cell7" in said  # its arm hides what no rigid geometry explains
+    assert "Provide" in said and "marginal: cell7" in said  # its arm hides what no rigid geometry explains
     assert (tmp_path / "cell7/certificate.html").is_file()
     assert (tmp_path / "cell7/9-export/robot.urdf").is_file()
 
