@@ -22,6 +22,7 @@ from calib.procedure.session.folder import (
 )
 from calib.procedure.session.geometry_steps import chain_of, clear_staging, notes_on, read_measured
 from calib.procedure.session.questions import stated_payloads
+from calib.procedure.session.recording_names import log_name
 from calib.procedure.session.session_results import folders_of, position_errors, torque_error
 from calib.procedure.session.steps import DONE, KEPT, WAITING, run_next, steps_of
 from calib.procedure.session.steps import State as StepState
@@ -56,6 +57,7 @@ __all__ = [
     "folders_of",
     "go_on",
     "locked",
+    "log_name",
     "new_session",
     "next_round",
     "noise_of_difference",

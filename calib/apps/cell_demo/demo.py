@@ -32,6 +32,7 @@ from calib.toolkit.sessions import (
     asks,
     designed_motions,
     locked,
+    log_name,
     new_session,
     next_round,
     open_session,
@@ -408,9 +409,9 @@ def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
         reference = play(t, *motion.orders(t), motion.repeat)
         noise = np.random.default_rng([seed, noise_seed])
         recorded = record(arm, reference, noise, running)
-        write_log(recorded, session.path(f"7-recorded/{name}_log.csv"))
+        write_log(recorded, session.path(f"7-recorded/{log_name(name)}"))
         for number, (label, payload) in enumerate(payloads.items(), 1):
             loaded = carrying(arm, payload.parameters or ())
             noise = np.random.default_rng([seed, noise_seed, number])
             recorded = record(loaded, reference, noise, running + number * PAYLOAD_RUNNING)
-            write_log(recorded, session.path(f"7-recorded/{name}_{label}_log.csv"))
+            write_log(recorded, session.path(f"7-recorded/{log_name(name, label)}"))

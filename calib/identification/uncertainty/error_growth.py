@@ -8,9 +8,6 @@ errors of time leave residuals where the torque y changes quickly. The variance 
 with the share θ by likelihood, or zero where a constant variance is as probable (Schwarz 1978). The cut-offs of filters
 follow the motion, and so do the errors of time: on another motion, the share θ of the variance is scaled by the
 variance of the torque. The remaining share is noise, and stays.
-
-θ is 0.7 to 0.98 for 11 of the 12 joints of two simulated TX40, whose noise is in the encoders alone, and 0 to 0.7 for
-the joints of a real UR10e, Panda and TX40.
 """
 
 from collections.abc import Sequence

@@ -32,7 +32,7 @@ SURELY = 2.0
 # findings on payloads, which decide the verdict
 PAYLOAD_FINDINGS = ("payload-exchanged", "payload-absent", "payload-mass", "payload-centre")
 # sigmas from which on a payload's identified mass differs from zero, or from its stated mass (our choice)
-SURELY_ABSENT = 3.0
+PAYLOAD_SIGMAS = 3.0
 # neighbouring rows that count as one from which on a residual is unmodelled dynamics, not noise
 MAX_CORRELATED_ROWS = 3.0
 # of all training files together [s] (our choice)
@@ -368,9 +368,9 @@ def _payload_masses(identification: Identification[RegressorModel]) -> Iterable[
         if f"M{label}" not in masses:
             continue
         mass, sigma = masses[f"M{label}"]
-        if payload.com is not None and mass > SURELY_ABSENT * sigma:
+        if payload.com is not None and mass > PAYLOAD_SIGMAS * sigma:
             yield from _payload_centre(label, payload.com, mass, masses)
-        doubt = SURELY_ABSENT * sigma
+        doubt = PAYLOAD_SIGMAS * sigma
         stated_mass = payload.mass
         if stated_mass is not None and abs(mass - stated_mass) <= doubt:
             continue
@@ -403,7 +403,7 @@ def _payload_centre(
         squares.append((value / mass - stated) ** 2)
         doubts.append((sigma / mass) ** 2)
     off, doubt = float(np.sqrt(sum(squares))), float(np.sqrt(sum(doubts)))
-    if off > SURELY_ABSENT * doubt:
+    if off > PAYLOAD_SIGMAS * doubt:
         yield finding("payload-centre", label=label, off=off, doubt=doubt)
 
 

@@ -94,7 +94,7 @@ class Designed:
         stored_front: the front with its motions, as the folder keeps it; None without a front.
         playback: setpoints for the controller.
         notes: remarks for the user.
-        doubts: those `notes` that are on goals which are missed, or whose value depends on assumed typical friction.
+        goal_notes: those of the `notes` that are on goals: missed, or decided by typical friction.
         outlook: predicted accuracy of the parameters and torques that the motion identifies; None without torque
             limits, from which torque errors are
             assumed.
@@ -114,7 +114,7 @@ class Designed:
     outlook: MotionOutlook | None = None
     predicted: Sequence[PredictedSigma] = ()
     stored_front: StoredFront | None = None
-    doubts: tuple[str, ...] = ()
+    goal_notes: tuple[str, ...] = ()
 
     def periodic(self, motion: SearchResult) -> Periodic:
         """Return a result of the search as a periodic motion."""
@@ -274,7 +274,7 @@ def search_motion(
         outlook=outlook,
         predicted=predicted,
         stored_front=stored,
-        doubts=goal_notes,
+        goal_notes=goal_notes,
     )
 
 

@@ -121,6 +121,11 @@ class ExportedPrediction:
     identified: float
     tested: float | None = None
 
+    @property
+    def compared(self) -> float:
+        """The exported robot's share that is compared with a tolerance [%]."""
+        return self.exported if self.tested is None else self.tested
+
     def __str__(self) -> str:
         return (
             f"the exported robot (with drives.csv) leaves {self.exported:.2f} % of the torque unexplained, the "

@@ -24,7 +24,7 @@ from calib.identification.loop import (
 from calib.identification.prediction import Score
 from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import geometry_tables
-from calib.procedure.dynamic_stage.computed_torque import torque_tests
+from calib.procedure.dynamic_stage.computed_torque import TorqueTest
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
@@ -209,8 +209,7 @@ def report_section(
     exported: Sequence[str] = (),
     tolerance: float = 0.0,
     delivered: float | None = None,
-    tolerances: Sequence[float] = (),
-    joint_count: int = 0,
+    tests: Sequence[TorqueTest] = (),
 ) -> page.Section:
     """Return the report section on the dynamics: errors on held-out motion, torques, excitation, and parameters.
 
@@ -220,13 +219,12 @@ def report_section(
         exported: remarks on the export.
         tolerance: largest acceptable torque error on held-out motion [%]; 0: no tolerance.
         delivered: torque error of the exported robot on held-out motion [%]; None: unknown.
-        tolerances: largest acceptable rms torque error of each joint, or one for all [N m or N]; empty: none.
-        joint_count: number of joints to which the tolerances apply; 0: as many as there are torque rows.
+        tests: results of the computed-torque test; empty: no tolerances of joints are stated.
     """
     metrics, unseen = report.metrics, report.unseen
     blocks: list[page.Block] = [_error_table(unseen), _reference_table(unseen), _interval_table(unseen)]
-    if tolerances:
-        blocks.insert(0, _test_table(unseen, tolerances, joint_count or len(unseen.rows)))
+    if tests:
+        blocks.insert(0, _test_table(unseen, tests))
 
     torque_figures = [name for name in figures if name.startswith("torque_")]
     blocks.append(page.pictures("", figures, ("errors", "residuals")))
@@ -249,48 +247,42 @@ def report_section(
     blocks.append(page.Text("What was exported", exported))
     noticed = (*report.metrics.noticed, *report.unseen.noticed)
     blocks.append(page.Text("Notes on the dynamics", as_notes(warnings_of(report), noticed), "note"))
-    key_figures = _key_figures(unseen, tolerance, delivered)
-    if tolerances:
-        key_figures += _test_figures(unseen, tolerances, joint_count or len(unseen.rows))
+    key_figures = [*_key_figures(unseen, tolerance, delivered), *_test_figures(unseen, tests)]
     return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, key_figures)
 
 
-def _test_table(unseen: UnseenReport, tolerances: Sequence[float], joint_count: int) -> page.ReportTable:
+def _test_table(unseen: UnseenReport, tests: Sequence[TorqueTest]) -> page.ReportTable:
     """Return the table of the computed-torque test: rms error of each torque row beside its tolerance.
 
     Args:
-        unseen: report on the model's errors on held-out motion.
-        tolerances: tolerance of each joint, or one for all [N m or N].
-        joint_count: number of joints.
+        unseen: report on the model's errors on held-out motion, which has the units of the rows.
+        tests: results of the test.
     """
     answers = {True: "yes", False: "no", None: "not tested"}
     units = dict(zip(unseen.rows, unseen.units))
     rows = []
-    for test in torque_tests(tolerances, unseen.proofs, unseen.rows, joint_count):
+    for test in tests:
         rms = "–" if test.passed is None else f"{test.rms:.3g} {units[test.row]}"
         rows.append([test.row, rms, f"{test.tolerance:g} {units[test.row]}", answers[test.passed], test.recording])
     header = ("torque", "rms error", "tolerance", "within", "recording")
     return page.ReportTable("Computed-torque test on unseen motion", header, rows, numbers=[1, 2])
 
 
-def _test_figures(unseen: UnseenReport, tolerances: Sequence[float], joint_count: int) -> list[page.KeyFigure]:
-    """Return the key figure of the computed-torque test: the torque that is nearest to its tolerance, or most above it.
+def _test_figures(unseen: UnseenReport, tests: Sequence[TorqueTest]) -> Iterator[page.KeyFigure]:
+    """Yield the key figure of the computed-torque test: the torque nearest to its tolerance, or most above it.
 
     Args:
-        unseen: report on the model's errors on held-out motion.
-        tolerances: tolerance of each joint, or one for all [N m or N].
-        joint_count: number of joints.
+        unseen: report on the model's errors on held-out motion, which has the units of the rows.
+        tests: results of the test; nothing is yielded without results.
     """
-    units = dict(zip(unseen.rows, unseen.units))
-    results = torque_tests(tolerances, unseen.proofs, unseen.rows, joint_count)
-    tests = [test for test in results if test.passed is not None]
-    if not tests:
-        return []
-    worst = max(tests, key=lambda test: test.rms / test.tolerance)
-    unit = units[worst.row]
+    tested = [test for test in tests if test.passed is not None]
+    if not tested:
+        return
+    worst = max(tested, key=lambda test: test.rms / test.tolerance)
+    unit = dict(zip(unseen.rows, unseen.units))[worst.row]
     name = f"rms torque error (identified model), {worst.row}"
     error, allowed = f"{worst.rms:.3g} {unit}", f"{worst.tolerance:g} {unit}"
-    return [page.KeyFigure(name, "", error, "", worst.recording, allowed, page.met(worst.rms, worst.tolerance))]
+    yield page.KeyFigure(name, "", error, "", worst.recording, allowed, page.met(worst.rms, worst.tolerance))
 
 
 def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.ReportTable:
@@ -364,12 +356,15 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
     error, in_band = "torque unexplained", "torque unexplained in the motion's band"
     if proof.stands:
         error += " in motion"
-    if proof.noisy:
+    # a tolerance is compared with the error in the band where most of the error is above it
+    without_floor = proof.noisy or (tolerance > 0.0 and proof.floor_dominates)
+    if without_floor:
         error += f" below {proof.band:.3g} Hz"
-    identified = percent(proof.judged.total)
+    model_error = proof.counted(without_floor).total
+    identified = percent(model_error)
     allowed = f"{tolerance:g} %" if tolerance else "none"
     if delivered is None:
-        met = page.met(proof.judged.total, tolerance)
+        met = page.met(model_error, tolerance)
         figures = [page.KeyFigure(error, "", identified, spread, basis, allowed, met)]
     else:
         # the exported robot is what is judged
@@ -380,7 +375,7 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
         ]
     if proof.stands:
         figures.append(page.KeyFigure("torque unexplained at rest", "", percent(proof.standing.total), "", basis))
-    if proof.noisy:
+    if without_floor:
         figures.append(page.KeyFigure("torque unexplained at all frequencies", "", percent(proof.raw.total), "", basis))
     figures.append(page.KeyFigure(in_band, "", percent(proof.filtered.total), "", basis))
 

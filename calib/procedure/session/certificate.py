@@ -9,6 +9,7 @@ from calib.data.poses import CORNERS, JOINTS
 from calib.errors import command_line
 from calib.extensions import Point
 from calib.folders import CERTIFICATE, ESTIMATE, METRICS, PAGES, REPORT, read_estimate
+from calib.procedure.dynamic_stage.computed_torque import torque_tests
 from calib.procedure.excitation import coefficients
 from calib.procedure.export.delivery import prediction
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
@@ -121,14 +122,16 @@ def _dynamics(session: Session) -> StageRecord:
             figures["excitation"] = picture(*dynamics_pages.trained_on(training, chain_of(session).joints))
     allowed = session.settings.dynamics.tolerance_percent
     predicted = prediction(session.path(session.export))
-    delivered = None if predicted is None else predicted.exported
+    delivered = None
+    if predicted is not None:
+        delivered = predicted.compared if allowed else predicted.exported
     exported = read_state(session).notes("export")
-    tolerances = session.settings.dynamics.tolerance_torque
-    joint_count = len(chain_of(session).joints)
-    section = dynamics_section.report_section(report, figures, exported, allowed, delivered, tolerances, joint_count)
+    tolerances, joint_count = session.settings.dynamics.tolerance_torque, len(chain_of(session).joints)
+    tests = torque_tests(tolerances, report.unseen.proofs, report.unseen.rows, joint_count)
+    section = dynamics_section.report_section(report, figures, exported, allowed, delivered, tests)
     verdict = session.verdicts().stages["dynamics"]
     section = replace(section, verdict=verdict.level, reason=verdict.reason)
-    stage = dynamics_pages.stage(report, section, session.plots, allowed or max(tolerances, default=0.0))
+    stage = dynamics_pages.stage(report, section, session.plots, bool(allowed or tests))
     return _with_arrival(stage, _arrival_notes(session, "7-recorded", "predict"))
 
 

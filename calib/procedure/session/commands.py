@@ -30,10 +30,11 @@ from calib.procedure.measuring.pose_limits import read_limits, tables_of
 from calib.procedure.report import page
 from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import steps
-from calib.procedure.session.dynamics_steps import pick_motion, picked_front, unrecorded_payloads
+from calib.procedure.session.dynamics_steps import design_motions, picked_front, unrecorded_payloads
 from calib.procedure.session.folder import POSES, UNSEEN, WAYS, Say, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
+from calib.procedure.session.recording_names import log_name
 from calib.procedure.session.second_round import promised
 from calib.procedure.session.settings import NOTHING, SessionSettings
 from calib.procedure.session.steps import DONE, KEPT, WAITING, State
@@ -183,8 +184,8 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
     logs = []
     for name in names:
         if name == "validation" or not session.brought("training"):
-            logs.append(f"{name}_log.csv")
-        logs += [f"{name}_{label}_log.csv" for label in missing]
+            logs.append(log_name(name))
+        logs += [log_name(name, label) for label in missing]
     files = " and ".join(str(session.path(f"7-recorded/{log}")) for log in logs)
     return task, (
         f"{files}, one row per sample: t [s], {', '.join(columns)}; currents are i_{first.name} [A] …; .npz and ROS "
@@ -372,7 +373,7 @@ def go_on(
     with locked(session, say):
         if pick:
             step = steps.find(session, "excite")
-            make = partial(pick_motion, picked_front(session, pick))
+            make = partial(design_motions, picked=picked_front(session, pick))
             steps.run_instead(session, step, make, say, progress, command)
         if again:
             steps.forget(session, steps.find(session, again))

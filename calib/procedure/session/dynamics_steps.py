@@ -3,8 +3,7 @@
 The steps call the functions behind `calib excite` and `calib identify` with files in the session's folder.
 """
 
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -39,6 +38,7 @@ from calib.procedure.findings import UNJUDGED, Note, Verdict, as_notes, lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, ROUND, Say, Session
 from calib.procedure.session.masses import return_masses
+from calib.procedure.session.recording_names import labels_in
 from calib.records import read_json
 from calib.robot.chain import Chain
 from calib.robot.library import load_calibrated
@@ -73,49 +73,11 @@ def options_of(session: Session) -> IdentifyOptions:
     settings = replace(settings, payloads=payloads, seed=session.settings.seed)
     by_file = dict(options.files)
     for path in session.brought("training", "unseen"):
-        labels = _labels_in(path.stem, payloads)
+        labels = labels_in(path.stem, payloads)
         if labels:
             default = FileSettings(options.every.recording, options.every.filter)
             by_file[path.name] = replace(by_file.get(path.name, default), payload=labels)
     return replace(options, settings=settings, files=by_file)
-
-
-def _labels_in(name: str, labels: Iterable[str]) -> tuple[str, ...]:
-    """Return the labels that are words of a recording's name, such as ``load`` of ``training_load_log``.
-
-    A number may follow a label, as in ``training_load2_log``; where a longer label matches, only this one counts.
-    Without such words the labels count with which a word begins, as in ``training_loaded_log``.
-
-    Args:
-        name: file name of the recording.
-        labels: labels of all payloads.
-    """
-    as_words = _spans(name, labels, r"(?![^\W_])")
-    return as_words or _spans(name, labels, "")
-
-
-def _spans(name: str, labels: Iterable[str], end: str) -> tuple[str, ...]:
-    """Return the labels at the beginnings of words in a name, without those inside a longer match.
-
-    Args:
-        name: the name.
-        labels: the labels.
-        end: pattern behind a label and its number.
-    """
-    matches = {}
-    for label in labels:
-        number = r"" if label[-1].isdigit() else r"\d*"
-        match = re.search(rf"(?<![^\W_]){re.escape(label)}{number}{end}", name, re.IGNORECASE)
-        if match is not None:
-            matches[label] = match.span()
-    longest = []
-    for label, (start, stop) in matches.items():
-        is_part = False
-        for rival, (first, last) in matches.items():
-            is_part = is_part or (first <= start and stop <= last and len(rival) > len(label))
-        if not is_part:
-            longest.append(label)
-    return tuple(longest)
 
 
 def unrecorded_payloads(session: Session) -> list[str]:
@@ -142,10 +104,10 @@ def excite(session: Session, say: Say) -> list[str | Note]:
     """
     if not session.settings.dynamics.plan:
         return ["no motion was designed, since plan = false: the recordings may contain any motions"]
-    return _designs(session, say)
+    return design_motions(session, say)
 
 
-def _designs(session: Session, say: Say, picked: StoredFront | None = None) -> list[str | Note]:
+def design_motions(session: Session, say: Say, picked: StoredFront | None = None) -> list[str | Note]:
     """Design both motions of a session, and return notes.
 
     Args:
@@ -202,17 +164,6 @@ def _validation_settings(session: Session) -> ExcitationSettings:
     )
 
 
-def pick_motion(picked: StoredFront, session: Session, say: Say) -> list[str | Note]:
-    """Make the designed motion of a front the training motion, design the validation motion, and return notes.
-
-    Args:
-        picked: the front of the session's training motion, with the motion to take as the designed one.
-        session: the session.
-        say: called with progress texts.
-    """
-    return _designs(session, say, picked)
-
-
 def picked_front(session: Session, number: int) -> StoredFront:
     """Return the front of the session's training motion with motion `number`, from 1, as the designed one.
 
@@ -265,14 +216,14 @@ def _design(
         f"normalised, {columns} columns; all limits are respected"
     ]
     if name == "training":
-        notes += [Note(f"{name}: {doubt}", is_warning=True) for doubt in designed.doubts]
+        notes += [Note(f"{name}: {goal_note}", is_warning=True) for goal_note in designed.goal_notes]
         if designed.front is not None:
             count = len(designed.front.values)
             choose = command_line("next", session.folder, "--pick", "N")
             table = session.path("6-excitation/training") / stored_front.TABLE
             notes.append(Note(f"{name}: {count} motions to choose from ({table}): {choose}", is_warning=True))
         for remark in (*designed.inputs.limits.bounds.lines(), *designed.notes):
-            if remark not in designed.doubts:
+            if remark not in designed.goal_notes:
                 notes.append(f"{name}: {remark}")
     return notes
 
@@ -597,7 +548,7 @@ def _as_delivered(session: Session, gathered: inputs.IdentificationInputs, asses
     except CalibError as reason:
         verdict = verdict.for_prediction(f"the dynamics cannot be exported: {reason}")
     if predicted:
-        error, model = predicted.exported if predicted.tested is None else predicted.tested, "exported robot"
+        error, model = predicted.compared, "exported robot"
         figure = f"{predicted.exported:.2f} % of the torque unexplained by the exported robot"
         verdict = replace(verdict, reason=f"{figure} (identified model: {verdict.reason})")
     elif verdict.level == "pass" and assessment.proofs:

@@ -19,7 +19,8 @@ from calib.errors import CalibError, UsageError, one_of, refused_as, require
 from calib.procedure.answers import CAMERA, CELL, Answers, CertificateSection
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, checked_goal
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
-from calib.procedure.session.settings import NOTHING, InstrumentSection, check_labels
+from calib.procedure.session.recording_names import check_labels
+from calib.procedure.session.settings import NOTHING, InstrumentSection
 from calib.records import FieldValues
 from calib.robot.library import resolve
 from calib.transforms import pose, to_xyz_rpy

@@ -27,6 +27,7 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.findings import limit
 from calib.procedure.session.dynamics_steps import next_round, options_of
 from calib.procedure.session.folder import ROUND, Say, Session, read_state
+from calib.procedure.session.recording_names import log_name
 from calib.procedure.session.steps import (
     FITTED_ROBOT,
     IDENTIFY_OPTIONS,
@@ -235,9 +236,9 @@ def promised(session: Session) -> tuple[str, ...]:
     played = folder / SAMPLES
     if session.settings.dynamics.repeats > 1:
         played = folder / RUN
-    logs = [f"{name}_log.csv", *(f"{name}_{label}_log.csv" for label in session.settings.dynamics.payloads)]
-    paths = " and ".join(str(session.path(f"7-recorded/{log}")) for log in logs)
-    loads = " without and with each payload" if session.settings.dynamics.payloads else ""
+    payloads = session.settings.dynamics.payloads
+    paths = " and ".join(str(session.path(f"7-recorded/{log_name(name, label)}")) for label in ("", *payloads))
+    loads = " without and with each payload" if payloads else ""
     task = f"play {played}{loads}, put the log into {paths}; then: "
     return (notes[0], f"if wanted, {task}{command_line('next', session.folder)}")
 

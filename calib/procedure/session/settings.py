@@ -4,8 +4,7 @@ Lengths are in m, angles in rad. The dataclasses of this module define every key
 comment.
 """
 
-import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path, PurePath
@@ -44,6 +43,7 @@ from calib.procedure.kinematic_stage.settings import (
     Method,
     Stations,
 )
+from calib.procedure.session.recording_names import check_labels
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -56,8 +56,6 @@ READABLE_SCHEMAS = (1, SCHEMA)
 NOTHING = "nothing"
 # of a designed motion (our choice): 160 MB per joint and derivative
 MAX_SAMPLES = 20_000_000
-# words in the names of all recordings of a session, besides the numbers of further rounds
-RECORDING_WORDS = ("training", "validation", "log", "round", "none")
 # letters of a file's name
 MAX_NAME = 200
 # where comments begin and end
@@ -258,13 +256,6 @@ class DynamicsSection:
                 f"period {self.period:g} s at rate {self.rate:g} Hz, repeated {self.repeats} times, is more than "
                 f"{MAX_SAMPLES:.0e} samples: lower one of them"
             )
-
-
-def check_labels(labels: Iterable[str]) -> None:
-    """Raise a ValueError if a label occurs in the names of all recordings, which labels assign to payloads."""
-    for label in labels:
-        if label.lower() in RECORDING_WORDS or re.fullmatch(r"round\d+", label.lower()):
-            raise ValueError(f"payloads: '{label}' is a part of all recordings' names; choose another label")
 
 
 @strict

@@ -569,12 +569,11 @@ def run_instead(session: Session, step: SessionStep, make: Make, say: Say, progr
         SessionError: if an earlier step is not completed, or people have carried out what the step planned.
     """
     go_on = command_line("next", session.folder)
+    kinds, reason = step.kept
     for state in states(session):
-        kinds, reason = step.kept
         if state.step.name == step.name:
             require(not session.brought(*kinds), f"step {step.name}: {reason}", SessionError)
-            message = f"step {step.name}: {state.words}; first repeat it: {go_on}"
-            require(state.kind == DONE, message, SessionError)
+            require(state.kind == DONE, f"step {step.name}: {state.words}; first repeat it: {go_on}", SessionError)
             break
         require(state.kind in (DONE, KEPT), f"first complete the step {state.step.name}: {go_on}", SessionError)
     _run(session, replace(step, make=make), say, progress, command)

@@ -34,14 +34,14 @@ NOTE = (
 )
 
 
-def stage(report: DynamicReport, section: Section, plots: bool, tolerance: float = 0.0) -> StageRecord:
+def stage(report: DynamicReport, section: Section, plots: bool, has_tolerance: bool = False) -> StageRecord:
     """Return the content of report and certificate on an identification.
 
     Args:
         report: stored results of the identification.
         section: section of the report, with verdict and key figures.
         plots: whether to include figures.
-        tolerance: largest acceptable torque error on held-out motion [%]; 0: no tolerance.
+        has_tolerance: whether a largest acceptable torque error is stated.
     """
     order = _worst_first(report)
     pictures = list(_curves(report, order)) if plots else []
@@ -53,19 +53,19 @@ def stage(report: DynamicReport, section: Section, plots: bool, tolerance: float
     # what stands under uncertainty is not repeated among the findings
     uncertainty = tuple(_uncertainty_findings(report))
     findings = [line for line in warnings_of(report) if not line.startswith(uncertainty)]
-    return StageRecord(section, blocks, list(_unchecked(report, tolerance)), findings)
+    return StageRecord(section, blocks, list(_unchecked(report, has_tolerance)), findings)
 
 
-def _unchecked(report: DynamicReport, tolerance: float) -> Iterator[str]:
+def _unchecked(report: DynamicReport, has_tolerance: bool) -> Iterator[str]:
     """Yield texts on the properties that the recordings of an identification cannot prove.
 
     Args:
         report: stored results of the identification.
-        tolerance: largest acceptable torque error [%]; 0: no tolerance.
+        has_tolerance: whether a largest acceptable torque error is stated.
     """
     if not report.unseen.proofs:
         yield "torque errors on unseen motion: none was recorded"
-    if not tolerance:
+    if not has_tolerance:
         yield "a tolerance of the torque: none was asked for; pass means below 10 %"
 
 
