@@ -17,7 +17,8 @@ import numpy as np
 from calib.dynamics import rigid_body
 from calib.identification.closed_loop.simulation import added_inertia
 from calib.parallel.mechanism.mechanism_simulation import ParallelPlant
-from calib.parallel.mechanism.parallel_model import ParallelModel, along, wrench_regressor
+from calib.parallel.mechanism.parallel_model import ParallelModel, along
+from calib.parallel.mechanism.platform_columns import wrench_regressor
 from calib.parallel.mechanism.velocities import LoopMotion
 from calib.toolkit.simulations import LoopController, Reference, Sensing
 

@@ -22,8 +22,8 @@ joint ``q_joint1 [rad]``, ``v_joint1 [rad/s]``, ``a_joint1 [rad/s^2]`` (of slidi
 predicts them, ``tau_joint1 [N m]``; ``motion.csv`` of `calib plan` likewise. ``arm.toml`` is the robot that it was
 made for, so that `calib view` can draw it.
 
-With ``--front`` there are ``front.csv``, one row per motion to choose from, and each motion as ``front/3/trajectory.toml``;
-``calib excite --pick 3``, with the options of the design, makes it the designed one.
+With ``--front`` there are ``front.csv``, a row per motion, and the motions (``front/3/trajectory.toml``);
+``calib excite --pick 3``, with the options of the design, makes one of them the designed one.
 
 ``calib recall`` finds the motion in a log, cuts it to whole periods and averages them. It writes a recording of one
 period that `calib identify` reads. A NumPy archive holds besides, per sample and joint, the variance of one sample over
