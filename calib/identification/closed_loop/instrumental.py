@@ -387,6 +387,7 @@ class _Fixed:
         estimator: estimator of each iteration.
         constraints: constraints on the parameters; None without.
         friction: additional friction terms.
+        noise: position noise of each recording, in the loop and in the log alone.
     """
 
     model: IdentificationModel
