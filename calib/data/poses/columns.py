@@ -9,10 +9,18 @@ import numpy as np
 
 from calib.controllers.table import as_described
 from calib.data.csv_table import Table
+from calib.data.joint_columns import (
+    described,
+    joint_series,
+    mapping_line,
+    position_series,
+    proposed_line,
+    series_named_in_cells,
+)
 from calib.data.poses import IGNORED, MEASURED
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import KINDS
-from calib.data.schema import BOUNDS, Column
+from calib.data.schema import BOUNDS, Column, Joints
 from calib.errors import MeasurementError, one_of, suggestion
 
 SUFFIXES = ("", "_meas", "_measured")
@@ -109,14 +117,14 @@ class Sheet:
             values.append(self.table.numbers(name, column.dimension, unit, gaps))
         return column.check(np.stack(values, axis=1), self.table, names)
 
-    def joints(self, joints: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    def joints(self, joints: Joints | Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return joint values (m, n) [rad or m], and the file's names of the joint columns.
 
         Args:
-            joints: names of the robot's n joints, in the robot's order.
+            joints: names of the robot's n joints, in the robot's order, or the joints with their types.
         """
         names = self.find_joints(joints)
-        q = self.numbers(names, Column(tuple(joints), "joint", "joints"))
+        q = self.numbers(names, Column(Joints.of(joints).names, "joint", "joints"))
         if self.options.controller:
             q = as_described(self.options.controller, q)
         return q, names
@@ -141,21 +149,24 @@ class Sheet:
                 message = f"the options state unit {unit} for '{name}', which is not a column: correct [units]"
                 self.fail(message + suggestion(name, (*names, *UNIT_GROUPS)), name)
 
-    def find_joints(self, joints: Sequence[str]) -> tuple[str, ...]:
+    def find_joints(self, joints: Joints | Sequence[str]) -> tuple[str, ...]:
         """Return the file's names of the joint columns, in the robot's order.
 
         Accepted are the robot's joint names, ``q_<joint name>``, or ``q1`` to ``qn``; the first of these forms that
-        occurs in the file is used.
+        occurs in the file is used. Without them: the only series of `calib.data.joint_columns` that may be positions.
 
         Args:
-            joints: names of the robot's joints.
+            joints: names of the robot's joints, or the joints with their types.
         """
+        robot = Joints.of(joints)
+        joints = robot.names
         n, table, mapping = len(joints), self.table, self.options.columns
+        message, missing = "", []
         numbered = tuple(f"q{i + 1}" for i in range(n))
         mapped = [mapping.get(joint) or mapping.get(q) for joint, q in zip(joints, numbered)]
         for form in (tuple(joints), tuple(f"q_{joint}" for joint in joints), numbered):
             columns: list[str] = []
-            missing: list[str] = []
+            missing = []
             for name, heading in zip(form, mapped):
                 if heading or name in table:
                     columns.append(heading or name)
@@ -167,9 +178,46 @@ class Sheet:
             if any(name in table for name in form):
                 near = suggestion(missing[0], table.header)
                 message = f"missing{near}: the robot has {n} joints, the header has only {', '.join(columns)}"
-                self.fail(message, missing[0])
-        message = f"no joint columns: expected q1 to q{n}, or {', '.join(joints)}; found {', '.join(table.header)}"
-        self.fail(f"{message}. Map them in the options' [columns]")
+                break
+        return self._joints_by_words(robot, message, missing[0] if message else None)
+
+    def has_our_names(self, columns: Sequence[str], joints: Sequence[str]) -> bool:
+        """Return whether joint columns have the names of the robot's joints or of this toolkit, or the options map them.
+
+        Args:
+            columns: the file's names of the joint columns.
+            joints: names of the robot's joints.
+        """
+        mapped = self.options.columns.values()
+        for number, (column, joint) in enumerate(zip(columns, joints), 1):
+            if column not in (joint, f"q_{joint}", f"q{number}", *mapped):
+                return False
+        return True
+
+    def _joints_by_words(self, robot: Joints, message: str, column: str | None) -> tuple[str, ...]:
+        """Return the columns of the only series of joint columns in the header that may be positions.
+
+        Args:
+            robot: the robot's joints.
+            message: what is wrong with columns that have the names of this toolkit; "" without such columns.
+            column: the name of the missing column, for the message.
+
+        Raises:
+            MeasurementError: no series, or several; the message ends with a line for the options, where it can.
+        """
+        table, n = self.table, len(robot.names)
+        series = series_named_in_cells(table, robot.names) or joint_series(table.header, robot.names, robot.kinds)
+        positions = position_series(series)
+        if len(positions) == 1:
+            return positions[0].columns
+        if len(positions) > 1:
+            choices = " or ".join(described(entry) for entry in positions)
+            self.fail(f"joints may be {choices}: choose by one line in the options: {mapping_line(positions[0])}")
+        if not message:
+            expected = f"expected q1 to q{n}, or {', '.join(robot.names)}"
+            message = f"no joint columns: {expected}; found {', '.join(table.header)}"
+        line = proposed_line(table.header, series, n)
+        self.fail(f"{message}. If they have other names, map them by one line in the options, as in {line}", column)
 
     def _refuse_more_joints(self, columns: Sequence[str], n: int) -> None:
         """Raise MeasurementError for a table with more numbered joint columns than the robot has joints.
@@ -299,19 +347,23 @@ class Layout:
         return self.base, self.base_sigma, self.base_sigma_rotation
 
 
-def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
+def find_layout(sheet: Sheet, joints: Joints | Sequence[str]) -> Layout:
     """Return which columns of a table are read, for a robot with joints of the given names.
 
     Args:
         sheet: the table with its options.
-        joints: names of the robot's joints.
+        joints: the robot's joints, or their names.
 
     Raises:
         MeasurementError: a column is missing, or the options map it to one that the file does not have; the header
             allows several kinds or position triples, and the options select none.
     """
-    sheet.check_names(joints)
-    layout = _layout(sheet, joints)
+    robot = Joints.of(joints)
+    sheet.check_names(robot.names)
+    layout = _layout(sheet, robot)
+    if not sheet.has_our_names(layout.joints, robot.names):
+        note = f"the joints are read from {', '.join(layout.joints)}"
+        layout = replace(layout, notes=(note, *layout.notes))
     numbers = list(layout.joints)
     for names in layout.positions:
         numbers += names
@@ -331,9 +383,9 @@ def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     return layout
 
 
-def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
+def _layout(sheet: Sheet, robot: Joints) -> Layout:
     _refuse_base_alone(sheet)
-    columns = sheet.find_joints(joints)
+    columns = sheet.find_joints(robot)
     kind = _find_kind(sheet, columns)
     if kind in LABEL_OF:
         return _grouped_layout(sheet, kind, columns)

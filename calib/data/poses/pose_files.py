@@ -240,7 +240,7 @@ def read_measurements(
         columns = {name: heading for name, heading in mapped if heading in table or name not in table}
         options = replace(options, columns=columns)
     sheet = _select_rows(Sheet(table, options))
-    layout = find_layout(sheet, robot.names)
+    layout = find_layout(sheet, robot)
     sheet, base_notes = rows_with_base(sheet, layout)
     number_columns = layout.used.difference(layout.group, [layout.tool])
     # Where a file has several targets, one that was not seen is a gap.
@@ -248,7 +248,7 @@ def read_measurements(
     if len(layout.positions) > 1:
         columns_with_gaps.update(*layout.positions, *layout.sigmas)
     sheet.table.check([name for name in sheet.table.header if name in number_columns], columns_with_gaps)
-    q, _ = sheet.joints(robot.names)
+    q, _ = sheet.joints(robot)
     notes = (*sheet.table.notes, *notes, *layout.notes, *base_notes)
     notes = (*notes, *plausible.check_joints(q, sheet, layout.joints, robot))
     if layout.positions:
