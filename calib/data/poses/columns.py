@@ -1,7 +1,7 @@
 """Columns of a measurement file: which quantity each column contains, by the column's name and the options."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
@@ -18,10 +18,19 @@ from calib.data.joint_columns import (
     series_named_in_cells,
 )
 from calib.data.poses import IGNORED, MEASURED
-from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.fit_options import CONVENTIONS, FileOptions
 from calib.data.poses.measurements import KINDS
+from calib.data.poses.name_shapes import (
+    Shape,
+    matrices_by_shape,
+    numbered_quaternions,
+    orientations_by_shape,
+    positions_by_shape,
+    with_shape,
+)
 from calib.data.schema import BOUNDS, Column, Joints
 from calib.errors import MeasurementError, one_of, suggestion
+from calib.units import ANGLES as ANGLE_UNITS
 
 SUFFIXES = ("", "_meas", "_measured")
 POSITION = Column(("x", "y", "z"), "length", "position", BOUNDS.max_length, "mm")
@@ -56,6 +65,19 @@ OURS = (
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
 _NUMBERED_JOINT = re.compile(r"q\d+")
+
+
+class Undecided(MeasurementError):
+    """Raised where a table can be read in several ways, and its names do not tell which is meant.
+
+    Attributes:
+        table: the table.
+        choices: options for reading it, by the line of an options file that states them.
+    """
+
+    def __init__(self, table: Table, message: str, choices: Mapping[str, FileOptions], column: str | None = None):
+        self.table, self.choices = table, choices
+        super().__init__(message, table.file, None, column)
 
 
 @dataclass(frozen=True)
@@ -384,7 +406,6 @@ def find_layout(sheet: Sheet, joints: Joints | Sequence[str]) -> Layout:
 
 
 def _layout(sheet: Sheet, robot: Joints) -> Layout:
-    _refuse_base_alone(sheet)
     columns = sheet.find_joints(robot)
     kind = _find_kind(sheet, columns)
     if kind in LABEL_OF:
@@ -412,6 +433,70 @@ def _layout(sheet: Sheet, robot: Joints) -> Layout:
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}{meaning}")
     rotation = sheet.family(SIGMA_ROTATION.names)
     return replace(layout, orientation=orientation, sigma_rotation=rotation, notes=notes)
+
+
+def with_shapes(sheet: Sheet, robot: Joints) -> Sheet:
+    """Return the sheet with the columns mapped that are a position or an orientation by the shape of their names.
+
+    Args:
+        sheet: the table with its options.
+        robot: the robot's joints.
+
+    Raises:
+        Undecided: a quaternion whose components are numbered.
+        MeasurementError: several positions or orientations have such names.
+    """
+    _refuse_base_alone(sheet)
+    joints = sheet.find_joints(robot)
+    if any(sheet.find(label) for label in LABEL_OF.values()):
+        return sheet
+    unread = {*joints, *sheet.options.columns.values()}
+    names = [name for name in sheet.table.header if name not in unread]
+    targets, *_ = _find_targets(sheet)
+    matrices = matrices_by_shape(sheet.table, names)
+    if not targets:
+        poses = [shape for shape in matrices if len(shape.columns) > len(MATRIX.names)]
+        sheet = _with_only_shape(sheet, poses or positions_by_shape(names))
+        targets, *_ = _find_targets(sheet)
+    if len(targets) != 1 or sheet.options.kind not in ("", "pose"):
+        return sheet
+    if sheet.family(QUATERNION.names) or sheet.family(MATRIX.names) or _angles(sheet, joints):
+        return sheet
+    shapes = matrices or orientations_by_shape(names)
+    if shapes:
+        return _with_only_shape(sheet, shapes)
+    for pair in numbered_quaternions(names):
+        columns = ", ".join(pair[0].columns.values())
+        choices = {_mapping(shape.columns): with_shape(sheet.options, shape) for shape in pair}
+        lines = " or ".join(choices)
+        message = f"{columns} look like a quaternion: is w first or last? One line in the options says it: {lines}"
+        raise Undecided(sheet.table, message, choices)
+    return sheet
+
+
+def _with_only_shape(sheet: Sheet, shapes: Sequence[Shape]) -> Sheet:
+    """Return the sheet with the columns of the only shape mapped; unchanged without a shape.
+
+    Args:
+        sheet: the table with its options.
+        shapes: columns that by their names are the quantity.
+
+    Raises:
+        MeasurementError: there are several.
+    """
+    if len(shapes) > 1:
+        first, second = (", ".join(shape.columns.values()) for shape in shapes[:2])
+        line = _mapping(shapes[0].columns)
+        sheet.fail(f"{first} or {second} may be meant: choose by one line in the options, as in {line}")
+    if not shapes:
+        return sheet
+    return replace(sheet, options=with_shape(sheet.options, shapes[0]))
+
+
+def _mapping(columns: Mapping[str, str]) -> str:
+    """Return the line of an options file that maps columns."""
+    entries = [f'{name} = "{heading}"' for name, heading in columns.items()]
+    return f"columns = {{ {', '.join(entries)} }}"
 
 
 def _of_base(column: Column) -> list[str]:
@@ -524,23 +609,25 @@ def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
         joints: names of the joint columns, which are not angles of an orientation.
 
     Raises:
-        MeasurementError: three angles whose convention the options do not define.
+        Undecided: three angles whose convention the options do not define.
     """
     columns = sheet.family(QUATERNION.names) or sheet.family(MATRIX.names) or _angles(sheet, joints)
     if len(columns) == 3 and not sheet.options.euler:
-        sheet.fail(
-            f"{', '.join(columns)} look like an orientation. State their meaning in the options: euler = 'vector' "
-            "(rotation vector, as in Universal Robots), 'xyz fixed' (roll, pitch, yaw), 'zyx moving' (KUKA's A, "
-            "B, C) ...; or ignore them by kind = 'position'",
-            columns[0],
+        message = (
+            f"{', '.join(columns)} look like an orientation. State their meaning by one line in the options: euler = "
+            "'vector' (rotation vector, as in Universal Robots), 'xyz fixed' (roll, pitch, yaw), 'zyx moving' (KUKA's "
+            "A, B, C) ...; or ignore them by kind = 'position'"
         )
+        choices = {f"euler = '{euler}'": replace(sheet.options, euler=euler) for euler in CONVENTIONS}
+        raise Undecided(sheet.table, message, choices, columns[0])
     return columns
 
 
 def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of three angle columns, in upper or lower case, that are not joints; () without such columns.
 
-    Names of one small letter (a, b, c) count as angles only if the options define the convention of the angles.
+    Names of one small letter (a, b, c) count as angles only if the header states a unit of angles, or the options the
+    convention.
 
     Args:
         sheet: the table with its options.
@@ -550,8 +637,8 @@ def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     if any(name in sheet.options.columns for name in standard_names):
         return sheet.family(standard_names)
     headings: dict[str, str] = {}
-    for name in sheet.table.header:
-        may_be_angle = sheet.options.euler or len(name) > 1 or name.isupper()
+    for name, unit in zip(sheet.table.header, sheet.table.units):
+        may_be_angle = sheet.options.euler or len(name) > 1 or name.isupper() or unit.lower() in ANGLE_UNITS
         if name not in joints and may_be_angle:
             headings[name.lower()] = name
     complete: list[tuple[str, ...]] = []
