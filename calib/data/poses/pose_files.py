@@ -351,6 +351,8 @@ def _read_targets(sheet: Sheet, layout: Layout, q: np.ndarray) -> Positions:
         quaternion = plausible.orientation(sheet, layout.orientation)
         common["sigma_rotation"] = _sigma_rotation(sheet, layout)
         common["euler"] = sheet.options.euler if len(layout.orientation) == 3 else ""
+        if sheet.options.camera.mounting != "auto":
+            common["mounting"] = sheet.options.camera.mounting
         block = Poses(q[row], layout.joints, block.position, quaternion, **common)
     if not layout.base:
         return block
