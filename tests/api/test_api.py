@@ -349,9 +349,13 @@ def test_session_in_python_is_the_commands(logs, tmp_path, monkeypatch, capsys):
     """A session in Python is the command's session."""
     monkeypatch.chdir(tmp_path)
     robot = str(logs / "robot.toml")
-    made = calib.new_session("script", robot, "cmm", poses=8, validation=0, dynamics=False)
+    keys = {"poses": 8, "validation": 0, "holdout": 0.25, "dynamics": False}
+    made = calib.new_session("script", robot, "cmm", **keys)
     command = ["new", "command", "--robot", robot, "--instrument", "cmm", "--poses", "8", "--validation", "0"]
-    assert cli.run([*command, "--geometry-only"]) == 0
+    assert cli.run([*command, "--holdout", "0.25", "--geometry-only"]) == 0
+    assert cli.run(["new", "free", "--robot", robot, "--instrument", "cmm", "--no-plan"]) == 0
+    free = tomllib.loads((tmp_path / "free/session.toml").read_text())
+    assert not free["poses"]["plan"] and not free["dynamics"]["plan"]
     own, other = (tomllib.loads((tmp_path / name / "session.toml").read_text()) for name in ("script", "command"))
     assert made == Path("script") and own | {"created": ""} == other | {"created": ""}
     script, command = calib.run_sessions(["script", "command/session.toml"], plots=False)

@@ -80,8 +80,9 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
     settings, joints = session.settings, chain_of(session).joint_names
     instrument, images = settings.instrument, settings.instrument.measures == IMAGES
     lists = [POSES] if step == "measure" else [UNSEEN]
-    # both are measured in one visit
-    if step == "measure" and settings.poses.validation and not session.brought("validation"):
+    # both are measured in one visit, unless rows of the first are held out
+    apart = settings.poses.validation and not settings.fit.holdout
+    if step == "measure" and apart and not session.brought("validation"):
         lists.append(UNSEEN)
 
     planned = _planned_poses(session, lists)
@@ -167,7 +168,7 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
     missing = unrecorded_payloads(session) if step == "record" else []
     if step == "record" and (missing or not session.brought("training")):
         names.append("training")
-    if section.validation and not session.brought("unseen"):
+    if section.validation and not section.holdout and not session.brought("unseen"):
         names.append("validation")
 
     if section.plan:
@@ -280,6 +281,8 @@ def new_session(
     program: str = "",
     tolerance_mm: float = 0.0,
     reference: bool = False,
+    plan: bool = True,
+    holdout: float = 0.0,
     certificate: Mapping[str, object] | None = None,
     **motion: object,
 ) -> Path:
@@ -299,6 +302,8 @@ def new_session(
         program: robot controller in whose language the poses are written, too (`calib program --list`); empty: none.
         tolerance_mm: largest accepted rms on held-out poses [mm]; 0: none.
         reference: whether a frame on the robot's base is measured beside the target.
+        plan: whether the session chooses poses and designs motions; otherwise other poses and motions are measured.
+        holdout: share of measured poses, and of recordings, that is held out where there is no file for validation.
         certificate: keys of ``[certificate]``: entries of the certificate besides results; None: all are empty.
         motion: other keys of ``[dynamics]`` (``calib formats session``): torques, payloads, period …
 
@@ -326,11 +331,11 @@ def new_session(
         "name": chain.name,
         "created": "",
         "seed": seed,
-        "fit": {"tolerance_mm": tolerance_mm},
+        "fit": {"tolerance_mm": tolerance_mm, "holdout": holdout},
         "robot": {"file": source.name, "given": str(robot), "base": base, "tip": tip, "controller": program},
         "instrument": of_instrument,
-        "poses": {"fit": poses, "validation": validation, "constraints": named},
-        "dynamics": {"wanted": dynamics, "limits": named, **motion},
+        "poses": {"fit": poses, "validation": validation, "plan": plan, "constraints": named},
+        "dynamics": {"wanted": dynamics, "limits": named, "plan": plan, "holdout": holdout, **motion},
         "certificate": dict(certificate or {}),
     }
     create(Path(folder), source, parse(SessionSettings, table, SESSION), copied | meshes_beside(source))
