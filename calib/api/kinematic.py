@@ -9,9 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calib import files
-from calib.api.rendering import ChartedResult, Progress, ReportedResult, WithoutVerdict, data_frame, listed, optional
+from calib.api.rendering import ChartedResult, Progress, ReportedResult, WithoutVerdict, listed, optional
+from calib.api.result_table import ResultTable, data_frame
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
@@ -25,13 +27,14 @@ from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSetti
 from calib.procedure.measuring import prediction
 from calib.procedure.measuring.measuring_run import write_run
 from calib.procedure.robot_kinds import Mechanism, stage_of
-from calib.records import as_subclass, plain, shaped
+from calib.records import as_subclass, plain
 from calib.result_kinds import BY_NAME
-from calib.robot.calibrated import CalibratedChain
+from calib.robot.calibrated import CalibratedChain, like_joints
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
-    from calib.api.rendering import DataFrame
+    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
+
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -130,7 +133,10 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
 
 
 class PredictedPoses(NamedTuple):
-    """Poses (m, 4, 4) [m] of a tool in the robot's base frame, with σ (m, 2) of position [m] and orientation [rad]."""
+    """Poses (m, 4, 4) [m] of a tool in the robot's base frame, with σ (m, 2) of position [m] and orientation [rad].
+
+    Of one pose, asked for by joint values (n,): (4, 4) and (2,).
+    """
 
     pose: np.ndarray
     sigma: np.ndarray
@@ -149,11 +155,15 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
     )
 
     @property
-    def residuals(self) -> DataFrame:
-        """Residuals of every row, fitted or held out, with weight and expected error, as a pandas DataFrame."""
+    def residuals(self) -> ResultTable:
+        """Residuals (measured minus predicted) of every row, fitted or held out, with weight and expected error.
+
+        The columns are those of ``residuals.csv``: ``fit.residuals["dx [mm]"]`` is an array (m,), and
+        ``fit.residuals.to_dataframe()`` a pandas DataFrame.
+        """
         from calib.procedure.kinematic_stage.fit_tables import residuals
 
-        return data_frame(*residuals(self))
+        return ResultTable.of_rows(*residuals(self))
 
     @property
     def estimate(self) -> Estimate:
@@ -161,14 +171,14 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         return self.selection.fit.estimate
 
     @one_blas_thread()
-    def predict(self, q: object, tool: int = 0) -> PredictedPoses:
+    def predict(self, q: ArrayLike, tool: int = 0) -> PredictedPoses:
         """Return the tool poses of the calibrated robot at given joint values, in its base frame, with their σ.
 
         If the fit has an error model, σ of the position contains all expected errors (`position_sigma`), else only
         those due to the parameters. σ of the orientation contains only those due to the parameters.
 
         Args:
-            q: (m, n) joint values [rad or m].
+            q: joint values (m, n) [rad or m], or (n,) for one pose.
             tool: index of the fitted tool, from 0.
         """
         geometry = self.selection.fit
@@ -177,10 +187,10 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         if self.expected is not None:
             sigma[:, 0] = self.expected.position_sigma(poses, -1, tool)
         tool_poses = self.robot.forward(poses.q, poses.torque) @ geometry.cell.tools[tool]
-        return PredictedPoses(tool_poses, sigma)
+        return PredictedPoses(like_joints(q, tool_poses), like_joints(q, sigma))
 
     @one_blas_thread()
-    def position_sigma(self, q: object, tool: int = 0) -> np.ndarray:
+    def position_sigma(self, q: ArrayLike, tool: int = 0) -> np.ndarray:
         """Return the standard deviation (m,) [m] of the tool position error (norm over the axes) at given poses.
 
         It contains the parameters' covariance and unmodelled effects. It is estimated on held-out rows, and grows with
@@ -188,7 +198,7 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         value.
 
         Args:
-            q: (m, n) joint values [rad or m].
+            q: joint values (m, n) [rad or m], or (n,) for one pose.
             tool: index of the fitted tool, from 0.
 
         Raises:
@@ -196,13 +206,12 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         """
         if self.expected is None:
             raise UsageError("this fit has no expected errors: they need at least 20 measured positions")
-        return self.expected.position_sigma(self._poses(q), tool=tool)
+        return like_joints(q, self.expected.position_sigma(self._poses(q), tool=tool))
 
-    def _poses(self, q: object) -> PoseMeasurements:
+    def _poses(self, q: ArrayLike) -> PoseMeasurements:
         """Return poses at joint values q (m, n), with gravity torques (m, n) [N m] if the links' masses are known."""
-        chain = self.inputs.chain
-        q = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, chain.n), "q")
-        return PoseMeasurements(q, chain.joint_names, torque=gravity_of(self.inputs.weighed, q))
+        joints = self.robot.joint_rows(q)
+        return PoseMeasurements(joints, self.inputs.chain.joint_names, torque=gravity_of(self.inputs.weighed, joints))
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
