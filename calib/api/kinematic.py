@@ -18,8 +18,9 @@ from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
-from calib.errors import TaskLost, UsageError, as_ours
+from calib.errors import TaskLost, UsageError, as_ours, require
 from calib.estimation.estimate import Estimate
+from calib.estimation.robust import Loss, check_loss
 from calib.geometry.observation import pose_sigmas
 from calib.procedure.kinematic_stage import fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.inputs import gravity_of
@@ -266,6 +267,7 @@ def select_poses(
     *,
     constraints: Tables | None = None,
     existing: str | Path | PoseMeasurements | np.ndarray | None = None,
+    candidates: selection.Candidates | None = None,
     base: str | None = None,
     tip: str | None = None,
     workers: str | int = 1,
@@ -284,11 +286,14 @@ def select_poses(
             its tables; None takes the defaults.
         existing: poses measured before, to which the selection adds the most informative ones: a CSV, measurements, or
             joint values (m, n) [rad or m]; None for no such poses.
+        candidates: poses to choose from: a CSV with the joints' columns, joint values (N, n) [rad or m], or a function
+            of a number of poses that returns joint values; those that break the constraints are left out, and
+            ``selection.indices`` are the rows of the chosen ones. None draws ``settings.candidates`` poses at random.
         workers: number of local processes, or the address of a Dask scheduler.
         progress: called with texts on the progress; None for no report.
 
     Raises:
-        UsageError: an invalid argument or file of constraints.
+        UsageError: an invalid argument, file of constraints or candidate.
         RobotError: the robot is not found, or its file is invalid.
     """
     from calib.workers import workers as opened
@@ -307,6 +312,7 @@ def select_poses(
             settings,
             constraints=optional(constraints),
             existing=optional(existing),
+            candidates=optional(candidates),
             base=base,
             tip=tip,
             map=crew.map_without(lost_workers),
@@ -325,6 +331,7 @@ def fit_geometry(
     validate: Several = (),
     options: FitOptions | str | Path | None = None,
     poses: PoseSelection | str | Path | None = None,
+    loss: Loss | None = None,
     base: str | None = None,
     tip: str | None = None,
     on_read: Callable[[inputs.Inputs], None] | None = None,
@@ -342,14 +349,25 @@ def fit_geometry(
             TOML file (``calib formats options``). None takes the defaults.
         poses: the planned poses: result of `select_poses`, its CSV, or its folder. The predicted σ are compared with
             those of the fit (finding ``sigma-ratio``). None for no comparison.
+        loss: the loss as a function ρ of squared residuals z = (r/σ)² (m,), which returns the rows ρ, ρ' and ρ'' (3, m)
+            or the first two, as in ``scipy.optimize.least_squares`` (Triggs et al. 2000); row weights are ρ'. It takes
+            the place of the loss in `settings`. None for a loss by name.
         on_read: called with the inputs before the fit begins; None for no call.
         progress: called with the name of each step; None for no report.
 
     Raises:
+        UsageError: an invalid argument; for `loss`: ρ' is negative, not finite, or not the derivative of ρ.
         MeasurementError: a file is implausible; the message names row and column.
         Unidentifiable: no parameter is identifiable.
         NotConverged: the fit did not converge.
     """
+    if loss is not None:
+        require(
+            settings is None or settings.loss is None,
+            "loss: given both as a function and by name, in the settings: give only one of them",
+            UsageError,
+        )
+        check_loss(loss)
     if not isinstance(options, FitOptions):
         options = read_options(optional(options))
     expected = None
@@ -359,6 +377,7 @@ def fit_geometry(
         expected = prediction.read(Path(poses))
     stage = stage_of(robot, "fit", base, tip)
     if stage is not None:
+        require(loss is None, "loss: a function is for arms only; parallel robots are fitted without one", UsageError)
         return stage.run(
             listed(measured), listed(validate), settings=settings, options=options, poses=poses, progress=progress
         )
@@ -375,5 +394,5 @@ def fit_geometry(
     )
     if on_read is not None:
         on_read(fit_inputs)
-    outcome = fit.run(fit_inputs, options, settings, progress, expected or None)
+    outcome = fit.run(fit_inputs, options, settings, progress, expected or None, loss)
     return as_subclass(outcome, GeometryFit)
