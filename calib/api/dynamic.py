@@ -17,6 +17,7 @@ from calib.arguments import checked
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
 from calib.estimation.estimate import Estimate
+from calib.identification.friction.friction_terms import FrictionTerm
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
 from calib.identification.methods.method import Method
 from calib.identification.registry import METHODS
@@ -190,6 +191,7 @@ def identify_dynamics(
     validate: Recorded | Sequence[Recorded] = (),
     method: str | None = None,
     friction: str | None = None,
+    terms: Sequence[FrictionTerm] = (),
     options: IdentifyOptions | str | Path | None = None,
     excitation: str | Path | None = None,
     base: str | None = None,
@@ -213,6 +215,8 @@ def identify_dynamics(
         validate: recordings of other motion, which are used to validate the result only.
         method, friction: identification method (one of `methods`) and friction model, which replace those of the
             settings; None takes those of the settings.
+        terms: friction terms that are functions of a joint's velocity or position, in addition to those of the
+            friction model; exports say that URDF has no place for them.
         options: the settings as a TOML file (``calib formats identify-options``), or the options read from one, given
             instead of `settings`; None for no file.
         excitation: folder written by `design_excitation`, for methods that simulate the closed loop ([loop] in the
@@ -234,9 +238,11 @@ def identify_dynamics(
         options = options_of(settings)
     elif not isinstance(options, IdentifyOptions):
         options = read_options(optional(options))
+    options = replace(options, settings=replace(options.settings, functions=tuple(terms)))
     designed = [] if excitation is None else [coefficients.read(Path(excitation))]
     stage = stage_of(robot, "identify", base, tip)
     if stage is not None:
+        require(not terms, "terms: functions are for arms only; parallel robots have the standard friction", UsageError)
         return stage.run(
             listed(recordings),
             listed(validate),

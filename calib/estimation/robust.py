@@ -94,8 +94,8 @@ def _loss_rows(loss: Loss, z: np.ndarray) -> np.ndarray:
     values = np.asarray(loss(z), dtype=float)
     if values.ndim != 2 or len(values) not in (2, 3) or values.shape[1] != len(z):
         raise UsageError(
-            f"loss: expected rows rho, rho', rho'' (3, {len(z)}) of z ({len(z)},), as scipy's least_squares takes them; "
-            f"found an array of shape {values.shape}"
+            f"loss: expected rows rho, rho', rho'' (3, {len(z)}) of z ({len(z)},), as for scipy's least_squares; found "
+            f"an array of shape {values.shape}"
         )
     return values[:2]
 

@@ -15,8 +15,8 @@ import numpy as np
 from calib import files, folders
 from calib.config_types import ParsedTable
 from calib.errors import UsageError, refused_as
-from calib.folders import COVARIANCE, ESTIMATE, METRICS, PAGES, REPORT, InFolder
 from calib.estimation.robust import LOSSES
+from calib.folders import COVARIANCE, ESTIMATE, METRICS, PAGES, REPORT, InFolder
 from calib.geometry import installation
 from calib.geometry.error_model import ErrorModel
 from calib.geometry.first_guess import install
