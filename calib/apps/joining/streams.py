@@ -269,10 +269,10 @@ def _joints(chain: Chain) -> Kind:
     high = np.where(np.isfinite(robot.upper), robot.upper, travel)
 
     def names(table: Table) -> tuple[str, ...]:
-        return Sheet(table).find_joints(robot.names)
+        return Sheet(table).find_joints(robot)
 
     def values(table: Table) -> np.ndarray:
-        q, *_ = Sheet(table).joints(robot.names)
+        q, *_ = Sheet(table).joints(robot)
         return q
 
     def sound(q: np.ndarray) -> np.ndarray:
