@@ -4,7 +4,8 @@ from calib.data.csv_table import Table, opened, plain_rows, read_header, read_ta
 from calib.data.poses import IMAGES
 from calib.data.poses.columns import ANGLES as TURN_NAMES
 from calib.data.poses.columns import LATE, OURS, POSITION, QUATERNION, SIGMA, SIGMA_ROTATION, Sheet
-from calib.data.poses.fit_options import FileOptions, FitOptions
+from calib.data.poses.fit_options import EULER, FileOptions, FitOptions
+from calib.data.poses.fit_options import parse_options as parse_fit_options
 from calib.data.poses.fit_options import read_options as read_fit_options
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.data.poses.plausible import check_joints, orientation, outside, unit_quaternions
@@ -15,6 +16,7 @@ from calib.data.schema import BOUNDS, Joints, max_travel
 
 __all__ = [
     "BOUNDS",
+    "EULER",
     "IMAGES",
     "LATE",
     "OURS",
@@ -37,6 +39,7 @@ __all__ = [
     "opened",
     "orientation",
     "outside",
+    "parse_fit_options",
     "plain_rows",
     "read_fit_options",
     "read_header",

@@ -133,7 +133,7 @@ def join(
         joint_table = read_table(joints)
         check_columns(options, [joint_table, point_table], chain)
         joint_table = stated(joint_table, options.for_file(joints_file), chain, holds_joints=True)
-    point_table = stated(point_table, options.for_file(points_file), chain, holds_joints=False)
+    point_table = stated(point_table, options.for_file(points_file), chain, holds_points=True)
     return _joined(joint_table, point_table, by, chain)
 
 

@@ -42,6 +42,7 @@ from calib.robot.chain import Chain
 from calib.robot.collision import meshes_beside
 from calib.robot.library import load, resolve
 from calib.robot.tables import dumps
+from calib.units import JOINT
 
 # units of a log: positions and torques
 UNITS = {"prismatic": ("m", "N"), "revolute": ("deg", "Nm")}
@@ -115,16 +116,38 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
         "and log the joint angles read back.",
         "At the end, measure the first three again to check for drift (optional, into drift.csv).",
     )
-    columns = [f"{joint} [deg]" for joint in joints]
+    columns = ", ".join(measured_columns(session))
+    return task, (
+        f"{' and '.join(files)}, one row per pose: {columns} (calib formats measurements), "
+        "or joints and points apart, by calib join"
+    )
+
+
+def measured_columns(session: Session) -> list[str]:
+    """Return the header of a file of measured poses, as a session's instrument fills it: joints, target, base frame."""
+    instrument = session.settings.instrument
+    columns = []
+    for joint in chain_of(session).joints:
+        _, unit = JOINT["prismatic" if joint.kind == "prismatic" else "revolute"]
+        columns.append(f"{joint.name} [{unit}]")
     columns += ["x [mm]", "y [mm]", "z [mm]"]
     if instrument.measures == "pose":
         columns += ["qx", "qy", "qz", "qw"]
     if instrument.reference:
         columns += ["base_x [mm]", "base_y [mm]", "base_z [mm]", "base_qx", "base_qy", "base_qz", "base_qw"]
-    return task, (
-        f"{' and '.join(files)}, one row per pose: {', '.join(columns)} (calib formats measurements), "
-        "or joints and points apart, by calib join"
-    )
+    return columns
+
+
+def recorded_columns(session: Session) -> list[str]:
+    """Return the header of a log of a motion, with the torques that a session asks for."""
+    section, joints = session.settings.dynamics, chain_of(session).joints
+    columns = ["t [s]"]
+    columns += [f"q_{joint.name} [{UNITS[joint.kind][0]}]" for joint in joints]
+    if section.torques != "link":
+        columns += [f"tau_{joint.name} [{UNITS[joint.kind][1]}]" for joint in joints]
+    if section.torques != "motor":
+        columns += [f"tau_link_{joint.name} [{UNITS[joint.kind][1]}]" for joint in joints]
+    return columns
 
 
 def _planned_poses(session: Session, lists: Sequence[str]) -> list[str]:
