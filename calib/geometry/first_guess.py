@@ -284,8 +284,8 @@ def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurem
     if inverse_distance > INVERSE_RATIO * distance or inverse_angle > INVERSE_RATIO * angle:
         return block
     note = (
-        f"the poses agree with the arm as their inverse ({inverse_angle:.2g}° instead of {angle:.2g}°, median), so they "
-        "are read as poses of what stands (board) in the frame of what the arm carries (camera)"
+        f"the poses agree with the arm as their inverse ({inverse_angle:.2g}° instead of {angle:.2g}°, median), so "
+        "they are read as poses of what stands (board) in the frame of what the arm carries (camera)"
     )
     return replace(inverse, notes=(*block.notes, note))
 
