@@ -201,9 +201,7 @@ def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[ResidualPar
     return [*_position(measured, seen, jacobian), orientation]
 
 
-def _at_lever(
-    measured: Poses, lever: np.ndarray, seen: Seen, jacobian: np.ndarray
-) -> tuple[Poses, Seen, np.ndarray]:
+def _at_lever(measured: Poses, lever: np.ndarray, seen: Seen, jacobian: np.ndarray) -> tuple[Poses, Seen, np.ndarray]:
     """Return poses, predicted targets and their Jacobian (f, 6, m) for points of the target instead of its origin.
 
     Args:
