@@ -15,9 +15,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeAlias, overload
 
-from calib.errors import CalibError, UsageError, one_of, refused_as
+from calib.errors import CalibError, UsageError, one_of
 from calib.procedure.findings import NOT_JUDGED, Verdict
 from calib.result_kinds import ResultKind
+from calib.workers.extras import needing
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
@@ -174,7 +175,8 @@ class ChartedResult(Kept):
 
     def figures(self) -> Mapping[str, Picture]:
         """Return the figures by name, as PNG images."""
-        from calib.procedure.report.charts import picture
+        with needing("matplotlib"):
+            from calib.procedure.report.charts import picture
 
         return {name: picture(chart, "") for name, chart in self.charts().items()}
 
@@ -193,7 +195,8 @@ class ChartedResult(Kept):
         Raises:
             UsageError: there is no figure of this name.
         """
-        from calib.procedure.report import charts
+        with needing("matplotlib"):
+            from calib.procedure.report import charts
 
         charts_by_name = self.charts()
         if name is None:
@@ -249,7 +252,6 @@ def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:
     Raises:
         UsageError: pandas is not installed.
     """
-    message = "data frames need pandas: pip install 'armature-calib[pandas]'; to_dict() and save() do without"
-    with refused_as(UsageError, ImportError, message):
+    with needing("pandas", "; to_dict() and save() do without"):
         import pandas  # pyright: ignore[reportMissingImports]
     return pandas.DataFrame(list(rows), columns=list(columns))

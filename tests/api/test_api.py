@@ -263,7 +263,7 @@ def test_tab_offers_what_there_is(fitted, model):
 def test_residuals_are_a_frame_with_pandas(fitted, model, tmp_path, monkeypatch):
     """Residuals are a data frame where pandas is there."""
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(UsageError, match=r"need pandas: pip install 'armature-calib\[pandas\]'"):
+    with pytest.raises(UsageError, match=r"pandas, for data frames, .*: pip install 'armature-calib\[pandas\]'"):
         _ = fitted.residuals
     frame = SimpleNamespace(DataFrame=lambda rows, columns: [columns, *rows])
     monkeypatch.setitem(sys.modules, "pandas", frame)
