@@ -283,7 +283,7 @@ def test_residuals_are_columns_without_pandas(fitted, model, tmp_path, monkeypat
     last = model.inputs.unseen[0].target[-1] - model.predictions["other.npz"][-1]
     np.testing.assert_array_equal(list(torques)[-1][2:], last)
 
-    with pytest.raises(UsageError, match=r"need pandas: pip install 'armature-calib\[pandas\]'"):
+    with pytest.raises(UsageError, match=r"pandas, for data frames, .*: pip install 'armature-calib\[pandas\]'"):
         residuals.to_dataframe()
     frame = SimpleNamespace(DataFrame=lambda rows, columns: [columns, *rows])
     monkeypatch.setitem(sys.modules, "pandas", frame)
