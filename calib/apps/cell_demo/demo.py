@@ -181,7 +181,7 @@ def run(
         return DemoResult(session, "", time.perf_counter() - started, _stopped(session, waiting))
 
     before, after = _compare_with_truth(session, cell, say)
-    if plots:
+    if session.plots:
         from calib.apps.cell_demo.picture import draw
 
         draw(session)

@@ -273,10 +273,10 @@ def _joints(chain: Chain, options: FileOptions) -> Kind:
     high = np.where(np.isfinite(robot.upper), robot.upper, travel)
 
     def names(table: Table) -> tuple[str, ...]:
-        return Sheet(table, options).find_joints(robot.names)
+        return Sheet(table, options).find_joints(robot)
 
     def values(table: Table) -> np.ndarray:
-        q, *_ = Sheet(table, options).joints(robot.names)
+        q, *_ = Sheet(table, options).joints(robot)
         return q
 
     def sound(q: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ import typer
 
 from calib.cli.shared import command, say
 from calib.errors import UsageError, refused_as
+from calib.workers.extras import needing
 
 app = typer.Typer()
 LOCAL = "127.0.0.1"
@@ -32,8 +33,7 @@ def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min
 
     from calib.toolkit.sessions import open_session
 
-    message = "calib serve needs starlette, uvicorn and python-multipart: pip install 'armature-calib[serve]'"
-    with refused_as(UsageError, ImportError, message):
+    with needing("starlette"):
         import uvicorn
 
         from calib.apps.serve.pages import application

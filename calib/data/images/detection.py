@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from calib.data.images.board import DICTIONARIES, MIN_CORNERS, Board, corners
@@ -17,6 +16,10 @@ from calib.data.images.board_print import charuco, dictionary
 from calib.data.images.images import quiet, read_image
 from calib.data.images.pixels import Detection, Detections
 from calib.errors import MeasurementError
+from calib.workers.extras import needing
+
+with needing("cv2"):
+    import cv2
 
 # Smallest number of detected markers from which on a dictionary counts as that of the print.
 MIN_MARKERS = 4

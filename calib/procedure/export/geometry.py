@@ -19,6 +19,7 @@ from calib.robot.formats.urdf_tree import UrdfTree, text
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import forward, joint_frames
 from calib.transforms import invert
+from calib.workers.extras import installed, lacking
 
 # of poses read back [m, and as a rotation matrix], and of torques over the largest
 MAX_DIFFERENCE = 1e-9
@@ -102,13 +103,15 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
         chain: the arm as this toolkit computes it.
 
     Returns:
-        A sentence on the programs that have read the text. If yourdfpy cannot read the text, the sentence states why.
+        A sentence on the programs that have read the text, or on why one has not.
 
     Raises:
         RobotError: if the poses differ.
     """
     tree = read_tree(edited, where)
     urdf_chain = chain_in(tree, chain)
+    if not installed("pinocchio"):
+        return f"not read back by another program; {lacking('pinocchio')}"
     q = random_joints(urdf_chain, CHECKED_POSES, 0)
     difference = float(np.abs(tip_poses(edited, urdf_chain, q) - forward(urdf_chain, q)).max())
     if difference > MAX_DIFFERENCE:
@@ -117,6 +120,8 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
             "this as a bug"
         )
 
+    if not installed("yourdfpy"):
+        return "Pinocchio reads the same poses to 1e-9"
     q = q[:CHECKED_AGAIN]
     links = (*urdf_chain.links, urdf_chain.tip)
     try:

@@ -34,7 +34,7 @@ from calib.procedure.session.dynamics_steps import design_motions, picked_front,
 from calib.procedure.session.folder import POSES, UNSEEN, WAYS, Say, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
-from calib.procedure.session.recording_names import log_name
+from calib.procedure.session.recording_names import labels_in, log_name
 from calib.procedure.session.second_round import promised
 from calib.procedure.session.settings import NOTHING, SessionSettings
 from calib.procedure.session.steps import DONE, KEPT, WAITING, State
@@ -213,8 +213,23 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
     files = " and ".join(str(session.path(f"7-recorded/{log}")) for log in logs)
     return task, (
         f"{files}, one row per sample: t [s], {', '.join(columns)}; currents are i_{first.name} [A] …; .npz and ROS "
-        "bags work, too (calib formats recordings)"
+        f"bags work, too (calib formats recordings){_present_logs(session)}"
     )
+
+
+def _present_logs(session: Session) -> str:
+    """Return how the recordings of a session that are there were taken by their names; empty without recordings."""
+    taken = [(path, "training") for path in session.brought("training")]
+    taken += [(path, "validation") for path in session.brought("unseen")]
+    if not taken:
+        return ""
+    payloads = session.settings.dynamics.payloads
+    parts = []
+    for path, motion in taken:
+        labels = labels_in(path.stem, payloads)
+        load = f" with {' and '.join(labels)}" if labels else " without payload"
+        parts.append(f"{path.name} ({motion}{load if payloads else ''})")
+    return f". By their names there are already: {'; '.join(parts)}"
 
 
 def _to_play(session: Session, names: Sequence[str], payloads: Sequence[str]) -> str:

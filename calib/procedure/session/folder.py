@@ -52,6 +52,7 @@ from calib.result_kinds import refusal
 from calib.robot import tables
 from calib.robot.calibrated import ROBOT
 from calib.robot.formats.urdf_tree import converter, is_urdf, text
+from calib.workers.extras import available
 
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
@@ -338,7 +339,7 @@ def open_session(folder: Path, plots: bool = True) -> Session:
     path = folder / SETTINGS
     if not path.exists():
         raise SessionError(refusal(folder, "session"))
-    return Session(folder, read_settings(path), plots=plots)
+    return Session(folder, read_settings(path), plots=plots and available("matplotlib"))
 
 
 def read_state(session: Session) -> StateFile:
