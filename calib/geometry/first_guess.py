@@ -285,7 +285,8 @@ def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurem
         return block
     note = (
         f"the poses agree with the arm as their inverse ({inverse_angle:.2g}° instead of {angle:.2g}°, median), so "
-        "they are read as poses of what stands (board) in the frame of what the arm carries (camera)"
+        "they are read as poses of what stands (board) in the frame of what the arm carries (camera; if it carries the "
+        "board instead, state [camera] mounting = 'to hand' in the options)"
     )
     return replace(inverse, notes=(*block.notes, note))
 

@@ -29,9 +29,6 @@ from calib.units import DEG
 MAX_ROWS = 60
 # Fewest samples that tell open conventions apart.
 MIN_ROWS = 5
-# Largest median difference of relative rotations [rad] with which a stated convention is not questioned: a detector's
-# orientations of small boards are that wrong.
-STATED_GAP = 3.0 * DEG
 # Largest difference of relative rotations [rad], and largest ratio to the smallest, of readings that are placed.
 MAX_GAP = 1.0 * DEG
 GAP_RATIO = 3.0
@@ -87,18 +84,20 @@ def agreed(pairs: PosePairs) -> tuple[Reading, list[str]]:
     choices = list(_choices(robot_turns, seen_turns, rows))
     stated = pairs.robot.convention, pairs.seen.convention
     is_stated = _states(pairs.robot) and _states(pairs.seen)
-    if is_stated and choices[0][0] < STATED_GAP:
-        choices = choices[:1]
+    first = choices[0]
     smallest = min(gap for gap, _ in choices)
     limit = max(MAX_GAP, GAP_RATIO * smallest)
     likely = sorted((choice for choice in choices if choice[0] <= limit), key=lambda choice: choice[0])
     readings = []
-    for _, names in likely[:MAX_PLACED]:
+    for _, names in dict.fromkeys([first, *likely[:MAX_PLACED]]):
         robot = poses_of(robot_position, robot_turns[names[0]])
         seen = poses_of(seen_position, seen_turns[names[1]])
         readings.append(_placed(robot, seen, names, rows))
+    as_stated = readings[0]
     readings.sort(key=lambda reading: reading.misfit)
     best = readings[0]
+    if is_stated and as_stated.misfit <= CLEAR_RATIO * best.misfit:
+        return as_stated, notes
     others = [reading for reading in readings[1:] if not reading.equals(best)]
     if others and not is_stated:
         _check_clear(pairs, best, others[0])
@@ -106,6 +105,7 @@ def agreed(pairs: PosePairs) -> tuple[Reading, list[str]]:
         if convention and convention != name:
             notes.append(
                 f"{poses.name or 'poses'}: the orientation is read as {convention}, with which the poses agree"
+                f"{f' ({name} is stated)' if name else ''}"
             )
     return best, notes
 

@@ -23,6 +23,8 @@ MIN_PAIRS = 3
 # Names of the joints, and their elementary transforms in their order.
 JOINTS = ("x", "y", "z", "c", "b", "a")
 JOINT_AXES = ("tx", "ty", "tz", "rz", "ry", "rx")
+# Names under which easy_handeye stores poses of the board in the camera.
+EASY_HANDEYE = ("optical", "opt")
 # Words for the boards that detectors find.
 BOARD_WORDS = frozenset(
     [
@@ -98,10 +100,7 @@ def _direction_note(pairs: PosePairs, direct: float, inverse: float, mounting: s
     )
     if mounting:
         return note
-    return (
-        f"{note}. If the camera stands and the robot's poses are those of its base in its tool (easy_handeye, eye on "
-        f"base), state [camera] mounting = '{TO_HAND}' in the options"
-    )
+    return f"{note}. If the arm carries the board instead, state [camera] mounting = '{TO_HAND}' in the options"
 
 
 def _is_board_in_camera(pairs: PosePairs) -> bool | None:
@@ -111,9 +110,7 @@ def _is_board_in_camera(pairs: PosePairs) -> bool | None:
         return True
     if of & LENS_WORDS and frame & BOARD_WORDS:
         return False
-    if pairs.seen.words & BOARD_WORDS and not of:
-        return True
-    return None
+    return True if pairs.seen.name.lower() in EASY_HANDEYE else None
 
 
 def _mounting_by_name(pairs: PosePairs, inverse: bool) -> str:
@@ -134,10 +131,9 @@ def _robot_is_inverse(pairs: PosePairs, reading: Reading, mounting: str) -> str:
     of, frame = pairs.robot.frames
     if of & FIXED_WORDS and frame & ROBOT_WORDS and not frame & FIXED_WORDS:
         return f"so says the name '{pairs.robot.name}'"
-    if not mounting:
+    board_in_camera = _is_board_in_camera(pairs)
+    if not mounting or board_in_camera is None:
         return ""
-    # detectors give the board in the camera
-    board_in_camera = _is_board_in_camera(pairs) is not False
     expected = board_in_camera == (mounting == IN_HAND)
     if expected == reading.inverse:
         return ""
