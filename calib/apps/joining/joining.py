@@ -10,6 +10,7 @@ by time             a column ``t``, ``time`` or ``timestamp`` in both (a number,
 by row              as many rows in both
 by geometry         with a robot: the order in which the nominal arm explains the points
 by motion           with a robot: points measured while the arm moves, by a clock of their own, and a log over time
+logs                two logs of one motion (positions, torques): one recording for `calib identify`, by time or row
 ==================  ===================================================================================================
 
 Several readings of one pose are averaged; their pooled scatter becomes ``sigma_x``, ``_y``, ``_z`` of the mean where it
@@ -28,7 +29,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
-from datetime import datetime
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,9 @@ from scipy.spatial.distance import pdist
 
 from calib.apps.controller_programs.program import joints_table
 from calib.apps.controller_programs.targets import is_program
-from calib.apps.joining.joined import CLOCKS, NAMES, Joined, column_of
+from calib.apps.joining.joined import NAMES, Joined, column_of
+from calib.apps.joining.logs import clock_of, is_log, join_logs, seconds
+from calib.apps.joining.mapping import mapped, read_mapping
 from calib.apps.joining.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_order
 from calib.apps.joining.streams import join_streams
 from calib.arguments import checked
@@ -45,7 +48,6 @@ from calib.toolkit.chains import CalibratedChain, Chain, load_calibrated
 from calib.toolkit.installations import check_scale
 from calib.toolkit.pose_data import POSITION, SIGMA, PoseMeasurements, Sheet, Table, read_table
 from calib.toolkit.result_folders import lines_of
-from calib.units import TIMES
 
 METHODS = ("name", "time", "row", "geometry", "motion")
 # requirements of each method except motion, for messages
@@ -74,6 +76,7 @@ def join(
     robot: str | Path | CalibratedChain | None = None,
     base: str | None = None,
     tip: str | None = None,
+    options: str | Path | None = None,
 ) -> Joined:
     """Join a controller's joint values and an instrument's points to one table of measured poses.
 
@@ -86,6 +89,7 @@ def join(
         robot: the nominal robot, by whose geometry the order is checked or found: library name, file, folder of a fit,
             or in memory; None: not checked.
         base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
+        options: TOML file with [columns] and [units] (`calib.apps.joining.mapping`); None: as the headers say.
 
     Returns:
         The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` reads. By
@@ -99,21 +103,33 @@ def join(
     joints_file, points_file = Path(joints), Path(points)
     if isinstance(robot, str | Path):
         robot = load_calibrated(robot, base, tip)
+    mapping = read_mapping(None if options is None else Path(options))
     if by == "motion":
         if robot is None:
             raise UsageError("joining by motion needs the nominal arm's path: give --robot")
-        return join_streams(joints_file, points_file, robot.complete)
+        return join_streams(joints_file, points_file, robot.complete, mapping)
     if is_program(joints_file):
         joint_table = joints_table(joints_file)
     else:
         joint_table = read_table(joints)
     chain = None if robot is None else robot.complete
-    return _joined(joint_table, read_table(points), by, chain)
+    (joint_table, point_table), notes = mapped((joint_table, read_table(points)), mapping)
+    if not _has_points(point_table) and is_log(joint_table) and is_log(point_table):
+        joined: Joined = join_logs(joint_table, point_table, by)
+    else:
+        joined = _joined(joint_table, point_table, by, chain)
+    return replace(joined, notes=(*notes, *joined.notes))
+
+
+def _has_points(table: Table) -> bool:
+    """Return whether a table has columns of measured positions."""
+    sheet = Sheet(table)
+    return bool(sheet.family(POSITION.names) or sheet.family(POSITION.names, "1"))
 
 
 def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joined:
     name_columns = [column_of(joints, NAMES), column_of(points, NAMES)]
-    time_columns = [column_of(joints, CLOCKS), column_of(points, CLOCKS)]
+    time_columns = [clock_of(joints), clock_of(points)]
     possible = {
         "name": all(name_columns),
         "time": all(time_columns),
@@ -384,8 +400,8 @@ def _at_times(
         joints, points: tables of joint values and of points, with times of one clock.
         joint_column, point_column: names of the columns of times.
     """
-    t = _seconds(joints, joint_column)
-    point_times = _seconds(points, point_column)
+    t = seconds(joints, joint_column)
+    point_times = seconds(points, point_column)
     not_after = np.flatnonzero(np.diff(t) <= 0.0)
     if len(not_after):
         joints.fail("the times do not increase", joint_column, int(not_after[0]) + 1)
@@ -431,17 +447,3 @@ def _interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.nd
         values: (N, k) the series.
     """
     return np.column_stack([np.interp(times, t, column) for column in values.T])
-
-
-def _seconds(table: Table, name: str) -> np.ndarray:
-    """Return the column `name` of a table as times (m,) [s].
-
-    The column contains numbers in the header's unit, or ISO 8601 dates and times.
-    """
-    column = table.index(name)
-    if table.cells[column].dtype == float:
-        return table.numbers(name, None) * table.factor(column, TIMES, "")
-    try:
-        return np.array([datetime.fromisoformat(text).timestamp() for text in table.texts(name)])
-    except ValueError as error:
-        table.fail(f"{error}: expected seconds, or a date and time as 2026-11-27T08:15:30.250", name)

@@ -19,6 +19,7 @@ import numpy as np
 from calib.apps.joining.clock_steps import Step, find_step
 from calib.apps.joining.clocks import Clock, Run, begin, fitted, residuals, velocities
 from calib.apps.joining.joined import Joined
+from calib.apps.joining.mapping import JoinOptions
 from calib.apps.joining.stream_files import Kind, Stream, read_stream
 from calib.errors import Finding, finding, refuse_data
 from calib.records import evenly
@@ -80,7 +81,7 @@ class Streamed(Joined):
     left: float
 
 
-def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
+def join_streams(log_file: Path, file: Path, chain: Chain, options: JoinOptions | None = None) -> Streamed:
     """Return the points of an instrument's stream with the joint values of a controller's log, thinned.
 
     Thinning keeps rows whose errors are independent.
@@ -89,12 +90,13 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
         log_file: file with times and joint values, by the controller's clock.
         file: file with times and positions, with or without quaternions, by the instrument's clock.
         chain: the nominal arm.
+        options: names and units of columns; None: as the headers say.
 
     Raises:
         MeasurementError: the files are no streams, the arm moves too little, or the files are not of the same motion.
     """
-    log = read_stream(log_file, _joints(chain))
-    stream = _fresh(read_stream(file, _target()))
+    log = read_stream(log_file, _joints(chain), options)
+    stream = _fresh(read_stream(file, _target(), options))
     _check_motion(log, chain.n, "")
     _check_motion(stream, 3, " m")
     positions = stream.values[:, :3]
