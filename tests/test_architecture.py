@@ -41,7 +41,7 @@ HOMES = {
         "calib.data.images.board_print",
         "calib.simulation.rendered_camera",
     ],
-    "ruamel": ["calib.data.images.lens", "calib.procedure.measuring.moveit"],
+    "ruamel": ["calib.data.trees", "calib.procedure.measuring.moveit"],
     "mcap": ["calib.data."],
     "rosbags": ["calib.data.recordings.bags", "calib.data.images."],
     "pandas": ["calib.api.rendering"],

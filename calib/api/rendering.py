@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, overload
 
 from calib.errors import CalibError, UsageError, one_of
 from calib.procedure.findings import NOT_JUDGED, Verdict
@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from calib.results.scene import Scene
 
 Progress = Callable[[str], None]
-DataFrame: TypeAlias = Any
-"""A pandas DataFrame; pandas is there for those who ask for data frames."""
 # number of characters of a line of text
 WIDTH = 120
 
@@ -240,18 +238,3 @@ class ReportedResult(Kept):
             frame = f'<iframe srcdoc="{escape(page)}" style="width: 100%; height: 60em; border: 0"></iframe>'
             bundle["text/html"] = frame
         return bundle
-
-
-def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:
-    """Return rows as a pandas DataFrame with the given columns.
-
-    Args:
-        rows: sequences or records, one per row.
-        columns: names of the columns.
-
-    Raises:
-        UsageError: pandas is not installed.
-    """
-    with needing("pandas", "; to_dict() and save() do without"):
-        import pandas  # pyright: ignore[reportMissingImports]
-    return pandas.DataFrame(list(rows), columns=list(columns))

@@ -26,13 +26,29 @@ from calib.errors import MeasurementError, refuse_data, require, suggestion
 from calib.extensions import Point
 from calib.files import check_regular
 from calib.records import frozen, plain_text, read_only
-from calib.units import ANGLES, LENGTHS, QUANTITIES, TIMES, is_number
+from calib.units import (
+    ANGLES,
+    CURRENTS,
+    EFFORTS,
+    LENGTHS,
+    QUANTITIES,
+    TIMES,
+    UNIT_WORDS,
+    VELOCITIES,
+    is_number,
+    unit_of,
+)
 
 EXPORTS: Point[Callable[[str | Path], IO[str] | None]] = Point(
     "exports", "a file of another program as a stream of our text; None where it is our table"
 )
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
+# x / mm (ISO 80000-1, 7.1.4)
+_QUOTIENT = re.compile(r"^(?P<name>[^/]+?)\s*/\s*(?P<unit>\(.+\)|[^/\s]+(/s)?)$")
+_QUOTED_UNITS = {*ANGLES, *LENGTHS, *TIMES, *VELOCITIES, *EFFORTS, *CURRENTS, *UNIT_WORDS}
+# q[0], T[0,1]: numbers of elements, no units
+_ELEMENT = re.compile(r"\d+(\s*,\s*\d+)*")
 # q1 [deg], where blanks separate the names
 _DETACHED_UNIT = re.compile(r"[ ]+([\[(])")
 # A cell of a spreadsheet, not a comment.
@@ -382,15 +398,24 @@ def _comment_header(comment: str, separator: str, width: int, path: str | Path) 
 
 
 def split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names and the units in a header's cells: ``q1 [deg]`` gives ``q1`` and ``deg``; "" without a unit."""
+    """Return the names and the units in a header's cells: ``q1 [deg]`` gives ``q1`` and ``deg``; "" without a unit.
+
+    A unit stands in brackets, or behind a slash (``q1 / deg``).
+
+    Args:
+        cells: cells of the header.
+    """
     names, units = [], []
     for number, cell in enumerate(cells, 1):
         name, unit = plain_text(cell), ""
         match = _HEADING.match(name)
-        if match:
-            name, unit = match["name"], match["unit"].strip()
+        quotient = _QUOTIENT.match(name)
+        if quotient and quotient["unit"].strip("()").strip().lower() in _QUOTED_UNITS:
+            match = quotient
+        if match and not _ELEMENT.fullmatch(match["unit"]):
+            name, unit = match["name"], match["unit"].strip("()").strip()
         names.append(name or f"column {number}")
-        units.append(unit)
+        units.append(unit_of(unit))
     return tuple(names), tuple(units)
 
 

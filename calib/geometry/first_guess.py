@@ -21,6 +21,7 @@ arm's S A_i X.
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import singledispatch
 from typing import TYPE_CHECKING
 
@@ -54,12 +55,18 @@ MIN_TURN = 0.01
 # largest and smallest number of rows by which orientations are checked (our choice)
 CHECKED_ROWS = 200
 MIN_CHECKED_ROWS = 4
+# smallest number of positions that can contradict the arm: station and offset take 9 of their 24 numbers (our choice)
+MIN_PLACED_ROWS = 8
 # smallest median misfit of orientations [deg] that contradicts their stated convention (our choice)
 MIN_ANGLE = 20.0
 # largest median misfits of the reading that explains the orientations: an angle [deg], and a share of the
 # positions' spread
 MAX_ANGLE = 5.0
 MAX_MISFIT = 0.1
+# largest median misfit of poses read as their inverse, as a share of the positions' spread, and largest ratios of their
+# misfits to those of the poses as they are (our choice)
+MAX_INVERSE_MISFIT = 0.3
+INVERSE_RATIO = 0.5
 # readings of orientations that are tried: text for the user, and order and signs of the quaternions as read
 READINGS = (
     (
@@ -236,8 +243,7 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
     """
     if not isinstance(block, Poses):
         return
-    rows = np.flatnonzero(block.tool == np.argmax(np.bincount(block.tool)))
-    rows = rows[evenly(len(rows), CHECKED_ROWS)]
+    rows = checked_rows(block)
     if len(rows) < MIN_CHECKED_ROWS:
         return
     arm = forward(chain, block.q[rows])
@@ -254,6 +260,75 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
                 f"the orientations contradict the arm (read as x y z w: median error {error:.0f}° for the best "
                 f"placement of instrument and tool); {advice}",
             )
+
+
+def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurements:
+    """Return poses of the target in the instrument's frame, inverted if they are those of the instrument in the target.
+
+    The first is a tracker's convention, and that of a camera beside the arm; a camera on the arm measures the second:
+    the board in its own frame. The reading is taken that agrees with the arm; a note says so where it is the second.
+
+    Args:
+        chain: the nominal arm.
+        block: measurements of any kind; only full poses are tried both ways.
+    """
+    if not isinstance(block, Poses) or block.lever is not None or block.base is not None:
+        return block
+    rows = checked_rows(block)
+    if len(rows) < MIN_CHECKED_ROWS:
+        return block
+    arm = forward(chain, block.q[rows])
+    inverse = block.inverted()
+    angle, distance = _misfit(arm, block.position[rows], block.quaternion[rows])
+    inverse_angle, inverse_distance = _misfit(arm, inverse.position[rows], inverse.quaternion[rows])
+    if not inverse_distance < MAX_INVERSE_MISFIT or not inverse_angle < MAX_ANGLE:
+        return block
+    if inverse_distance > INVERSE_RATIO * distance or inverse_angle > INVERSE_RATIO * angle:
+        return block
+    note = (
+        f"the poses agree with the arm as their inverse ({inverse_angle:.2g}° instead of {angle:.2g}°, median), so "
+        "they are read as poses of what stands (board) in the frame of what the arm carries (camera)"
+    )
+    return replace(inverse, notes=(*block.notes, note))
+
+
+def checked_rows(block: Poses) -> np.ndarray:
+    """Return the indices of the rows by which orientations are checked, all of one tool."""
+    rows = np.flatnonzero(block.tool == np.argmax(np.bincount(block.tool)))
+    return rows[evenly(len(rows), CHECKED_ROWS)]
+
+
+def contradiction(chain: Chain, block: PoseMeasurements) -> float:
+    """Return how far measurements are from the nominal arm with instrument and tool placed; above 1 they contradict it.
+
+    It is the larger of the median distance over `MAX_MISFIT` of the positions' spread and, for poses, the median angle
+    over `MAX_ANGLE`.
+
+    Args:
+        chain: the nominal arm.
+        block: positions or poses; infinite for another kind, or too few rows.
+    """
+    block = as_seen_by_instrument(chain, block)
+    if isinstance(block, Poses):
+        rows = checked_rows(block)
+        if len(rows) < MIN_CHECKED_ROWS:
+            return math.inf
+        arm = forward(chain, block.q[rows])
+        angle, distance = _misfit(arm, block.position[rows], block.quaternion[rows])
+        return max(angle / MAX_ANGLE, distance / MAX_MISFIT)
+    if not isinstance(block, Positions) or len(block) < MIN_PLACED_ROWS:
+        return math.inf
+    sample = take(block, evenly(len(block), CHECKED_ROWS))
+    arm = forward(chain, sample.q)
+    spread = math.sqrt(float(np.sum(np.var(sample.position, axis=0))))
+    worst = 0.0
+    for tool in np.unique(sample.tool):
+        rows = np.flatnonzero(sample.tool == tool)
+        station, offset = _place_position(arm[rows], sample.position[rows], None, None)
+        placed = station @ arm[rows] @ offset
+        distance = np.linalg.norm(placed[:, :3, 3] - sample.position[rows], axis=1)
+        worst = max(worst, float(np.median(distance)) / max(spread, 1e-9))
+    return worst / MAX_MISFIT
 
 
 def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tuple[float, float]:

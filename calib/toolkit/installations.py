@@ -1,7 +1,7 @@
 """Geometry: installations of robots and instruments, observation models, fits, inverse kinematics."""
 
 from calib.geometry.error_model import Discrepancy, ErrorModel, outside
-from calib.geometry.first_guess import check_scale, install
+from calib.geometry.first_guess import check_scale, chordal_turns, install, misfit, place_pose
 from calib.geometry.fit import PLAUSIBLE, plausible_deviation
 from calib.geometry.fit import fit as fit_installation
 from calib.geometry.installation import FRAME_AXES, Installation, NoOptics, read_arms, see
@@ -36,6 +36,7 @@ __all__ = [
     "base_columns",
     "calibrated_chain",
     "check_scale",
+    "chordal_turns",
     "conditions",
     "differences",
     "families",
@@ -44,10 +45,12 @@ __all__ = [
     "install",
     "layout",
     "layout_counts",
+    "misfit",
     "nearest",
     "observe",
     "outside",
     "parameter_values",
+    "place_pose",
     "plausible_deviation",
     "pose_sigmas",
     "prepare",

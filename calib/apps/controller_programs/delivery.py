@@ -78,12 +78,12 @@ def _frames(arm: Installation, controller: Controller, base: ControllerFrame, fl
         base, flange: the controller's base and flange, located in the arm's base and tip.
     """
     for index, (name, pose) in enumerate(zip(arm.tool_names, arm.tools), 1):
-        yield from _stood(f"tool {name}", controller.tool_frame, controller, pose, flange, index)
+        yield from frame_lines(f"tool {name}", controller.tool_frame, controller, pose, flange, index)
     for index, (name, pose) in enumerate(zip(arm.station_names, invert(arm.stations)), 1):
-        yield from _stood(f"instrument {name}", controller.base_frame, controller, pose, base, index)
+        yield from frame_lines(f"instrument {name}", controller.base_frame, controller, pose, base, index)
 
 
-def _stood(
+def frame_lines(
     name: str, form: str, controller: Controller, pose: np.ndarray, frame: ControllerFrame, index: int
 ) -> Iterator[str]:
     """Yield the lines on one frame: its numbers relative to the controller's base or flange, and this reference's name.

@@ -20,6 +20,7 @@ def join(
     robot: Annotated[Robot | None, typer.Option()] = None,
     base: str | None = None,
     tip: str | None = None,
+    options: Path | None = None,
     overwrite: bool = False,
 ) -> None:
     """Join the JOINTS of the controller and the POINTS of the instrument to one file of measured poses.
@@ -35,11 +36,13 @@ def join(
         out: CSV file of measured poses, for calib fit
         by: how rows are matched. Default: the first that both files have columns for
         robot: its nominal geometry checks the order, or finds it (--by geometry), or the clocks (--by motion)
+        options: TOML whose [columns], [units], controller and euler say how the two files are read: calib formats
+            options; calib fit reads the result without them
     """
     from calib.apps.joining import joining
     from calib.files import results
 
-    with results([(out, (".csv",))], [joints, points, robot], overwrite):
-        joined = joining.join(joints, points, by=by, robot=robot, base=base, tip=tip)
+    with results([(out, (".csv",))], [joints, points, robot, options], overwrite):
+        joined = joining.join(joints, points, by=by, robot=robot, base=base, tip=tip, options=options)
         joined.write(out)
     say(*joined.notes, f"{len(joined.poses)} measured poses written to {out}")

@@ -16,6 +16,9 @@ Several readings of one pose are averaged; their pooled scatter becomes ``sigma_
 has at least five degrees of freedom and the file states no sigma. A pose whose readings are further apart than
 1 mm, and than ten times what such readings usually are, is left out and named. Units are those of the two files.
 
+Columns of other names, units that the header does not state, joints as a controller shows them and the meaning of
+angles are stated in options (``--options``: [columns], [units], controller, euler); the result is read without them.
+
 By motion, both files have a column of times (seconds, or ``t [ms]``; 5 Hz or more), each by its own clock, and run
 while the arm moves slowly. Offset and drift of the clocks are found from the motion; rows that cannot be used are left
 out and counted; the rest is thinned to rows whose errors are independent. Notes above the table's header say all of it.
@@ -38,18 +41,31 @@ from calib.apps.controller_programs.program import joints_table
 from calib.apps.controller_programs.targets import is_program
 from calib.apps.joining.joined import CLOCKS, NAMES, Joined, column_of
 from calib.apps.joining.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_order
+from calib.apps.joining.stated import check_columns, stated
 from calib.apps.joining.streams import join_streams
 from calib.arguments import checked
 from calib.errors import MeasurementError, UsageError, counted, finding, listing, one_of, refuse_data
-from calib.toolkit.chains import CalibratedChain, Chain, load_calibrated
+from calib.toolkit.chains import CalibratedChain, Chain, controllers, load_calibrated
 from calib.toolkit.installations import check_scale
-from calib.toolkit.pose_data import POSITION, SIGMA, PoseMeasurements, Sheet, Table, read_table
+from calib.toolkit.pose_data import (
+    POSITION,
+    SIGMA,
+    FitOptions,
+    PoseMeasurements,
+    Sheet,
+    Table,
+    read_fit_options,
+    read_table,
+)
 from calib.toolkit.result_folders import lines_of
 from calib.units import TIMES
 
 METHODS = ("name", "time", "row", "geometry", "motion")
 # requirements of each method except motion, for messages
 REQUIREMENTS = ("both files need names (a column name, pose, id …)", "times (column t)", "as many rows", "give --robot")
+
+# remark on a join by row without a robot
+UNCHECKED = "order not checked: give --robot, whose nominal arm shows whether the rows belong together"
 
 # Thresholds are our choice.
 # largest distance of two readings of one pose [m], where their scatter is not known
@@ -74,6 +90,7 @@ def join(
     robot: str | Path | CalibratedChain | None = None,
     base: str | None = None,
     tip: str | None = None,
+    options: str | Path | FitOptions | None = None,
 ) -> Joined:
     """Join a controller's joint values and an instrument's points to one table of measured poses.
 
@@ -86,6 +103,8 @@ def join(
         robot: the nominal robot, by whose geometry the order is checked or found: library name, file, folder of a fit,
             or in memory; None: not checked.
         base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
+        options: options whose [columns], [units], ``controller`` and ``euler`` say how the two files are read: in
+            memory, or as a TOML file (``calib formats options``); None: their headers say it. The result needs none.
 
     Returns:
         The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` reads. By
@@ -99,16 +118,23 @@ def join(
     joints_file, points_file = Path(joints), Path(points)
     if isinstance(robot, str | Path):
         robot = load_calibrated(robot, base, tip)
+    if not isinstance(options, FitOptions):
+        options = read_fit_options(options)
     if by == "motion":
         if robot is None:
             raise UsageError("joining by motion needs the nominal arm's path: give --robot")
-        return join_streams(joints_file, points_file, robot.complete)
+        return join_streams(joints_file, points_file, robot.complete, options)
+    chain = None if robot is None else robot.complete
+    point_table = read_table(points)
     if is_program(joints_file):
         joint_table = joints_table(joints_file)
+        check_columns(options, [joint_table, point_table], chain)
     else:
         joint_table = read_table(joints)
-    chain = None if robot is None else robot.complete
-    return _joined(joint_table, read_table(points), by, chain)
+        check_columns(options, [joint_table, point_table], chain)
+        joint_table = stated(joint_table, options.for_file(joints_file), chain, holds_joints=True)
+    point_table = stated(point_table, options.for_file(points_file), chain, holds_points=True)
+    return _joined(joint_table, point_table, by, chain)
 
 
 def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joined:
@@ -144,6 +170,8 @@ def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joine
         pose, notes = ordered(chain, q, points, candidates)
     else:
         notes = (f"{counts}, joined by {by}", *notes)
+        if by == "row":
+            notes = (*notes, UNCHECKED)
     keys = {*name_columns, *time_columns} - {""}
     return merged(joints, points, pose, (*joints.notes, *points.notes, *notes), keys)
 
@@ -180,6 +208,7 @@ def ordered(
     measured_candidates = {origin: pose[measured] for origin, pose in candidates.items()}
     order = find_order(chain, q, position[measured], measured_candidates)
     if order is None:
+        _refuse_shown(chain, q, points, position, measured_candidates)
         searched, advice = "any order", ""
         if len(measured) < MIN_FOUND:
             searched = "their order"
@@ -201,6 +230,30 @@ def ordered(
         pose[doubtful] = -1
         notes.append(f"left out, since several poses are equally near: rows {listing(points.rows[doubtful])}")
     return pose, tuple(notes)
+
+
+def _refuse_shown(
+    chain: Chain, q: np.ndarray, points: Table, position: np.ndarray, candidates: dict[str, np.ndarray]
+) -> None:
+    """Raise MeasurementError if the joint values explain the points as a controller shows them (a FANUC's J3).
+
+    Args:
+        chain: the nominal arm.
+        q: (n, joints) joint values [rad or m].
+        points: table of the measured points.
+        position: (m, 3) measured positions [m]; NaN where none was measured.
+        candidates: orders that are tried first.
+    """
+    measured = position[np.isfinite(position).all(axis=1)]
+    for name, controller in controllers().items():
+        if not controller.coupled:
+            continue
+        if find_order(chain, controller.described(q), measured, candidates) is not None:
+            refuse_data(
+                points.file,
+                f"its points fit the joints as {controller.title} shows them, not as the description counts them: "
+                f'state controller = "{name}" in the options (--options)',
+            )
 
 
 def merged(

@@ -34,6 +34,8 @@ from calib.units import DEG
 _POSE_MARKS = ("w", "rx", "r", "a")
 JOINT_NUMBERS = ["j1", "j2", "j3", "j4", "j5", "j6"]
 JOINT_NAMES = ["joint 1", "joint 2", "joint 3", "joint 4", "joint 5", "joint 6"]
+# Numbers of columns of points, of points with TCP or poses, of poses with TCP.
+WIDTHS = (9, 12, 18)
 # Meaning of w, p, r by the options' `euler`.
 MEANINGS = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}
 # Largest angle [rad] read as degrees that would fit radians, with rounding.
@@ -54,6 +56,11 @@ def recognises(header: Sequence[str]) -> bool:
     return not has_seventh
 
 
+def _is_robodk(header: Sequence[str]) -> bool:
+    """Return whether a header begins as RoboDK's, and has not more columns than RoboDK writes."""
+    return recognises(header) and (len(header) in WIDTHS or len(header) < WIDTHS[0])
+
+
 def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
     """Return RoboDK's CSV as a table for the standard reader, the options for reading this table, and notes.
 
@@ -67,7 +74,7 @@ def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
         refuse_data(path, f"is not a RoboDK file: its header begins with {', '.join(header[:7])}, not J1 to J6")
     require(joints == 6, f"RoboDK's format has 6 joints, the robot has {joints}", MeasurementError, path)
     is_pose = len(header) == 18 or (len(header) == 12 and _plain(header[9]) in _POSE_MARKS)
-    if len(header) not in (9, 12, 18):
+    if len(header) not in WIDTHS:
         refuse_data(path, f"has {len(header)} columns; RoboDK's points have 9 or 12, its poses 12 or 18")
     raw = read_table(path, doubles=True)
     measured_count = 12 if is_pose else 9
@@ -154,7 +161,7 @@ def _with_tools(table: Table, tcp: Sequence[str], options: FileOptions) -> tuple
 
 
 FORMS: dict[str, tuple[Callable[[Sequence[str]], bool], Callable[[str | Path, int, FileOptions], Read]]] = {
-    "robodk": (recognises, read_robodk),
+    "robodk": (_is_robodk, read_robodk),
     "three_smr": (lambda header: False, read_three_smr),
 }
 """By the options' ``format``: whether a header is of that form, and the reader."""

@@ -5,7 +5,7 @@ They are known by the names of their columns, and the notes say which was recogn
 * UR: RTDE recordings, of UR's own recorder (parted by blanks) and of ur_rtde
 * Franka: libfranka's ``logToCSV``, its time in ms; a time that is not in whole numbers has been converted, to seconds
 * ABB: EGM as abb_libegm logs it: positions only, no torques
-* KUKA: Sunrise's DataRecorder; the name of the torques' columns has to be stated
+* KUKA: Sunrise's DataRecorder; the torques' columns are told by a word (tau, torque) in their names, else stated
 
 Sources stand in ``logs.toml``. ROS bags, of ros2_control and franka_ros too, are read by their joint states, those of
 franka_ros2 by ``FrankaRobotState``, too. No published description of the text was found for KUKA's RSI monitor and KRC

@@ -15,6 +15,7 @@ import numpy as np
 from calib import files, folders
 from calib.config_types import ParsedTable
 from calib.errors import UsageError, refused_as
+from calib.estimation.robust import LOSSES
 from calib.folders import COVARIANCE, ESTIMATE, METRICS, PAGES, REPORT, InFolder
 from calib.geometry import installation
 from calib.geometry.error_model import ErrorModel
@@ -119,7 +120,9 @@ class FitFolder:
             free, covariance = fit_tables.read_covariance(self.path, calibrated_cell)
             expected = ErrorModel(calibrated_cell, free, covariance, fitted_q, findings.discrepancy)
         start = install(inputs.chain, inputs.fit, inputs.known)
-        weighing = replace(settings, loss=findings.loss or settings.loss)
+        # of a loss that was a function, only the name is stored
+        loss = findings.loss if findings.loss in LOSSES else settings.loss
+        weighing = replace(settings, loss=loss)
         nominal = polish_frames(start, inputs.fit, weighing).cell
         rigid = calibrated.read(self.path).chain
         return Arms(nominal, calibrated_cell, rigid, expected, plain_reference(nominal, inputs))

@@ -51,7 +51,11 @@ def client(session: Session) -> TestClient:
     return TestClient(application(Recorded(session.folder)), base_url="http://127.0.0.1:8000")
 
 
-def bring(client: TestClient, kind: str, name: str, content: bytes = b"x\n1\n") -> Any:
+HEADER = ",".join([*(f"joint{k}" for k in range(1, 8)), "x,y,z,qx,qy,qz,qw"])
+MEASURED = f"{HEADER}\n0,0,0,0,0,0,0,1,1,1,0,0,0,1\n1,0,0,0,0,0,0,1,1,1,0,0,0,1\n"
+
+
+def bring(client: TestClient, kind: str, name: str, content: bytes = MEASURED.encode()) -> Any:
     return client.post(f"/bring/{kind}", files={"file": (name, content)}, follow_redirects=False)
 
 
@@ -61,6 +65,8 @@ def test_the_page_says_what_calib_next_says(session: Session, client: TestClient
     monkeypatch.setattr(pages, "step_states", lambda _: [waits])
     task, file = commands.asks(session, waits)
     shown = re.sub("<.*?>", "", unescape(client.get("/").text))
+    file, _, command = file.partition("; then: ")
+    assert command not in shown, "the page does it"
     lines = [line.partition(" ")[2] for line in task.splitlines()]
     assert len(lines) == 3 and all(line in shown for line in (*lines, file))
 
@@ -72,7 +78,7 @@ def test_files_get_the_sessions_names(session: Session, client: TestClient) -> N
     names = {kind: [path.name for path in session.brought(kind)] for kind in ("measured", "validation")}
     assert names == {"measured": ["Shots 1.csv"], "validation": ["validation_later.csv"]}
     assert client.app.state.work.current.task == CHECK  # type: ignore[attr-defined]
-    for name, words in (("validation.csv", "have another upload"), ("shots.xlsx", "expected .csv")):
+    for name, words in (("validation.csv", "have another upload"), ("shot.png", "is an image, and this session")):
         refused = bring(client, "measured", name)
         assert refused.status_code == 400 and words in refused.text
     assert bring(client, "training", "log.csv").status_code == 404, "the session has no dynamics"
