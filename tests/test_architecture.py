@@ -46,7 +46,7 @@ HOMES = {
     "mcap": ["calib.data."],
     "rosbags": ["calib.data.recordings.bags", "calib.data.images."],
     "pandas": ["calib.api.rendering"],
-    "starlette": ["calib.apps.serve.pages"],
+    "starlette": ["calib.apps.serve."],
     "uvicorn": ["calib.apps.serve.commands"],
     "python_multipart": ["calib.apps.serve.uploads"],
     "rerun": ["calib.apps.viewer.viewer"],

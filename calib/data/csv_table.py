@@ -580,7 +580,7 @@ def _ragged(row: Sequence[str], names: Sequence[str], separator: str, last: bool
 def _not_utf8(error: UnicodeDecodeError, path: str | Path) -> MeasurementError:
     byte = error.object[error.start]
     if _begins_as_archive(path):
-        return MeasurementError("is an archive (.npz or spreadsheet), not a CSV table", path)
+        return MeasurementError("is an archive (.npz or spreadsheet), not a CSV table; save a spreadsheet as CSV", path)
     return MeasurementError(f"is not UTF-8 text (byte 0x{byte:02x}): save it as 'CSV UTF-8'", path)
 
 

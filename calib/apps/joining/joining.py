@@ -4,7 +4,8 @@
 joints              ``joints.csv``: one row per pose, or a log over time: a column per joint; or what a program of
                     `calib program` left at the controller (`calib formats programs`)
 points              ``points.csv``: ``x y z``, with or without an orientation, sigmas, ``tool``
-by name             a column ``name``, ``point``, ``pose``, ``id``, ``label`` or ``target`` in both; ``P_007`` is ``p7``
+by name             a column ``name``, ``point``, ``pose``, ``id``, ``label`` or ``target`` (also in German, French,
+                    Italian, Spanish) in both; ``P_007`` is ``p7``
 by time             a column ``t``, ``time`` or ``timestamp`` in both (a number, or ISO 8601), of the same clock; points
                     measured while the arm moved are left out
 by row              as many rows in both

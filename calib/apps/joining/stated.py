@@ -144,10 +144,10 @@ def _exchanged(table: Table, columns: Sequence[str], names: Sequence[str], cells
         cells: their (m,) values.
         note: a remark for the user.
     """
-    others = [k for k, name in enumerate(table.header) if name not in columns]
-    header = [*names, *(table.header[k] for k in others)]
-    units = [*("" for _ in names), *(table.units[k] for k in others)]
-    values = [*cells, *(table.cells[k] for k in others)]
+    remaining = [k for k, name in enumerate(table.header) if name not in columns]
+    header = [*names, *(table.header[k] for k in remaining)]
+    units = [*("" for _ in names), *(table.units[k] for k in remaining)]
+    values = [*cells, *(table.cells[k] for k in remaining)]
     return replace(table, header=tuple(header), units=tuple(units), cells=tuple(values), notes=(*table.notes, note))
 
 

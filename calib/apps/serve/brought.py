@@ -128,9 +128,10 @@ def set_aside(request: Request) -> Response:
             aside = path.parent / "aside"
             aside.mkdir(exist_ok=True)
             path.replace(aside / f"{len(list(aside.iterdir())) + 1}_{path.name}")
-            if kind in MEASURED_KINDS:
+            if path.parent.name == received.FILES:
                 received.discard_joined(session, kind)
                 work.joins.pop(kind, None)
-            work.ask(CHECK, kind)
+            else:
+                work.ask(CHECK, kind)
             return back(f"brought-{kind}")
     return back()

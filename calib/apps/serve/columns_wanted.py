@@ -18,7 +18,7 @@ ROWS = 3
 RATE = 500.0
 APART = (
     "Or joint values and points in files apart, in any format that calib join reads: upload both, and they are "
-    "joined here. Joint values as a CSV, or as the controller kept them (POSREG.VA, .dat, .script …); points as a CSV, or an "
+    "joined here. Joint values: a CSV, or what the controller kept (POSREG.VA, .dat, .script …); points: a CSV, or an "
     "instrument's text export (SpatialAnalyzer, Motive, Vicon …). Names, times, order, or the nominal arm pair them. "
     "Columns with other names are asked for."
 )
@@ -35,7 +35,7 @@ class Example:
 
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    words: str
+    remark: str
 
     @property
     def text(self) -> str:
@@ -88,8 +88,8 @@ def _poses(session: Session, chain: Chain) -> np.ndarray:
 
 def _shown(chain: Chain, q: np.ndarray) -> list[float]:
     """Return joint values (n,) in the units in which they are shown: degrees and millimetres."""
-    shown = []
+    displayed = []
     for joint, value in zip(chain.joints, q):
         factor, _ = JOINT["prismatic" if joint.kind == "prismatic" else "revolute"]
-        shown.append(factor * float(value))
-    return shown
+        displayed.append(factor * float(value))
+    return displayed

@@ -26,8 +26,8 @@ from calib.toolkit.sessions import (
 FILES = {"robot": (".urdf", ".toml"), "limits": (".toml",), "lens": (".yaml", ".yml"), "board": (".toml",)}
 # questions that have lists of answers
 ALWAYS = ("robot", "instrument", "program", "dynamics", "tool", "tolerance_mm")
-# bytes of a text, and number of files
-MAX_TEXT, MAX_FILES = 1 << 16, len(FILES)
+# bytes of a text and of the whole form, and number of files
+MAX_TEXT, MAX_FORM, MAX_FILES = 1 << 16, 64 << 20, len(FILES)
 COUNTS = {"poses": 40, "validation": 20, "seed": 0}
 
 
@@ -61,15 +61,18 @@ def creation_page(values: dict[str, str] | None = None, problem: str = "") -> Re
 async def create(request: Request) -> Response:
     """Make the session that a form describes, or return the form with what is wrong."""
     folder: Path = request.app.state.work.folder
+    length = request.headers.get("content-length", "")
+    message = f"the form and its files are larger than {MAX_FORM >> 20} MB; nothing was made"
+    require(length.isdecimal() and int(length) <= MAX_FORM, message, UsageError)
     values: dict[str, str] = {}
-    with tempfile.TemporaryDirectory(prefix="calib-new-") as place:
+    with tempfile.TemporaryDirectory(prefix="calib-new-") as temporary:
         form = request.form(max_files=MAX_FILES, max_fields=200, max_part_size=MAX_TEXT)
         async with form as content:
             for name, value in content.items():
                 if not isinstance(value, UploadFile):
                     values[name] = value.strip()
                 elif value.filename:
-                    path = Path(place) / f"{name}{Path(value.filename).suffix.lower()}"
+                    path = Path(temporary) / f"{name}{Path(value.filename).suffix.lower()}"
                     path.write_bytes(await value.read())
                     values[f"{name}_file"] = str(path)
         try:
@@ -77,7 +80,7 @@ async def create(request: Request) -> Response:
         except (CalibError, OSError) as error:
             foreseen = complaint(error)
             message = foreseen[0] if foreseen else str(error)
-            return creation_page(values, message.replace(place, "the uploaded file"))
+            return creation_page(values, message.replace(temporary, "the uploaded file"))
     return back()
 
 

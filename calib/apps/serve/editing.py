@@ -36,13 +36,13 @@ def editable(session: Session) -> dict[str, str]:
     """Return the names of the files of settings that can be edited, each with what it is for."""
     settings = session.settings
     names = {SETTINGS: HELP[SETTINGS]}
-    named = {
+    purposes = {
         settings.fit.options: "fit",
         settings.poses.constraints: "constraints",
         settings.dynamics.limits: "limits",
         settings.dynamics.options: "dynamics",
     }
-    for name, purpose in named.items():
+    for name, purpose in purposes.items():
         if name and session.path(name).is_file():
             names[name] = HELP[purpose]
     return names
@@ -117,9 +117,9 @@ def new_options(request: Request) -> Response:
     require(not session.settings.fit.options, "the session has a file of options already", UsageError)
     settings = session.path(SETTINGS)
     text = settings.read_text(encoding="utf-8")
-    head, section, rest = text.partition("[fit]")
-    changed = rest.replace('options = ""', f'options = "{OPTIONS}"', 1)
-    require(section and changed != rest, f'write options = "{OPTIONS}" into [fit] of {SETTINGS}', UsageError)
+    head, section, tail = text.partition("[fit]")
+    changed = tail.replace('options = ""', f'options = "{OPTIONS}"', 1)
+    require(section and changed != tail, f'write options = "{OPTIONS}" into [fit] of {SETTINGS}', UsageError)
     if not session.path(OPTIONS).exists():
         files.write(session.path(OPTIONS), NEW_OPTIONS)
     files.write(settings, head + section + changed)

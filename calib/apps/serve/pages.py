@@ -110,18 +110,24 @@ def page(request: Request) -> Response:
     recording = ""
     if session.path(RECORDING).exists():
         recording = RECORDING
-    paths = _files(session)
+    kinds = []
+    for kind, description in kinds_of(session).items():
+        kinds.append(_brought(session, kind, description))
+    # what the page does itself is no command
+    to_bring, _, _ = to_bring.partition("; then: ")
+    tasks = [re.sub(r"^\d+ ", "", line) for line in task.splitlines()]
+    file_names = [name_of(session, path) for path in _files(session)]
+    pictures = [name for name in file_names if name.endswith(PICTURES)]
     return page_of(
         "page.html",
         session=session,
         states=states,
         ahead=ahead,
         work=work,
-        # what the page does itself is no command
-        to_bring=to_bring.partition("; then: ")[0],
-        tasks=[re.sub(r"^\d+ ", "", line) for line in task.splitlines()],
+        to_bring=to_bring,
+        tasks=tasks,
         verdicts=verdicts,
-        kinds=[_brought(session, kind, words) for kind, words in kinds_of(session).items()],
+        kinds=kinds,
         joints=chain_of(session).joint_names,
         controllers=list(controllers()),
         eulers=EULER,
@@ -131,8 +137,8 @@ def page(request: Request) -> Response:
         pages=_pages(session),
         bundles=_bundles(session),
         recording=recording,
-        pictures=[name_of(session, path) for path in paths if path.suffix in PICTURES],
-        files=[name_of(session, path) for path in paths],
+        pictures=pictures,
+        files=file_names,
     )
 
 
@@ -149,45 +155,45 @@ class Brought:
     """A kind of files on the page.
 
     Attributes:
-        kind, words: its name and description.
+        kind, description: its name, and what it is.
         names: paths of the files that the session reads.
         example: the columns that it wants.
         parts: received files that are no measurement yet.
         preview: joined joint values and points that can be taken; None if nothing is joined.
         planned: whether points alone can be taken with the planned joint values.
-        stated: what was stated of the parts' columns: name of the part -> field of the form -> answer.
+        answers: what was stated of the parts' columns: name of the part -> field of the form -> answer.
     """
 
     kind: str
-    words: str
+    description: str
     names: tuple[str, ...]
     example: Example
     parts: tuple[received.Received, ...] = ()
     preview: received.Preview | None = None
     planned: bool = False
-    stated: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    answers: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
     def of_role(self, role: str) -> list[str]:
         """Return the names of the received files that were recognised as `role`."""
         return [part.name for part in self.parts if part.role == role]
 
 
-def _brought(session: Session, kind: str, words: str) -> Brought:
+def _brought(session: Session, kind: str, description: str) -> Brought:
     """Return what the page shows of a kind of files (a key of `BROUGHT`)."""
     names = tuple(name_of(session, path) for path in session.brought(kind))
     example = example_of(session, kind)
     if kind not in MEASURED_KINDS:
-        return Brought(kind, words, names, example)
+        return Brought(kind, description, names, example)
     parts = tuple(received.received(session, kind))
     planned = received.planned_poses(session, kind) is not None
-    stated = received.stated_answers(session, kind)
-    return Brought(kind, words, names, example, parts, received.preview(session, kind), planned, stated)
+    answers = received.stated_answers(session, kind)
+    return Brought(kind, description, names, example, parts, received.preview(session, kind), planned, answers)
 
 
 def _bundles(session: Session) -> dict[str, str]:
     """Return the folders that can be downloaded as a whole, with what each holds."""
     bundles = {**BUNDLES, session.export: RESULTS}
-    return {name: words for name, words in bundles.items() if any(session.path(name).glob("*"))}
+    return {name: content for name, content in bundles.items() if any(session.path(name).glob("*"))}
 
 
 def _files(session: Session) -> list[Path]:

@@ -52,13 +52,13 @@ class Received:
     Attributes:
         name: the file's name.
         role: `JOINTS`, `POINTS`, `MEASURED` (both in one table), or `UNCLEAR`.
-        words: what was read, or why the file cannot be read.
+        message: what was read, or why the file cannot be read.
         header: names of its columns; empty where it is no table.
     """
 
     name: str
     role: str
-    words: str
+    message: str
     header: tuple[str, ...] = ()
 
 
@@ -135,8 +135,8 @@ def _recognised(folder: Path, kind: str, path: Path, versions: tuple[tuple[int, 
         return Received(path.name, JOINTS, f"{len(table)} poses: {listing(table.header)}")
     try:
         blocks = read_measurements(path, joints_of(chain), options)
-        words = ", ".join(f"{len(block)} rows of kind {block.kind}" for block in blocks)
-        return Received(path.name, MEASURED, words, read_table(path).header)
+        content = ", ".join(f"{len(block)} rows of kind {block.kind}" for block in blocks)
+        return Received(path.name, MEASURED, content, read_table(path).header)
     except (CalibError, OSError) as error:
         message = _message(error, path)
     try:
@@ -157,34 +157,34 @@ def _part(table: Table, options: FileOptions, chain: Chain, name: str, message: 
         message: why it is no whole measurement.
     """
     sheet = Sheet(table, options)
-    problems = []
-    roles = []
+    problems = {}
+    contents = {}
     try:
         columns = sheet.find_joints(chain.joint_names)
-        roles.append(JOINTS)
+        contents[JOINTS] = f"{len(table)} rows of joint values: {listing(columns)}"
         q, _ = sheet.joints(chain.joint_names)
         check_joints(q, sheet, columns, joints_of(chain))
-        words = f"{len(table)} rows of joint values: {listing(columns)}"
     except CalibError as error:
-        problems.append(_message(error, Path(table.file)))
+        problems[JOINTS] = _message(error, Path(table.file))
     try:
         columns = sheet.family(POSITION.names) or sheet.family(POSITION.names, "1")
         if columns:
-            roles.append(POINTS)
+            contents[POINTS] = f"{len(table)} points: {listing(columns)}"
             sheet.numbers(columns, POSITION, gaps=True)
-            words = f"{len(table)} points: {listing(columns)}"
     except CalibError as error:
-        roles.append(POINTS)
-        problems.append(_message(error, Path(table.file)))
-    if roles == [JOINTS] and not problems:
-        return Received(name, JOINTS, words, table.header)
-    # the first problem is that joints are missing
-    if POINTS in roles and JOINTS not in roles and len(problems) == 1:
-        return Received(name, POINTS, words, table.header)
-    if not roles:
-        message = problems[0]
-    if len(roles) == 1 and problems:
-        message = problems[-1]
+        problems[POINTS] = _message(error, Path(table.file))
+
+    if len(contents) == 1:
+        role = next(iter(contents))
+        if role in problems:
+            return Received(name, UNCLEAR, problems[role], table.header)
+        return Received(name, role, contents[role], table.header)
+    if not contents:
+        missing = f"neither joint values ({listing(chain.joint_names)}, or q1 to q{chain.n}) nor points (x, y, z)"
+        problem = problems.get(POINTS, "")
+        message = (
+            f"has {missing}; its columns are {', '.join(table.header)}: say below which of them is what. {problem}"
+        )
     return Received(name, UNCLEAR, message, table.header)
 
 
@@ -326,7 +326,7 @@ def take_measured(session: Session, kind: str) -> list[Path]:
     Returns:
         Paths of the new files.
     """
-    taken = []
+    targets = []
     for part in received(session, kind):
         if part.role != MEASURED:
             continue
@@ -340,8 +340,8 @@ def take_measured(session: Session, kind: str) -> list[Path]:
             table = stated(read_table(path), options, chain_of(session), holds_joints=True, holds_points=True)
             Joined(table, table.rows - 1, table.notes).write(target)
             _put_away(session, kind, [path])
-        taken.append(target)
-    return taken
+        targets.append(target)
+    return targets
 
 
 def take_points(session: Session, kind: str, name: str) -> Path:
@@ -381,8 +381,8 @@ def _free(session: Session, kind: str, name: str) -> Path:
 
 def _put_away(session: Session, kind: str, paths: list[Path]) -> None:
     """Move received files to those from which a measurement was made."""
-    used = place(session, kind, USED)
-    used.mkdir(exist_ok=True)
+    used_folder = place(session, kind, USED)
+    used_folder.mkdir(exist_ok=True)
     for path in paths:
-        path.replace(used / f"{len(list(used.iterdir())) + 1}_{path.name}")
+        path.replace(used_folder / f"{len(list(used_folder.iterdir())) + 1}_{path.name}")
     discard_joined(session, kind)

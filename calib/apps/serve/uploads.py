@@ -117,12 +117,15 @@ async def receive(session: Session, kind: str, content_type: str, chunks: AsyncI
         finally:
             for upload in arrived:
                 upload.close()
-        uploaded = [upload for upload in arrived if upload.size]
-        require(uploaded, "no file was chosen, or it is empty", UsageError)
+        uploaded = [upload for upload in arrived if upload.file_name]
+        require(uploaded, "no file was chosen", UsageError)
         names = []
         for upload in uploaded:
             file_name = upload.file_name or b""
-            names.append(file_name.decode(errors="replace"))
+            name = file_name.decode(errors="replace")
+            message = f"{name} is empty (0 bytes): was it still being written? Nothing was stored"
+            require(upload.size, message, UsageError)
+            names.append(name)
         paths = targets(session, kind, names)
         for upload, path in zip(uploaded, paths):
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -82,8 +82,8 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
     instrument, images = settings.instrument, settings.instrument.measures == IMAGES
     lists = [POSES] if step == "measure" else [UNSEEN]
     # both are measured in one visit, unless rows of the first are held out
-    apart = settings.poses.validation and not settings.fit.holdout
-    if step == "measure" and apart and not session.brought("validation"):
+    has_validation = settings.poses.validation and not settings.fit.holdout
+    if step == "measure" and has_validation and not session.brought("validation"):
         lists.append(UNSEEN)
 
     planned = _planned_poses(session, lists)
