@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from calib import files
+from calib.config import read_toml
 from calib.errors import UsageError, command_line
 from calib.workers import caches, processes
 
@@ -106,6 +107,16 @@ def test_caches_and_commands(windows, monkeypatch, tmp_path):
     monkeypatch.setattr("tempfile.gettempdir", lambda: str(tmp_path))
     assert caches._temporary("numba").parent.parent == tmp_path
     assert command_line("next", "cell 7") == 'calib next "cell 7"'
+
+
+def test_a_path_that_toml_misreads_is_named(tmp_path):
+    """Backslashes of a path in double quotes are escapes in TOML; the message says how to write it."""
+    options = tmp_path / "options.toml"
+    options.write_text('[camera]\nlens = "C:\\Users\\me\\lens.yaml"\n', encoding="utf-8")
+    with pytest.raises(UsageError, match="in single quotes"):
+        read_toml(options)
+    options.write_text("[camera]\nlens = 'C:\\Users\\me\\lens.yaml'\n", encoding="utf-8")
+    assert read_toml(options)["camera"]["lens"] == "C:\\Users\\me\\lens.yaml"
 
 
 def test_processes_start_without_signal_masks(windows):

@@ -53,13 +53,13 @@ def docs(topic: Annotated[str | None, typer.Argument()] = None) -> None:
 
 def pages() -> Mapping[str, Path]:
     """Return the pages by topic: name of the page's file, or of its folder for the folder's first page."""
-    found: dict[str, Path] = {}
+    topics: dict[str, Path] = {}
     for path in sorted([*SOURCES.glob("*.md"), *SOURCES.glob("*/*.md")]):
         name = path.stem
         if name == "index" and path.parent != SOURCES:
             name = path.parent.name
-        found[name] = path
-    return found
+        topics[name] = path
+    return topics
 
 
 def title(path: Path) -> str:
