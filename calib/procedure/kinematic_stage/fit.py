@@ -276,6 +276,7 @@ def _residual_findings(
         notes.append(rigid_misfit)
     notes += _moved_between(selection.nominal.cell, inputs.fit, weighing)
     notes += diagnose(selection.fit, with_changes=not changes)
+    notes += plausibility.joint_scales(selection.fit)
     notes += image_notes(selection.fit)
     return notes
 
