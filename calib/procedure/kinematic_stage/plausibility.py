@@ -36,6 +36,8 @@ HALF = 0.5
 # changes of a healthy arm's elements: [rad], and as a share of the reach (our choice)
 MAX_TURN = 0.1
 MAX_SHIFT = 0.03
+# of a rigid misfit, where the data name none
+USUAL_CAUSES = "flexibility, gear errors or a moved target"
 # number of images by which the scale is judged
 MAX_IMAGES = 100
 
@@ -70,7 +72,15 @@ def misfit(selection: ModelSelection, reach: float) -> Finding | None:
     if min(rigid.cross_validated, fitted) <= healthy:
         return None
     left = selection.cross_validated / healthy
-    return finding("rigid-misfit", rms=fitted, folds=rigid.cross_validated, reach=reach, healthy=healthy, left=left)
+    return finding(
+        "rigid-misfit",
+        rms=fitted,
+        folds=rigid.cross_validated,
+        reach=reach,
+        healthy=healthy,
+        left=left,
+        causes=USUAL_CAUSES,
+    )
 
 
 def gross_rows(selection: ModelSelection, robust: ModelSelection, reach: float) -> Finding | None:
