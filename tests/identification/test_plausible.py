@@ -19,8 +19,11 @@ from calib.identification.identify import identify
 from calib.identification.physical_consistency.solve import Contradiction, contradiction
 from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
+from calib.procedure.dynamic_stage.hypotheses import tare_findings
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs, gather
 from calib.procedure.dynamic_stage.plausibility import described, findings, impossible, wrong_joints
 from calib.procedure.findings import Verdict, level_of, settle
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.library import load
 from calib.simulation.known_robots import random_fourier
 
@@ -38,6 +41,11 @@ def recorded(late: float = 0.0, clock: float = 1.0, seed: int = 0, **series: np.
 
 def case_of(recording: Recording) -> Case:
     return make_case("log", make_motion(recording, FilterOptions(cutoff=30.0, band=10.0)))
+
+
+def inputs_of(recording: Recording) -> IdentificationInputs:
+    """Return the inputs of an identification of the planted arm from one recording, checked as a file is."""
+    return gather(CalibratedChain(ARM, source="planted"), [recording])
 
 
 def found(recording: Recording, gravity: tuple[float, ...] | None = None) -> list[Finding]:
@@ -214,6 +222,24 @@ def test_jumping_encoder_is_named_with_rows() -> None:
     assert "joint3 jumps by 50" in jumping.jumps[0] and "between rows 2000 and 2001" in jumping.jumps[0]
     (one,) = coded(found(jumping), "position-jump")
     assert level_of(one) == "marginal" and one.values == {"file": "log", "jump": jumping.jumps[0]}
+
+
+def test_jitter_of_stamps_is_no_jump():
+    """Stamps that jitter by a third of a step make no encoder jump."""
+    log = recorded()
+    jitter = 1.6e-3 * np.random.default_rng(0).uniform(-1.0, 1.0, len(log))
+    fast = replace(log, t=log.t / 4.0 + jitter / 4.0, v=None)
+    assert check_recording(fast).jumps == ()
+
+
+@pytest.mark.parametrize("kind", ["average", "start"])
+def test_tared_torques_are_named(kind):
+    """Torques zeroed over the log, or at its start, are named; offsets of friction are not."""
+    tau = recorded().effort
+    zero = tau.mean(axis=0) if kind == "average" else tau[:20].mean(axis=0)
+    told = tare_findings(inputs_of(recorded(tau=tau - zero)), None)
+    assert [(one.code, one.values["kind"]) for one in told] == [("torques-tared", kind)]
+    assert tare_findings(inputs_of(recorded()), None) == []
 
 
 @pytest.mark.parametrize("clock, level", [(1.0, None), (1.2, None), (2.0, "fail"), (0.5, "fail"), (3.0, "fail")])

@@ -41,20 +41,24 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
             return f"looks like {unit}; if so, name the column '{columns[j]} [{unit}]'"
         return f"the column is read as [{units[j]}]: is it in another unit (counts, grad), or of another joint?"
 
+    remedy = "correct its limits or set check_limits = false in the options"
+    otherwise = f"are joint columns swapped? If the robot reached it, {remedy}"
+
     def says(row: int, j: int) -> str:
         unit, mistaken_unit, factor = joint_unit(kinds[j])
         fault = f"{q[row, j]:g} {unit} is outside the limits {lower[j]:g} to {upper[j]:g} {unit} of {joints[j]}"
         fits_other_unit = not outside(q[:, j] * factor, lower[j], upper[j]).any()
         if units[j] in ("", "rad", "m") and np.abs(q[:, j]).max() > BOUNDS.max_turn and fits_other_unit:
             return f"{fault}: {advice(j, mistaken_unit)}"
-        return (
-            f"{fault}: are joint columns swapped? If the robot reached it, correct its limits or set "
-            "check_limits = false in the options"
-        )
+        turns = _turns_beyond(float(q[row, j]), float(lower[j]), float(upper[j]))
+        if turns and not sliding[j]:
+            there = f"{fault}, {q[row, j] + turns * math.tau:g} rad ({turns:+d} turn) is inside"
+            return f"{there}: was the joint wound, or its turn lost? Then add the turn to these rows. Or {otherwise}"
+        return f"{fault}: {otherwise}"
 
+    sliding = np.array([kind == "prismatic" for kind in kinds])
     if sheet.options.check_limits:
         refuse(table, outside(q, lower, upper) & bounded, columns, says)
-    sliding = np.array([kind == "prismatic" for kind in kinds])
     free = ~bounded if sheet.options.check_limits else sliding
     check_travel(q, np.where(free, max_travel(kinds), math.inf), table, columns, joints, kinds, advice)
     notes = []
@@ -69,6 +73,13 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
     if in_degrees and np.abs(q[:, turning]).max() < BOUNDS.max_turn * DEG:
         notes.append("all joint values are below 6.6 deg: are they radians instead of degrees?")
     return tuple(notes)
+
+
+def _turns_beyond(value: float, lower: float, upper: float) -> int:
+    """Return the whole turns that bring a joint's value [rad] inside its limits; 0 if no number of turns does."""
+    turns = round(((lower + upper) / 2.0 - value) / math.tau)
+    inside = lower <= value + turns * math.tau <= upper
+    return turns if inside else 0
 
 
 def outside(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:

@@ -21,6 +21,7 @@ from calib.procedure.dynamic_stage.hypotheses import (
     gravity_hypotheses,
     likelier_gravity,
     load_findings,
+    tare_findings,
 )
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.findings import level_of, limit, settle
@@ -66,6 +67,7 @@ def implausible(
     result = wrong_joints(columns, chain.joint_names)
     result += gravity_findings(hypotheses, chain.joint_names)
     result += load_findings(inputs, gravity)
+    result += tare_findings(inputs, gravity)
     result += standing_columns(cases, chain.joint_names)
     result += findings(sizes, chain.joint_names)
     result += impossible(impossible_by)
@@ -135,6 +137,8 @@ def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Findi
                 extremes = " and ".join(f"{value:.4g}" for value in fault.values)
                 clipped.append(joint)
                 values.append(f"{extremes} in {fault.share:.0%} of its motion")
+                continue
+            if fault.kind in ("mean", "start"):
                 continue
             code = "velocity-stands" if fault.kind == "velocity" else "encoder-stands"
             result.append(

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import Finding, finding
+from calib.geometry.checks.file_change import changed_since_fit
 from calib.geometry.error_model import ErrorModel
 from calib.geometry.fit import without_corrections
 from calib.geometry.installation import Installation
@@ -437,11 +438,15 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
     copies = _copies(inputs)
     if copies:
         noticed.append(finding("not-unseen", files=copies))
+    fitted_files = {block.file for block in inputs.fit}
     usual = np.inf
     if len(fitted.errors[0].main):
         usual = float(np.median(fitted.errors[0].main))
     for name, rows in validation.items():
         noticed += _noticed(name, rows, usual)
+        others = [block for block in rows.blocks if block.file not in fitted_files]
+        if rows.shares_frames and rows.proves and others:
+            noticed += changed_since_fit(rows.cells[1], others, fitted.errors[1].rms)
 
     notes = [*inputs.notes]
     for block in inputs.fit:
