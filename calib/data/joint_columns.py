@@ -9,38 +9,23 @@ many; otherwise the names do not tell which joints they are.
 """
 
 import re
+import tomllib
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from calib.data.csv_table import Table
 from calib.errors import listing
 
-# words for a joint, in languages of pendants and teaching programs
-JOINT_WORDS = frozenset(
-    "q j jt jnt joint joints a ax axis axes rax theta th θ motor servo achse gelenk axe articulation eje articulacion "
-    "articulación junta eixo asse giunto oś os as led kloub eksen mafsal сустав ось 关节 轴 軸 関節 관절 축".split()
-)
-# words for a position of a joint
-POSITION_WORDS = frozenset("q pos position positions qpos angle angles deg winkel angulo ángulo angolo 角度".split())
-# words for another quantity of a joint
-OTHER_WORDS = frozenset(
-    "v vel velocity velocities speed dq qd qvel geschwindigkeit acc acceleration ddq qdd tau torque torques effort "
-    "efforts moment force load i current currents strom voltage temperature temp error sigma time name names limit "
-    "min max lower upper raw pwm duty power".split()
-)
-# words that say nothing about the quantity
-PLAIN_WORDS = frozenset(
-    "actual act measured meas state states ist istwert observation field value robot robax data feedback deg rad mm "
-    "degrees".split()
-)
-# words for a position that was to be reached, not one that was measured
-COMMANDED_WORDS = frozenset(
-    "cmd command commanded target ref reference des desired action goal soll sollwert setpoint set nominal plan "
-    "planned".split()
-)
-# words for an axis outside the arm, beside the arm's numbered axes
-EXTERNAL_WORDS = frozenset("e eax ext extax external zusatzachse".split())
+# words in names of columns, by what they mean
+_WORDS = tomllib.loads(Path(__file__).with_name("column_words.toml").read_text(encoding="utf-8"))
+JOINT_WORDS = frozenset(_WORDS["joint"].split())
+POSITION_WORDS = frozenset(_WORDS["position"].split())
+OTHER_WORDS = frozenset(_WORDS["other"].split())
+PLAIN_WORDS = frozenset(_WORDS["plain"].split())
+COMMANDED_WORDS = frozenset(_WORDS["commanded"].split())
+EXTERNAL_WORDS = frozenset(_WORDS["external"].split())
 # joints that a pendant shows by letters or names, in the order of the arm
 PENDANTS = (
     ("s", "l", "u", "r", "b", "t"),
@@ -48,7 +33,7 @@ PENDANTS = (
     ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3"),
 )
 # first words of columns that are no joints
-TARGET_WORDS = [(word,) for word in ("x", "y", "z", "t", "time", "nr", "no", "row", "tag", "name", "point", "punkt")]
+TARGET_WORDS = frozenset(("x", "y", "z", "t", "time", "nr", "no", "row", "tag", "name", "point", "punkt"))
 _BREAK = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])")
 _WORD = re.compile(r"[^\W\d_]+|\d+")
 
@@ -178,7 +163,7 @@ def proposed_line(header: Sequence[str], series: Sequence[JointSeries], n: int) 
     """
     if series:
         return mapping_line(series[0])
-    columns = [column for column in header if words_of(column)[:1] not in TARGET_WORDS]
+    columns = [column for column in header if TARGET_WORDS.isdisjoint(words_of(column)[:1])]
     columns += ["..."] * n
     return mapping_line(JointSeries(tuple(columns[:n]), ()))
 
@@ -287,10 +272,8 @@ def _with_external(numbered: Mapping[tuple[str, ...], Mapping[int, str]], kinds:
     turning = [index for index, kind in enumerate(kinds) if kind != "prismatic"]
     if not sliding or not turning:
         return []
-    external = []
-    for series in _by_numbers(numbered, len(sliding)):
-        if EXTERNAL_WORDS.intersection(series.words):
-            external.append(series)
+    series = _by_numbers(numbered, len(sliding))
+    external = [entry for entry in series if EXTERNAL_WORDS.intersection(entry.words)]
     result = []
     for arm in _by_numbers(numbered, len(turning)):
         for outside in external:

@@ -204,7 +204,7 @@ class Sheet:
         return self._joints_by_words(robot, message, missing[0] if message else None)
 
     def has_our_names(self, columns: Sequence[str], joints: Sequence[str]) -> bool:
-        """Return whether joint columns have the names of the robot's joints or of this toolkit, or the options map them.
+        """Return whether joint columns have names of the robot's joints or of this toolkit, or the options map them.
 
         Args:
             columns: the file's names of the joint columns.

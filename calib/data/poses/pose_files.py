@@ -66,6 +66,7 @@ from calib.data.poses.measurements import (
     Positions,
     Sockets,
 )
+from calib.data.poses.placeholders import without_placeholders
 from calib.data.poses.robodk import FORMS
 from calib.data.poses.silent_units import with_silent_units
 from calib.data.poses.unnamed import arrangements
@@ -249,6 +250,7 @@ def read_measurements(
     sheet = with_shapes(_select_rows(Sheet(table, options)), robot)
     layout = find_layout(sheet, robot)
     sheet, unit_notes = with_silent_units(sheet, layout, robot)
+    sheet, unseen_notes = without_placeholders(sheet, layout)
     sheet, base_notes = rows_with_base(sheet, layout)
     number_columns = layout.used.difference(layout.group, [layout.tool])
     # Where a file has several targets, one that was not seen is a gap.
@@ -257,7 +259,10 @@ def read_measurements(
         columns_with_gaps.update(*layout.positions, *layout.sigmas)
     sheet.table.check([name for name in sheet.table.header if name in number_columns], columns_with_gaps)
     q, _ = sheet.joints(robot)
-    notes = (*sheet.table.notes, *notes, *layout.notes, *unit_notes, *base_notes)
+    turn_notes: tuple[str, ...] = ()
+    if options.check_limits:
+        q, turn_notes = plausible.within_limits(q, robot, layout.joints)
+    notes = (*sheet.table.notes, *notes, *layout.notes, *unit_notes, *unseen_notes, *turn_notes, *base_notes)
     notes = (*notes, *plausible.check_joints(q, sheet, layout.joints, robot))
     if layout.positions:
         block: PoseMeasurements = _read_targets(sheet, layout, q)

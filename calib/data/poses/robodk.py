@@ -63,7 +63,7 @@ def _is_robodk(header: Sequence[str]) -> bool:
     Args:
         header: names of the columns; fewer than those of a point count, too.
     """
-    if not recognises(header) or len(header) > WIDTHS[0] and len(header) not in WIDTHS:
+    if not recognises(header) or (len(header) > WIDTHS[0] and len(header) not in WIDTHS):
         return False
     words = [words_of(name) for name in header[6:]]
     if any(not COMMANDED_WORDS.isdisjoint(name) for name in words):

@@ -1,8 +1,8 @@
 """Units of columns whose names come from a controller or another program, where the header states none.
 
-The toolkit's own names (``q1``, a joint's name, ``x``) without a unit are SI. Controllers show deg and mm, programs write
-rad and m: where most rows are impossible in SI, the columns are deg or mm, and the notes say so. A name may hold its
-unit as a word (``x_mm``, ``J1 deg``).
+The toolkit's own names (``q1``, a joint's name, ``x``) without a unit are SI. Controllers show deg and mm, programs
+write rad and m: where most rows are impossible in SI, the columns are deg or mm, and the notes say so. A name may hold
+its unit as a word (``x_mm``, ``J1 deg``).
 """
 
 import math
@@ -43,8 +43,7 @@ def with_silent_units(sheet: Sheet, layout: Layout, robot: Joints) -> tuple[Shee
         names = sliding if kind == "prismatic" else turning
         names.append(name)
     families = [(turning, "joints", "deg", BOUNDS.max_turn), (sliding, "joints", "mm", _travel(robot))]
-    for names in layout.positions:
-        families.append((list(names), "position", "mm", BOUNDS.max_length))
+    families += [(list(names), "position", "mm", BOUNDS.max_length) for names in layout.positions]
     if len(layout.orientation) == 3:
         families.append((list(layout.orientation), "orientation", "deg", BOUNDS.max_turn))
     units = dict(sheet.options.units)
