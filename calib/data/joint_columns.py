@@ -44,34 +44,34 @@ class JointSeries:
 
     Attributes:
         columns: n names of columns, in the robot's order.
-        words: words that all names have beside the joint.
-        named: whether the columns have the joints' names, not only numbers.
+        terms: words that all names have beside the joint.
+        by_name: whether the columns have the joints' names, not only numbers.
     """
 
     columns: tuple[str, ...]
-    words: tuple[str, ...]
-    named: bool = False
+    terms: tuple[str, ...]
+    by_name: bool = False
 
     @property
     def is_position(self) -> bool:
         """Whether the words may mean a position; numbers alone count where a word for joints stands beside them."""
-        words = set(self.words)
-        if words & OTHER_WORDS and not words & (POSITION_WORDS - {"q"}):
+        terms = set(self.terms)
+        if terms & OTHER_WORDS and not terms & (POSITION_WORDS - {"q"}):
             return False
-        if self.named and words <= PLAIN_WORDS:
+        if self.by_name and terms <= PLAIN_WORDS:
             return True
-        return bool(words & (JOINT_WORDS | POSITION_WORDS))
+        return bool(terms & (JOINT_WORDS | POSITION_WORDS))
 
     @property
     def is_commanded(self) -> bool:
         """Whether a word means that the position was commanded, not measured."""
-        return bool(COMMANDED_WORDS.intersection(self.words))
+        return bool(COMMANDED_WORDS.intersection(self.terms))
 
 
 def words_of(name: str) -> tuple[str, ...]:
     """Return the words and numbers in a column's name, in lower case: (joint, 1, pos) for ``Joint1.pos``."""
     text = _BREAK.sub(" ", unicodedata.normalize("NFKC", name))
-    return tuple(word.casefold() for word in _WORD.findall(text))
+    return tuple(term.casefold() for term in _WORD.findall(text))
 
 
 def joint_series(header: Sequence[str], joints: Sequence[str], kinds: Sequence[str] = ()) -> list[JointSeries]:
@@ -113,10 +113,10 @@ def series_named_in_cells(table: Table, joints: Sequence[str]) -> list[JointSeri
         return []
     numbers = [number_of[joint] for joint in joints]
     result = []
-    for words, columns in numbered.items():
+    for terms, columns in numbered.items():
         if all(number in columns for number in numbers):
             names = tuple(columns[number] for number in numbers)
-            result.append(JointSeries(names, words, named=True))
+            result.append(JointSeries(names, terms, by_name=True))
     return result
 
 
@@ -127,7 +127,7 @@ def position_series(series: Sequence[JointSeries]) -> list[JointSeries]:
         series: all series of a table.
     """
     positions = [entry for entry in series if entry.is_position]
-    positions = [entry for entry in positions if entry.named] or positions
+    positions = [entry for entry in positions if entry.by_name] or positions
     return [entry for entry in positions if not entry.is_commanded] or positions
 
 
@@ -141,8 +141,8 @@ def joints_in(header: Sequence[str], joints: Sequence[str]) -> list[str]:
     columns = [words_of(name) for name in header]
     result = []
     for joint in joints:
-        words = words_of(joint)
-        if any(_without(column, words) is not None for column in columns):
+        terms = words_of(joint)
+        if any(_without(column, terms) is not None for column in columns):
             result.append(joint)
     return result
 
@@ -173,17 +173,17 @@ def described(series: JointSeries) -> str:
     return listing(series.columns, 8)
 
 
-def _without(words: tuple[str, ...], part: tuple[str, ...]) -> tuple[str, ...] | None:
+def _without(terms: tuple[str, ...], part: tuple[str, ...]) -> tuple[str, ...] | None:
     """Return `words` without the words of `part`, which stand together; None if they do not.
 
     Args:
-        words: words of a column's name.
+        terms: words of a column's name.
         part: words of a joint's name.
     """
-    for start in range(len(words) - len(part) + 1):
+    for start in range(len(terms) - len(part) + 1):
         stop = start + len(part)
-        if words[start:stop] == part:
-            return words[:start] + words[stop:]
+        if terms[start:stop] == part:
+            return terms[:start] + terms[stop:]
     return None
 
 
@@ -198,16 +198,16 @@ def _by_names(header: Sequence[str], names: Sequence[tuple[str, ...]]) -> list[J
     # the longest name first: wrist_roll is not the joint wrist
     longest = sorted(filter(None, names), key=len, reverse=True)
     for column in header:
-        words = words_of(column)
+        terms = words_of(column)
         for name in longest:
-            rest = _without(words, name)
-            if rest is not None:
-                by_words.setdefault(rest, {}).setdefault(name, column)
+            remainder = _without(terms, name)
+            if remainder is not None:
+                by_words.setdefault(remainder, {}).setdefault(name, column)
                 break
     result = []
-    for rest, columns in by_words.items():
+    for remainder, columns in by_words.items():
         if all(name in columns for name in names):
-            result.append(JointSeries(tuple(columns[name] for name in names), rest, named=True))
+            result.append(JointSeries(tuple(columns[name] for name in names), remainder, by_name=True))
     return result
 
 
@@ -223,9 +223,9 @@ def _short_names(joints: Sequence[str]) -> list[tuple[str, ...]]:
     common = set(names[0]).intersection(*names) | {"joint"}
     short = []
     for name in names:
-        words = tuple(word for word in name if word not in common)
-        is_number = all(word.isdigit() for word in words)
-        short.append(() if is_number else words)
+        terms = tuple(term for term in name if term not in common)
+        is_number = all(term.isdigit() for term in terms)
+        short.append(() if is_number else terms)
     return short if len(set(short)) == len(short) else [()] * len(short)
 
 
@@ -237,12 +237,12 @@ def _numbered(header: Sequence[str]) -> dict[tuple[str, ...], dict[int, str]]:
     """
     result: dict[tuple[str, ...], dict[int, str]] = {}
     for column in header:
-        words = words_of(column)
-        places = [place for place, word in enumerate(words) if word.isdigit()]
-        if places:
-            place = places[-1]
-            beside = words[:place] + words[place + 1 :]
-            result.setdefault(beside, {}).setdefault(int(words[place]), column)
+        terms = words_of(column)
+        indices = [index for index, term in enumerate(terms) if term.isdigit()]
+        if indices:
+            index = indices[-1]
+            beside = terms[:index] + terms[index + 1 :]
+            result.setdefault(beside, {}).setdefault(int(terms[index]), column)
     return result
 
 
@@ -254,10 +254,10 @@ def _by_numbers(numbered: Mapping[tuple[str, ...], Mapping[int, str]], n: int) -
         n: number of the robot's joints.
     """
     result = []
-    for words, columns in numbered.items():
+    for terms, columns in numbered.items():
         numbers = sorted(columns)
         if len(numbers) == n and numbers[0] in (0, 1) and numbers[-1] - numbers[0] == n - 1:
-            result.append(JointSeries(tuple(columns[number] for number in numbers), words))
+            result.append(JointSeries(tuple(columns[number] for number in numbers), terms))
     return result
 
 
@@ -273,12 +273,12 @@ def _with_external(numbered: Mapping[tuple[str, ...], Mapping[int, str]], kinds:
     if not sliding or not turning:
         return []
     series = _by_numbers(numbered, len(sliding))
-    external = [entry for entry in series if EXTERNAL_WORDS.intersection(entry.words)]
+    external = [entry for entry in series if EXTERNAL_WORDS.intersection(entry.terms)]
     result = []
     for arm in _by_numbers(numbered, len(turning)):
-        for outside in external:
+        for rail in external:
             columns = [""] * len(kinds)
-            for index, column in zip((*turning, *sliding), (*arm.columns, *outside.columns)):
+            for index, column in zip((*turning, *sliding), (*arm.columns, *rail.columns)):
                 columns[index] = column
-            result.append(JointSeries(tuple(columns), arm.words))
+            result.append(JointSeries(tuple(columns), arm.terms))
     return result

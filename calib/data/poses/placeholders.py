@@ -38,7 +38,7 @@ def without_placeholders(sheet: Sheet, layout: Layout) -> tuple[Sheet, tuple[str
     for names in layout.positions:
         orientation = layout.orientation if single else ()
         unseen = _placeholders(table, names, orientation, single)
-        if not unseen.any() or unseen.all():
+        if layout.base or not unseen.any() or unseen.all():
             continue
         rows = listing(table.rows[unseen].tolist(), 8)
         notes.append(f"{', '.join(names)}: not seen in row(s) {rows}, which hold {_written(table, names, unseen)}")

@@ -82,15 +82,15 @@ def within_limits(q: np.ndarray, robot: Joints, columns: Sequence[str]) -> tuple
         robot: types and limits of the joints.
         columns: the file's names of the joint columns.
     """
-    beyond = outside(q, robot.lower, robot.upper)
+    exceeds = outside(q, robot.lower, robot.upper)
     turns = np.where(q > robot.upper, -1, 1) * 2.0 * math.pi
-    moved = np.where(beyond, q + turns, q)
+    turned = np.where(exceeds, q + turns, q)
     notes = []
     result = q.copy()
-    for j in np.flatnonzero(beyond.any(axis=0) & ~outside(moved, robot.lower, robot.upper).any(axis=0)).tolist():
+    for j in np.flatnonzero(exceeds.any(axis=0) & ~outside(turned, robot.lower, robot.upper).any(axis=0)).tolist():
         if robot.kinds[j] != "prismatic":
-            result[:, j] = moved[:, j]
-            count = int(beyond[:, j].sum())
+            result[:, j] = turned[:, j]
+            count = int(exceeds[:, j].sum())
             notes.append(
                 f"{columns[j]} is outside its limits in {count} of {len(q)} rows, and within them by a turn: read so"
             )

@@ -302,8 +302,8 @@ def _without_units(columns: Mapping[str, str], table: Table) -> dict[str, str]:
     """
     names, _ = split_units(list(columns.values()))
     result = {}
-    for (ours, heading), name in zip(columns.items(), names):
-        result[ours] = heading if heading in table or name not in table else name
+    for (standard_name, heading), name in zip(columns.items(), names):
+        result[standard_name] = heading if heading in table or name not in table else name
     return result
 
 

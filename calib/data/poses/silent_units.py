@@ -48,9 +48,9 @@ def with_silent_units(sheet: Sheet, layout: Layout, robot: Joints) -> tuple[Shee
         families.append((list(layout.orientation), "orientation", "deg", BOUNDS.max_turn))
     units = dict(sheet.options.units)
     notes = []
-    for names, family, unit, most in families:
+    for names, family, unit, limit in families:
         silent = bool(names) and not any(sheet.unit(name, family) for name in names)
-        if silent and _share_above(sheet, names, most) > MOST_ROWS:
+        if silent and _share_above(sheet, names, limit) > MOST_ROWS:
             units |= dict.fromkeys(names, unit)
             notes.append(f"{', '.join(names)}: no unit stated, read in {unit}; in {SI[unit]} they are impossible")
     read = replace(sheet, options=replace(sheet.options, units=units))
@@ -70,9 +70,9 @@ def _with_units_of_names(sheet: Sheet, layout: Layout) -> Sheet:
     units = dict(sheet.options.units)
     for names, family in families:
         for name in names:
-            words = [word for word in words_of(name) if word in WORD_UNITS]
-            if len(words) == 1 and not sheet.unit(name, family):
-                units[name] = words[0]
+            terms = [term for term in words_of(name) if term in WORD_UNITS]
+            if len(terms) == 1 and not sheet.unit(name, family):
+                units[name] = terms[0]
     return replace(sheet, options=replace(sheet.options, units=units))
 
 
@@ -102,18 +102,18 @@ def _travel(robot: Joints) -> float:
     return travel + BOUNDS.limit_slack if math.isfinite(travel) else BOUNDS.max_length
 
 
-def _share_above(sheet: Sheet, names: Sequence[str], most: float) -> float:
+def _share_above(sheet: Sheet, names: Sequence[str], limit: float) -> float:
     """Return the share of rows with a number above `most` in one of the columns, among rows with numbers.
 
     Args:
         sheet: the table.
         names: the file's names of the columns.
-        most: largest possible absolute value.
+        limit: largest possible absolute value.
     """
     columns = [np.abs(sheet.table.numbers(name, None, gaps=True)) for name in names]
     largest = np.max(np.stack(columns), axis=0)
     largest = largest[np.isfinite(largest)]
-    return float(np.mean(largest > most)) if len(largest) else 0.0
+    return float(np.mean(largest > limit)) if len(largest) else 0.0
 
 
 def _ask_for_angles(sheet: Sheet, layout: Layout, turning: Sequence[str]) -> None:

@@ -96,32 +96,32 @@ def without_unseen(chain: Chain, block: Block, copies_accepted: bool = False) ->
         for entry in _copies(block):
             findings.append(_says_copies(block, entry))
             unseen |= np.isin(block.tool, _false_targets(block, entry)) & np.isin(block.rows, entry.rows)
-    rest = take(block, np.flatnonzero(~unseen))
+    remainder = take(block, np.flatnonzero(~unseen))
     try:
-        repeated = _repeated(install(chain, [rest]), rest)
+        repeated = _repeated(install(chain, [remainder]), remainder)
     except CalibError:  # too few rows, or another robot's: the fit says so
         repeated = []
     index = np.flatnonzero(~unseen)
     for entry in repeated:
-        if len(entry.index) <= MOST_ROWS * np.sum(rest.tool == entry.tool):
-            findings.append(_says_repeated(rest, entry))
+        if len(entry.index) <= MOST_ROWS * np.sum(remainder.tool == entry.tool):
+            findings.append(_says_repeated(remainder, entry))
             unseen[index[list(entry.index)]] = True
     if not unseen.any():
         return block, []
     return _seen(block, ~unseen), findings
 
 
-def _seen(block: Positions, seen: np.ndarray) -> Positions:
+def _seen(block: Positions, visible: np.ndarray) -> Positions:
     """Return the rows of a block that were seen, without targets that were seen in no row.
 
     Args:
         block: the measurements.
-        seen: mask (m,) of its rows.
+        visible: mask (m,) of its rows.
     """
-    rest = take(block, np.flatnonzero(seen))
-    targets = np.unique(rest.tool)
+    remainder = take(block, np.flatnonzero(visible))
+    targets = np.unique(remainder.tool)
     names = tuple(block.tool_names[tool] for tool in targets)
-    return replace(rest, tool=np.searchsorted(targets, rest.tool), tool_names=names)
+    return replace(remainder, tool=np.searchsorted(targets, remainder.tool), tool_names=names)
 
 
 def _readings(block: Positions) -> np.ndarray:
@@ -173,15 +173,15 @@ def _false_targets(block: Positions, copies: Copies) -> list[int]:
     """
     if len(copies.rows) == copies.common:
         return [copies.second]
-    others = [tool for tool in range(len(block.tool_names)) if tool not in (copies.first, copies.second)]
-    first = [_distance_change(block, copies.first, other, copies.rows) for other in others]
-    second = [_distance_change(block, copies.second, other, copies.rows) for other in others]
-    if not others or np.isnan(first + second).any() or sum(first) == sum(second):
+    neighbours = [tool for tool in range(len(block.tool_names)) if tool not in (copies.first, copies.second)]
+    first = [_distance_change(block, copies.first, neighbour, copies.rows) for neighbour in neighbours]
+    second = [_distance_change(block, copies.second, neighbour, copies.rows) for neighbour in neighbours]
+    if not neighbours or np.isnan(first + second).any() or sum(first) == sum(second):
         return [copies.first, copies.second]
     return [copies.second if sum(first) < sum(second) else copies.first]
 
 
-def _distance_change(block: Positions, tool: int, other: int, rows: Sequence[int]) -> float:
+def _distance_change(block: Positions, tool: int, neighbour: int, rows: Sequence[int]) -> float:
     """Return by how much the distance [m] of two targets in some rows differs from the median in the other rows.
 
     NaN without rows of both kinds.
@@ -192,7 +192,7 @@ def _distance_change(block: Positions, tool: int, other: int, rows: Sequence[int
         rows: numbers of the rows in question.
     """
     position_of = []
-    for target in (tool, other):
+    for target in (tool, neighbour):
         index = np.flatnonzero(block.tool == target)
         position_of.append(dict(zip(block.rows[index].tolist(), block.position[index])))
     distances: dict[bool, list[float]] = {True: [], False: []}
