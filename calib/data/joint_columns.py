@@ -13,6 +13,9 @@ import tomllib
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import filterfalse
+from operator import attrgetter
 from pathlib import Path
 
 from calib.data.csv_table import Table
@@ -71,7 +74,12 @@ class JointSeries:
 def words_of(name: str) -> tuple[str, ...]:
     """Return the words and numbers in a column's name, in lower case: (joint, 1, pos) for ``Joint1.pos``."""
     text = _BREAK.sub(" ", unicodedata.normalize("NFKC", name))
-    return tuple(term.casefold() for term in _WORD.findall(text))
+    return tuple(_WORD.findall(text.casefold()))
+
+
+def parted(terms: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the numbers among the terms of a name, and the words."""
+    return tuple(filter(str.isdigit, terms)), tuple(filterfalse(str.isdigit, terms))
 
 
 def joint_series(header: Sequence[str], joints: Sequence[str], kinds: Sequence[str] = ()) -> list[JointSeries]:
@@ -82,12 +90,12 @@ def joint_series(header: Sequence[str], joints: Sequence[str], kinds: Sequence[s
         joints: names of the robot's n joints.
         kinds: URDF type of each joint, which tells external axes apart; (): all revolute.
     """
-    result = _by_names(header, [words_of(joint) for joint in joints])
+    result = _by_names(header, list(map(words_of, joints)))
     if not result:
         result = _by_names(header, _short_names(joints))
     for pendant in PENDANTS:
         if len(pendant) == len(joints):
-            result += _by_names(header, [words_of(name) for name in pendant])
+            result += _by_names(header, list(map(words_of, pendant)))
     kinds = kinds or ["revolute"] * len(joints)
     numbered = _numbered(header)
     result += _by_numbers(numbered, len(joints))
@@ -106,16 +114,16 @@ def series_named_in_cells(table: Table, joints: Sequence[str]) -> list[JointSeri
     for columns in numbered.values():
         for number, column in columns.items():
             cells = table.cells[table.header.index(column)]
-            texts = set(cells.tolist()) if cells.dtype == object else set()
-            if len(texts) == 1:
+            texts = set(cells.tolist())
+            if cells.dtype == object and len(texts) == 1:
                 number_of[texts.pop()] = number
-    if any(joint not in number_of for joint in joints):
+    if not number_of.keys() >= set(joints):
         return []
-    numbers = [number_of[joint] for joint in joints]
+    numbers = list(map(number_of.__getitem__, joints))
     result = []
     for terms, columns in numbered.items():
-        if all(number in columns for number in numbers):
-            names = tuple(columns[number] for number in numbers)
+        if columns.keys() >= set(numbers):
+            names = tuple(map(columns.__getitem__, numbers))
             result.append(JointSeries(names, terms, by_name=True))
     return result
 
@@ -126,9 +134,9 @@ def position_series(series: Sequence[JointSeries]) -> list[JointSeries]:
     Args:
         series: all series of a table.
     """
-    positions = [entry for entry in series if entry.is_position]
-    positions = [entry for entry in positions if entry.by_name] or positions
-    return [entry for entry in positions if not entry.is_commanded] or positions
+    positions = list(filter(attrgetter("is_position"), series))
+    positions = list(filter(attrgetter("by_name"), positions)) or positions
+    return list(filterfalse(attrgetter("is_commanded"), positions)) or positions
 
 
 def joints_in(header: Sequence[str], joints: Sequence[str]) -> list[str]:
@@ -138,11 +146,11 @@ def joints_in(header: Sequence[str], joints: Sequence[str]) -> list[str]:
         header: names of the columns.
         joints: names of joints.
     """
-    columns = [words_of(name) for name in header]
+    columns = list(map(words_of, header))
     result = []
     for joint in joints:
-        terms = words_of(joint)
-        if any(_without(column, terms) is not None for column in columns):
+        remainders = map(partial(_without, part=words_of(joint)), columns)
+        if set(remainders) - {None}:
             result.append(joint)
     return result
 
@@ -206,8 +214,8 @@ def _by_names(header: Sequence[str], names: Sequence[tuple[str, ...]]) -> list[J
                 break
     result = []
     for remainder, columns in by_words.items():
-        if all(name in columns for name in names):
-            result.append(JointSeries(tuple(columns[name] for name in names), remainder, by_name=True))
+        if columns.keys() >= set(names):
+            result.append(JointSeries(tuple(map(columns.__getitem__, names)), remainder, by_name=True))
     return result
 
 
@@ -219,14 +227,16 @@ def _short_names(joints: Sequence[str]) -> list[tuple[str, ...]]:
     Args:
         joints: names of the joints.
     """
-    names = [words_of(joint) for joint in joints]
+    names = list(map(words_of, joints))
     common = set(names[0]).intersection(*names) | {"joint"}
     short = []
     for name in names:
-        terms = tuple(term for term in name if term not in common)
-        is_number = all(term.isdigit() for term in terms)
-        short.append(() if is_number else terms)
-    return short if len(set(short)) == len(short) else [()] * len(short)
+        terms = tuple(filterfalse(common.__contains__, name))
+        has_name = not "".join(terms).isdigit()
+        short.append(terms * has_name)
+    if len(set(short)) < len(short):
+        return [()] * len(short)
+    return short
 
 
 def _numbered(header: Sequence[str]) -> dict[tuple[str, ...], dict[int, str]]:
@@ -257,7 +267,7 @@ def _by_numbers(numbered: Mapping[tuple[str, ...], Mapping[int, str]], n: int) -
     for terms, columns in numbered.items():
         numbers = sorted(columns)
         if len(numbers) == n and numbers[0] in (0, 1) and numbers[-1] - numbers[0] == n - 1:
-            result.append(JointSeries(tuple(columns[number] for number in numbers), terms))
+            result.append(JointSeries(tuple(map(columns.__getitem__, numbers)), terms))
     return result
 
 

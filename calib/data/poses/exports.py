@@ -169,7 +169,7 @@ def unnamed_table(path: str | Path) -> Table | None:
     lines = content.decode(encoding, errors="replace").splitlines()
     rows = [row for row in _rows(lines[grid.first :], grid) if len(row) == len(grid.cells)]
     header = tuple(f"column {number + 1}" for number in range(len(grid.cells)))
-    cells = [as_column(column) for column in zip(*rows)]
+    cells = list(map(as_column, zip(*rows)))
     numbers = frozen(np.arange(1, len(rows) + 1), int)
     return Table(str(path), header, ("",) * len(header), tuple(cells), numbers, _left_out(lines, grid))
 
@@ -328,7 +328,7 @@ def _headings(grid: Grid) -> tuple[str, ...]:
     headings = grid.above[-1]
     width = len(grid.cells)
     is_named = sum(map(bool, headings)) > width / 2 and sum(_numeric(headings, grid.mark)) <= width / 2
-    return headings if is_named else ()
+    return headings * is_named
 
 
 def _named_by_comment(lines: Sequence[str], grid: Grid) -> bool:
@@ -353,7 +353,7 @@ def _left_out(lines: Sequence[str], grid: Grid) -> tuple[str, ...]:
         grid: position of the numbers in the text.
     """
     indices = [index for index, line in enumerate(lines[: grid.first]) if _is_content(line)]
-    understood = 1 if _headings(grid) else 0
+    understood = int(bool(_headings(grid)))
     if grid.above and all(cell.lower() in UNITS for cell in grid.above[-1] if cell):
         understood = 2
     titles = []
@@ -383,7 +383,7 @@ def _number_count(line: str, grid: Grid) -> int:
     if not _is_content(line):
         return 0
     count = sum(_numeric(_split(line, grid.separator), grid.mark))
-    return count if count >= max(MIN_NUMBERS, sum(grid.numeric)) else 0
+    return count * (count >= max(MIN_NUMBERS, sum(grid.numeric)))
 
 
 def _is_ours(names: Sequence[str]) -> bool:

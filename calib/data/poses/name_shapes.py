@@ -10,11 +10,13 @@ import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import filterfalse
+from operator import attrgetter
 
 import numpy as np
 
 from calib.data.csv_table import Table
-from calib.data.joint_columns import COMMANDED_WORDS, OTHER_WORDS, words_of
+from calib.data.joint_columns import COMMANDED_WORDS, OTHER_WORDS, parted, words_of
 from calib.data.poses.fit_options import FileOptions
 from calib.data.schema import BOUNDS
 
@@ -69,7 +71,7 @@ def positions_by_shape(names: Sequence[str]) -> list[Shape]:
     shapes = []
     for (terms, _), columns in _by_axis(names).items():
         if ORIENTATION_WORDS.isdisjoint(terms) and "w" not in columns and set(AXES) <= columns.keys():
-            shapes.append(Shape({axis: columns[axis] for axis in AXES}, terms))
+            shapes.append(Shape(_picked(columns, AXES, AXES), terms))
     for terms, columns in _numbered(names, PLACE_WORDS - {"p", "t", "d"}, 3).items():
         shapes.append(Shape(dict(zip(AXES, columns)), terms))
     return _measured(shapes)
@@ -84,11 +86,11 @@ def orientations_by_shape(names: Sequence[str]) -> list[Shape]:
     shapes = []
     for (terms, _), columns in _by_axis(names).items():
         if set("xyzw") <= columns.keys():
-            shapes.append(Shape({f"q{axis}": columns[axis] for axis in "xyzw"}, terms))
+            shapes.append(Shape(_picked(columns, QUATERNION, "xyzw"), terms))
         elif set(AXES) <= columns.keys() and not ORIENTATION_WORDS.isdisjoint(terms):
-            shapes.append(_angles([columns[axis] for axis in AXES], terms))
+            shapes.append(_angles(columns, AXES, terms))
     for terms, columns in _numbered(names, ORIENTATION_WORDS - QUATERNION_WORDS, 3).items():
-        shapes.append(_angles(columns, terms))
+        shapes.append(_angles(dict(zip(AXES, columns)), AXES, terms))
     for angle_names in ANGLE_NAMES:
         shapes += _named_angles(names, angle_names)
     return _measured(shapes)
@@ -116,10 +118,9 @@ def matrices_by_shape(table: Table, names: Sequence[str]) -> list[Shape]:
     """
     elements: dict[tuple[str, ...], dict[tuple[int, int], str]] = {}
     for name in names:
-        terms = words_of(name)
-        digits = "".join(term for term in terms if term.isdigit())
+        numbers, beside = parted(words_of(name))
+        digits = "".join(numbers)
         if len(digits) == 2:
-            beside = tuple(term for term in terms if not term.isdigit())
             elements.setdefault(beside, {}).setdefault((int(digits[0]), int(digits[1])), name)
     shapes = []
     for terms, columns in elements.items():
@@ -140,8 +141,10 @@ def _by_axis(names: Iterable[str]) -> dict[tuple[tuple[str, ...], str], Mapped]:
     """
     result: dict[tuple[tuple[str, ...], str], Mapped] = {}
     for name in names:
-        terms = [term for term in words_of(name) if term not in UNIT_WORDS]
-        number = terms.pop() if len(terms) > 1 and terms[-1].isdigit() else ""
+        terms = list(filterfalse(UNIT_WORDS.__contains__, words_of(name)))
+        number = ""
+        if len(terms) > 1 and terms[-1].isdigit():
+            number = terms.pop()
         axis, beside = _axis(terms)
         if axis and REJECTED_WORDS.isdisjoint(beside):
             result.setdefault((beside, number), {}).setdefault(axis, name)
@@ -154,9 +157,9 @@ def _axis(terms: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     Args:
         terms: words of a column's name.
     """
-    axes = [term for term in terms if term in ("x", "y", "z", "w")]
+    axes = list(filter(("x", "y", "z", "w").__contains__, terms))
     if len(axes) == 1:
-        return axes[0], tuple(term for term in terms if term != axes[0])
+        return axes[0], tuple(filterfalse(axes.__contains__, terms))
     if axes or not terms:
         return "", ()
     match = _GLUED.fullmatch(terms[-1])
@@ -179,9 +182,7 @@ def _numbered(names: Iterable[str], stems: Collection[str], size: int) -> dict[t
     """
     numbered: dict[tuple[str, ...], dict[int, str]] = {}
     for name in names:
-        terms = words_of(name)
-        digits = [term for term in terms if term.isdigit()]
-        beside = tuple(term for term in terms if not term.isdigit())
+        digits, beside = parted(words_of(name))
         if len(digits) == 1 and beside and REJECTED_WORDS.isdisjoint(beside):
             numbered.setdefault(beside, {}).setdefault(int(digits[0]), name)
     result = {}
@@ -189,7 +190,7 @@ def _numbered(names: Iterable[str], stems: Collection[str], size: int) -> dict[t
         numbers = sorted(columns)
         in_sequence = len(numbers) == size and numbers[0] in (0, 1) and numbers[-1] - numbers[0] == size - 1
         if in_sequence and (not stems or not set(stems).isdisjoint(terms)):
-            result[terms] = [columns[number] for number in numbers]
+            result[terms] = list(map(columns.__getitem__, numbers))
     return result
 
 
@@ -207,18 +208,23 @@ def _named_angles(names: Sequence[str], angle_names: tuple[str, ...]) -> list[Sh
             continue
         for angle in angle_names:
             if terms.count(angle) == 1:
-                beside = tuple(term for term in terms if term != angle and term not in UNIT_WORDS)
+                beside = tuple(filterfalse({angle, *UNIT_WORDS}.__contains__, terms))
                 by_words.setdefault(beside, {}).setdefault(angle, name)
     shapes = []
     for terms, columns in by_words.items():
         if len(columns) == 3 and REJECTED_WORDS.isdisjoint(terms):
-            shapes.append(_angles([columns[angle] for angle in angle_names], terms))
+            shapes.append(_angles(columns, angle_names, terms))
     return shapes
 
 
-def _angles(columns: Sequence[str], terms: tuple[str, ...]) -> Shape:
+def _picked(columns: Mapping[str, str], standard_names: Iterable[str], keys: Iterable[str]) -> Mapped:
+    """Return the toolkit's names → the columns with these keys, in their order."""
+    return dict(zip(standard_names, map(columns.__getitem__, keys)))
+
+
+def _angles(columns: Mapping[str, str], keys: Iterable[str], terms: tuple[str, ...]) -> Shape:
     euler = "" if VECTOR_WORDS.isdisjoint(terms) else "vector"
-    return Shape(dict(zip(ANGLES, columns)), terms, euler)
+    return Shape(_picked(columns, ANGLES, keys), terms, euler)
 
 
 def _matrix(elements: Mapping[tuple[int, int], str], terms: tuple[str, ...]) -> list[Shape]:
@@ -237,7 +243,9 @@ def _matrix(elements: Mapping[tuple[int, int], str], terms: tuple[str, ...]) -> 
     for i, axis in enumerate(AXES):
         if (i, 3) in elements:
             columns[axis] = elements[i, 3]
-    return [Shape(columns, terms)] if len(columns) in (9, 12) else []
+    if len(columns) not in (9, 12):
+        return []
+    return [Shape(columns, terms)]
 
 
 def _flat_matrix(table: Table, columns: Sequence[str], width: int, terms: tuple[str, ...]) -> list[Shape]:
@@ -262,8 +270,8 @@ def _flat_matrix(table: Table, columns: Sequence[str], width: int, terms: tuple[
             order = np.arange(len(columns)).reshape(width, rows).T
         matrices = numbers[:, order[:3, :3]]
         defect = np.abs(matrices @ np.swapaxes(matrices, 1, 2) - np.eye(3)).max()
-        last_row = numbers[:, order[3]] if rows == 4 else np.array([0.0, 0.0, 0.0, 1.0])
-        is_pose = np.abs(last_row - [0.0, 0.0, 0.0, 1.0]).max() < BOUNDS.max_norm_error
+        last_row = numbers[:, order[3:].ravel()]
+        is_pose = rows < 4 or np.abs(last_row - [0.0, 0.0, 0.0, 1.0]).max() < BOUNDS.max_norm_error
         if math.isfinite(defect) and defect < 2 * BOUNDS.max_norm_error and is_pose:
             elements = {(i, j): columns[order[i, j]] for i in range(rows) for j in range(width)}
             return _matrix(elements, terms)
@@ -272,7 +280,7 @@ def _flat_matrix(table: Table, columns: Sequence[str], width: int, terms: tuple[
 
 def _measured(shapes: Sequence[Shape]) -> list[Shape]:
     """Return the shapes that were not commanded; all of them if there are no others."""
-    return [shape for shape in shapes if not shape.is_commanded] or list(shapes)
+    return list(filterfalse(attrgetter("is_commanded"), shapes)) or list(shapes)
 
 
 def with_shape(options: FileOptions, shape: Shape) -> FileOptions:

@@ -58,23 +58,29 @@ def _placeholders(table: Table, names: Sequence[str], orientation: Sequence[str]
         orientation: the names of the orientation's columns; () without one.
         single: whether the table has no other target, so that an empty position is a row without measurement.
     """
-    columns = [table.cells[table.index(name)] for name in names]
-    if all(column.dtype == float for column in columns):
+    columns, are_numbers = _cells(table, names)
+    if are_numbers:
         x, y, z = columns
         unseen = (x == y) & (y == z) & (np.abs(x) >= MIN_PLACEHOLDER)
         if single:
             unseen |= np.isnan(x) & np.isnan(y) & np.isnan(z)
-        turns = [table.cells[table.index(name)] for name in orientation]
-        if turns and all(column.dtype == float for column in turns):
+        turns, are_numbers = _cells(table, orientation)
+        if turns and are_numbers:
             unseen |= ~np.any([*columns, *turns], axis=0)
         return unseen
-    texts = [table.texts(name) for name in names]
+    texts = list(map(table.texts, names))
     unseen = []
     for x, y, z in zip(*texts):
         empty = x in ("", "nan")
         marked = not empty and not x.startswith(ERRORS) and _is_mark(x)
         unseen.append(x == y == z and (marked or (empty and single)))
     return np.array(unseen)
+
+
+def _cells(table: Table, names: Sequence[str]) -> tuple[list[np.ndarray], bool]:
+    """Return the cells of columns, and whether all of them are numbers or empty."""
+    columns = [table.cells[table.index(name)] for name in names]
+    return columns, all(column.dtype == float for column in columns)
 
 
 def _is_mark(text: str) -> bool:

@@ -21,6 +21,7 @@ columns of padding, joints [deg] last; 18 to 21 columns for six joints. A reflec
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -65,8 +66,8 @@ def _is_robodk(header: Sequence[str]) -> bool:
     """
     if not recognises(header) or (len(header) > WIDTHS[0] and len(header) not in WIDTHS):
         return False
-    term_lists = [words_of(name) for name in header[6:]]
-    if any(not COMMANDED_WORDS.isdisjoint(name) for name in term_lists):
+    term_lists = list(map(words_of, header[6:]))
+    if not COMMANDED_WORDS.isdisjoint(chain(*term_lists)):
         return False
     is_pose = len(header) == WIDTHS[-1] or _plain("".join(header[9:10])) in _POSE_MARKS
     axes = "xyz" if is_pose else "xyzxyz"

@@ -5,7 +5,6 @@ write rad and m: where most rows are impossible in SI, the columns are deg or mm
 its unit as a word (``x_mm``, ``J1 deg``).
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -70,7 +69,7 @@ def _with_units_of_names(sheet: Sheet, layout: Layout) -> Sheet:
     units = dict(sheet.options.units)
     for names, family in families:
         for name in names:
-            terms = [term for term in words_of(name) if term in WORD_UNITS]
+            terms = list(filter(WORD_UNITS.__contains__, words_of(name)))
             if len(terms) == 1 and not sheet.unit(name, family):
                 units[name] = terms[0]
     return replace(sheet, options=replace(sheet.options, units=units))
@@ -98,8 +97,8 @@ def _travel(robot: Joints) -> float:
     travel = 0.0
     for kind, lower, upper in zip(robot.kinds, robot.lower, robot.upper):
         if kind == "prismatic":
-            travel = max(travel, abs(lower), abs(upper))
-    return travel + BOUNDS.limit_slack if math.isfinite(travel) else BOUNDS.max_length
+            travel = np.maximum(travel, max(abs(lower), abs(upper)))
+    return float(np.fmin(travel + BOUNDS.limit_slack, BOUNDS.max_length))
 
 
 def _share_above(sheet: Sheet, names: Sequence[str], limit: float) -> float:
@@ -113,7 +112,7 @@ def _share_above(sheet: Sheet, names: Sequence[str], limit: float) -> float:
     columns = [np.abs(sheet.table.numbers(name, None, gaps=True)) for name in names]
     largest = np.max(np.stack(columns), axis=0)
     largest = largest[np.isfinite(largest)]
-    return float(np.mean(largest > limit)) if len(largest) else 0.0
+    return float(np.sum(largest > limit)) / max(len(largest), 1)
 
 
 def _ask_for_angles(sheet: Sheet, layout: Layout, turning: Sequence[str]) -> None:

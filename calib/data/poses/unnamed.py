@@ -64,7 +64,9 @@ def arrangements(path: str | Path, joints: int, options: FileOptions) -> tuple[T
         for index, name in enumerate(table.header):
             heading[index] = heading[index] or name
         choices[",".join(heading)] = replace(options, columns={**columns, **options.columns})
-    return (table, choices) if choices else None
+    if not choices:
+        return None
+    return table, choices
 
 
 def _orders(table: Table, numbers: Sequence[str], joints: int) -> Iterator[dict[str, str]]:

@@ -6,6 +6,7 @@ not seen: `without_unseen` leaves them out of a fit.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 
@@ -73,7 +74,7 @@ def repeated_readings(nominal: Installation, blocks: Sequence[PoseMeasurements])
         if isinstance(block, Positions) and len(block) > 1:
             copies = _copies(block)
             copied = {entry.second for entry in copies}
-            findings += [_says_copies(block, entry) for entry in copies]
+            findings += map(partial(_says_copies, block), copies)
             findings += [
                 _says_repeated(block, entry) for entry in _repeated(nominal, block) if entry.tool not in copied
             ]
@@ -120,7 +121,7 @@ def _seen(block: Positions, visible: np.ndarray) -> Positions:
     """
     remainder = take(block, np.flatnonzero(visible))
     targets = np.unique(remainder.tool)
-    names = tuple(block.tool_names[tool] for tool in targets)
+    names = tuple(map(block.tool_names.__getitem__, targets))
     return replace(remainder, tool=np.searchsorted(targets, remainder.tool), tool_names=names)
 
 
@@ -234,7 +235,9 @@ def _repeated(nominal: Installation, block: Positions) -> list[Repeated]:
 
 
 def _says_copies(block: Positions, copies: Copies) -> Finding:
-    rows = [str(row) for row in copies.rows] if len(copies.rows) < copies.common else []
+    rows = []
+    if len(copies.rows) < copies.common:
+        rows = list(map(str, copies.rows))
     values = {
         "name": block.tool_names[copies.second],
         "other": block.tool_names[copies.first],
@@ -247,7 +250,7 @@ def _says_copies(block: Positions, copies: Copies) -> Finding:
 
 def _says_repeated(block: Positions, repeated: Repeated) -> Finding:
     index = list(repeated.index)
-    rows = [str(row) for row in block.rows[index]]
+    rows = list(map(str, block.rows[index].tolist()))
     reading_mm = [f"{1e3 * axis:.6g}" for axis in block.position[index[0]]]
     name = block.tool_names[repeated.tool]
     return finding("reading-repeated", file=_name(block), name=name, rows=rows, value=reading_mm, apart=repeated.apart)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.images.pixels import Pixels
+from calib.data.joint_columns import joints_in
 from calib.data.poses import JOINTS, is_image_folder
 from calib.data.poses.columns import Undecided
 from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
@@ -274,6 +275,8 @@ def load_robot(
         header = joint_columns(table)
         columns = dict.fromkeys([*header, *options.for_file(measured).columns])
         names = [column for column in columns if column in joints and joints[column].actuated]
+        if not names:
+            names = joints_in(header, [name for name, joint in joints.items() if joint.actuated])
         # numbered columns hold more joints than are named
         if f"q{len(names) + 1}" in header:
             names = []
