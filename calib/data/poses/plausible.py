@@ -82,6 +82,32 @@ def _turns_beyond(value: float, lower: float, upper: float) -> int:
     return turns if inside else 0
 
 
+def within_limits(q: np.ndarray, robot: Joints, columns: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return joint values (m, n) [rad or m] with those outside their limits moved by a turn, and notes.
+
+    Controllers show a joint as 0 to 360° or as -180 to 180°. A column is changed only if a turn brings all of its
+    values within the limits.
+
+    Args:
+        q: the joint values.
+        robot: types and limits of the joints.
+        columns: the file's names of the joint columns.
+    """
+    exceeds = outside(q, robot.lower, robot.upper)
+    turns = np.where(q > robot.upper, -1, 1) * 2.0 * math.pi
+    turned = np.where(exceeds, q + turns, q)
+    notes = []
+    result = q.copy()
+    for j in np.flatnonzero(exceeds.any(axis=0) & ~outside(turned, robot.lower, robot.upper).any(axis=0)).tolist():
+        if robot.kinds[j] != "prismatic":
+            result[:, j] = turned[:, j]
+            count = int(exceeds[:, j].sum())
+            notes.append(
+                f"{columns[j]} is outside its limits in {count} of {len(q)} rows, and within them by a turn: read so"
+            )
+    return result, tuple(notes)
+
+
 def outside(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Return which joint values (m, n) exceed their limits (n,) by more than an encoder's error, (m, n) bool.
 

@@ -435,6 +435,7 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
     for name, rows in validation.items():
         noticed += filter(level_of, _references(name, rows, deliverable, frames_only))
     noticed += findings.noticed
+    noticed += inputs.noticed
     copies = _copies(inputs)
     if copies:
         noticed.append(finding("not-unseen", files=copies))
