@@ -8,6 +8,7 @@ from calib.data.poses.fit_options import EULER, FileOptions, FitOptions
 from calib.data.poses.fit_options import parse_options as parse_fit_options
 from calib.data.poses.fit_options import read_options as read_fit_options
 from calib.data.poses.measurements import PoseMeasurements, Positions, take
+from calib.data.poses.name_shapes import positions_by_shape
 from calib.data.poses.plausible import check_joints, orientation, outside, unit_quaternions
 from calib.data.poses.pose_files import read_measurements
 from calib.data.poses.pose_lists import Targets, read_poses, read_targets
@@ -41,6 +42,7 @@ __all__ = [
     "outside",
     "parse_fit_options",
     "plain_rows",
+    "positions_by_shape",
     "read_fit_options",
     "read_header",
     "read_measurements",

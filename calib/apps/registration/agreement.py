@@ -12,7 +12,7 @@ are compared by these angles first; those that agree are placed (Shah 2013) and 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -20,27 +20,24 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import refuse_data
 from calib.records import evenly
-from calib.toolkit.installations import misfit, place_pose
-from calib.toolkit.pose_pairs import PoseList, PosePairs, poses_of
+from calib.toolkit.installations import direction, median_misfit
+from calib.toolkit.pose_pairs import MAX_METRES, PoseList, PosePairs, poses_of
 from calib.transforms import invert
-from calib.units import DEG
+from calib.units import DEG, LENGTHS
 
 # Largest number of samples by which readings are compared.
 MAX_ROWS = 60
 # Fewest samples that tell open conventions apart.
 MIN_ROWS = 5
-# Largest median difference of relative rotations [rad] with which a stated convention is not questioned: a detector's
-# orientations of small boards are that wrong.
-STATED_GAP = 3.0 * DEG
 # Largest difference of relative rotations [rad], and largest ratio to the smallest, of readings that are placed.
 MAX_GAP = 1.0 * DEG
 GAP_RATIO = 3.0
 # Largest number of readings that are placed.
 MAX_PLACED = 24
-# Length by which angles are multiplied to compare them with distances [m/rad].
-LEVER = 0.3
 # Smallest ratio of misfits at which the better of two readings is taken.
 CLEAR_RATIO = 2.5
+# Units in which lengths may be meant.
+UNITS = ("m", "cm", "mm", "in")
 # Difference of orientations [rad] below which two readings are one.
 SAME = 1e-6
 
@@ -52,14 +49,12 @@ class Reading:
     Attributes:
         robot, seen: (m, 4, 4) poses of the robot and of what was seen.
         conventions: conventions of both orientations; empty where there is nothing to choose.
-        inverse: whether the poses that were seen agree as their inverse.
         misfit: median misfit, angles included [m].
     """
 
     robot: np.ndarray
     seen: np.ndarray
     conventions: tuple[str, str]
-    inverse: bool
     misfit: float
 
     def equals(self, other: Reading) -> bool:
@@ -87,18 +82,20 @@ def agreed(pairs: PosePairs) -> tuple[Reading, list[str]]:
     choices = list(_choices(robot_turns, seen_turns, rows))
     stated = pairs.robot.convention, pairs.seen.convention
     is_stated = _states(pairs.robot) and _states(pairs.seen)
-    if is_stated and choices[0][0] < STATED_GAP:
-        choices = choices[:1]
+    first = choices[0]
     smallest = min(gap for gap, _ in choices)
     limit = max(MAX_GAP, GAP_RATIO * smallest)
     likely = sorted((choice for choice in choices if choice[0] <= limit), key=lambda choice: choice[0])
     readings = []
-    for _, names in likely[:MAX_PLACED]:
+    for _, names in dict.fromkeys([first, *likely[:MAX_PLACED]]):
         robot = poses_of(robot_position, robot_turns[names[0]])
         seen = poses_of(seen_position, seen_turns[names[1]])
         readings.append(_placed(robot, seen, names, rows))
+    as_stated = readings[0]
     readings.sort(key=lambda reading: reading.misfit)
     best = readings[0]
+    if is_stated and as_stated.misfit <= CLEAR_RATIO * best.misfit:
+        return _in_likely_unit(pairs, as_stated, notes), notes
     others = [reading for reading in readings[1:] if not reading.equals(best)]
     if others and not is_stated:
         _check_clear(pairs, best, others[0])
@@ -106,8 +103,33 @@ def agreed(pairs: PosePairs) -> tuple[Reading, list[str]]:
         if convention and convention != name:
             notes.append(
                 f"{poses.name or 'poses'}: the orientation is read as {convention}, with which the poses agree"
+                f"{f' ({name} is stated)' if name else ''}"
             )
-    return best, notes
+    return _in_likely_unit(pairs, best, notes), notes
+
+
+def _in_likely_unit(pairs: PosePairs, reading: Reading, notes: list[str]) -> Reading:
+    """Return a reading with the lengths of the poses seen in the unit with which they agree, where none is stated.
+
+    Args:
+        pairs: the pairs.
+        reading: their reading.
+        notes: remarks, to which that on the unit is added.
+    """
+    if pairs.seen.length_unit or len(pairs) < MIN_ROWS or direction(reading.robot, reading.seen).agrees:
+        return reading
+    read_unit = "m" if np.abs(pairs.seen.position).max() <= MAX_METRES else "mm"
+    for unit in UNITS:
+        factor = LENGTHS[unit] / LENGTHS[read_unit]
+        seen = reading.seen.copy()
+        seen[:, :3, 3] *= factor
+        ways = direction(reading.robot, seen)
+        if unit != read_unit and ways.agrees and ways.is_inverse is not None:
+            name = pairs.seen.name or "poses"
+            notes[:] = [note for note in notes if not note.startswith(f"{name}: up to")]
+            notes.append(f"{name}: the lengths are read as {unit}, with which the poses agree (no unit is stated)")
+            return replace(reading, seen=seen)
+    return reading
 
 
 def _states(poses: PoseList) -> bool:
@@ -137,20 +159,10 @@ def _relative_angles(turns: np.ndarray) -> np.ndarray:
 
 
 def _placed(robot: np.ndarray, seen: np.ndarray, names: tuple[str, str], rows: np.ndarray) -> Reading:
-    """Return a reading with the direction of the poses seen in which they agree better."""
+    """Return a reading with its misfit in the direction of the poses seen in which they agree better."""
     direct = median_misfit(robot[rows], seen[rows])
     inverse = median_misfit(robot[rows], invert(seen[rows]))
-    return Reading(robot, seen, names, inverse < direct, min(direct, inverse))
-
-
-def median_misfit(robot: np.ndarray, seen: np.ndarray) -> float:
-    """Return the median misfit [m] of poses B_i = S A_i X with the best S and X, angles included.
-
-    Args:
-        robot: (m, 4, 4) A_i.
-        seen: (m, 4, 4) B_i.
-    """
-    return float(np.median(misfit(robot, seen, *place_pose(robot, seen), LEVER)))
+    return Reading(robot, seen, names, min(direct, inverse))
 
 
 def _check_clear(pairs: PosePairs, best: Reading, second: Reading) -> None:

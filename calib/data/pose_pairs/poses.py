@@ -123,7 +123,7 @@ class PoseList:
     def frames(self) -> tuple[frozenset[str], frozenset[str]]:
         """Words for the frame whose pose this is, and for the frame in which it is; empty where the name says none."""
         of, frame = _direction(self.name)
-        return frozenset(re.split(r"[^a-z]+", of)), frozenset(re.split(r"[^a-z]+", frame))
+        return frozenset(re.findall(r"[a-z]+", of)), frozenset(re.findall(r"[a-z]+", frame))
 
     @property
     def kind(self) -> str:

@@ -45,11 +45,11 @@ COMPONENTS |= {f"q{_axis}": ("quaternion", _number) for _number, _axis in enumer
 COMPONENTS |= {name: ("xyz fixed", number) for number, name in enumerate(("roll", "pitch", "yaw"))}
 COMPONENTS |= {name: ("zyx moving", number) for number, name in enumerate("abc")}
 COMPONENTS |= {name: ("wpr", number) for number, name in enumerate("wpr")}
-for _row in range(3):
-    for _column in range(3):
-        COMPONENTS[f"r{_row + 1}{_column + 1}"] = ("matrix", 3 * _row + _column)
-        COMPONENTS[f"r{_row}{_column}"] = ("matrix from 0", 3 * _row + _column)
-SIZES = {"position": 3, "quaternion": 4, "matrix": 9, "matrix from 0": 9}
+# r11 to r33, or r00 to r22
+for _row in range(4):
+    for _column in range(4):
+        COMPONENTS[f"r{_row}{_column}"] = ("matrix", 10 * _row + _column)
+SIZES = {"position": 3, "quaternion": 4, "matrix": 9}
 # Quantities whose name says the convention of their angles.
 CONVENTIONS = ("vector", "xyz fixed", "zyx moving", "wpr")
 # Fewest further columns that count as those of joints.
@@ -121,9 +121,9 @@ def component(name: str) -> tuple[str, str, int] | None:
         words.pop()
     if not words:
         return None
-    for last in (len(words) - 1, 0):
-        rest = words[:last] + words[last + 1 :]
-        split = _component_of_word(words[last], rest)
+    for index in dict.fromkeys([len(words) - 1, *range(len(words))]):
+        rest = words[:index] + words[index + 1 :]
+        split = _component_of_word(words[index], rest)
         if split is not None:
             quantity, number = split
             named = [word for word in rest if word not in POSITION_WORDS | TURN_WORDS | POSE_WORDS]

@@ -15,6 +15,8 @@ from calib.errors import MeasurementError
 SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".samples")
 # Least number of samples that are a list of poses rather than one pose.
 MIN_SAMPLES = 2
+# Largest number of keys of a table that is a list of poses with a header.
+MAX_KEYS = 2
 # Deepest nesting that is searched.
 MAX_DEPTH = 12
 POSITION_KEYS = ("translation", "position", "trans", "tvec", "t", "xyz", "origin", "p", "pos", "location")
@@ -133,7 +135,11 @@ def _of_parallel(node: Mapping[str, object]) -> list[PoseList]:
     table = _without_numbers(node)
     lists = []
     parts: dict[str, dict[str, tuple[np.ndarray, str]]] = {}
-    for key, value in table.items():
+    for key, content in table.items():
+        value = content
+        if isinstance(content, Mapping) and len(content) <= MAX_KEYS:
+            # the poses of a PoseArray, with its header beside them
+            value = next((entry for entry in content.values() if isinstance(entry, list)), content)
         if not isinstance(value, list) or len(value) < MIN_SAMPLES:
             continue
         poses = [pose_of(entry) for entry in value]

@@ -6,6 +6,7 @@ A CSV table has one column of stamps, one per joint and quantity (``q1 [deg]``, 
 bags hold: ``calib formats logs``.
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -15,6 +16,7 @@ import numpy as np
 
 from calib.controllers.table import as_described, motors_as_described
 from calib.data.csv_table import Table, read_table
+from calib.data.joint_columns import words_of
 from calib.data.recordings import log_columns
 from calib.data.recordings.archives import read_archive
 from calib.data.recordings.checks import check_recording
@@ -37,6 +39,8 @@ from calib.files import check_regular
 from calib.records import FieldValues
 from calib.units import TIMES
 
+_LOG = logging.getLogger(__name__)
+NO_JOINTS = Joints(())
 # What a note says of columns without any number.
 ABSENT = "not provided, NaN or empty in every row"
 
@@ -53,9 +57,10 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
         ends: begin and end of the part to read; None: no bound.
     """
     table = _numbered_brackets(read_table(path, doubles=True))
-    joint_names = joints.names if joints else ()
-    columns_of, column_notes = _find_columns(table, options, joint_names)
-    advice = _advice(table, columns_of, joint_names)
+    robot_joints = joints or NO_JOINTS
+    joint_names = robot_joints.names
+    columns_of, column_notes = _find_columns(table, options, robot_joints)
+    advice = _advice(table, columns_of, robot_joints)
     renamed = one_effort({name: name for name in columns_of}, options, table.header, path, advice)
     columns_of = {name: columns_of[file_name] for name, file_name in renamed.items()}
     n = len(columns_of["q"])
@@ -87,7 +92,7 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
     unused = [column for column in range(len(table.header)) if column not in read_columns]
     notes = [*table.notes, *column_notes, *time_notes, *row_notes, *notes]
     if unused:
-        notes.append(f"not read: {', '.join(log_columns.condensed(table.header, joint_names, unused))}")
+        notes.append(f"not read: {', '.join(log_columns.condensed(table.header, robot_joints, unused))}")
     by_words = any(note.startswith("read as columns") for note in column_notes)
     for name, columns in columns_of.items():
         if not by_words and stem_of(table.header[columns[0]])[0].startswith(MEASURED):
@@ -118,7 +123,7 @@ def read_positions(path: Path, joints: Joints, options: RecordingOptions) -> tup
     """
     table = _numbered_brackets(read_table(path, doubles=True))
     names = {key: name for key, name in options.names.items() if key in ("t", "q", "q_ref")}
-    columns_of, _ = _find_columns(table, replace(options, names=names), joints.names)
+    columns_of, _ = _find_columns(table, replace(options, names=names), joints)
     name = "q_ref" if "q_ref" in columns_of else "q"
     if name not in columns_of:
         expected = ", ".join((*SYNONYMS["q_ref"], *SYNONYMS["q"]))
@@ -140,9 +145,7 @@ def _numbered_brackets(table: Table) -> Table:
     return replace(table, header=tuple(header), units=tuple(units))
 
 
-def _find_columns(
-    table: Table, options: RecordingOptions, joints: Sequence[str]
-) -> tuple[dict[str, list[int]], list[str]]:
+def _find_columns(table: Table, options: RecordingOptions, joints: Joints) -> tuple[dict[str, list[int]], list[str]]:
     """Return the column indices of each series, in the robot's joint order, by the toolkit's name, and notes.
 
     Columns that are NaN in every row count as not provided.
@@ -158,7 +161,9 @@ def _find_columns(
     for name, synonyms in SYNONYMS.items():
         while name not in columns_of:
             provided = replace(table, header=tuple(header))
-            columns = _stamp_column(provided, synonyms) if name == "t" else _joint_columns(provided, synonyms, joints)
+            columns = (
+                _stamp_column(provided, synonyms) if name == "t" else _joint_columns(provided, synonyms, joints.names)
+            )
             if not columns:
                 break
             if name == "t" or not _all_nan(table, columns):
@@ -172,9 +177,9 @@ def _find_columns(
     by_words = {name: family for name, family in by_series.items() if name not in columns_of}
     columns_of |= {name: list(family.columns) for name, family in by_words.items()}
     for family in candidates:
-        # a table of joints' names alone: what its file's name says, else positions
-        series = log_columns.series_of(Path(table.file).stem) or "q"
-        if family.pattern == log_columns.JOINT and series not in columns_of:
+        # names of joints alone: what the file's name says, else positions
+        series = log_columns.series_of(words_of(Path(table.file).stem)) or "q"
+        if family.plain and series not in columns_of:
             columns_of[series] = list(family.columns)
             by_words[series] = family
     if "t" not in columns_of:
@@ -184,8 +189,10 @@ def _find_columns(
     if by_words or options.columns or options.names:
         notes.append(f"read as {log_columns.mapping_line(table.header, joints, columns_of)}")
         by_topic = [family.pattern for family in by_words.values() if family.pattern.startswith("/")]
-        if joints and any(log_columns.NUMBER in pattern for pattern in by_topic):
-            notes.append(f"numbers are taken for {', '.join(joints)} in this order: is it the order of the message?")
+        if any(log_columns.NUMBER in pattern for pattern in by_topic):
+            notes.append(
+                f"numbers are taken for {', '.join(joints.names)} in this order: is it the order of the message?"
+            )
     if by_words and rivals:
         notes.append(f"also there, not read: {', '.join(rivals)}")
     return columns_of, notes
@@ -204,11 +211,11 @@ def _hide(header: list[str], columns: Sequence[int]) -> str:
     """Replace the headings of columns that the logger did not provide by unique blanks; return a note on them."""
     headings = ", ".join(header[column] for column in columns)
     for column in columns:
-        header[column] = f"\0{column}"
+        header[column] = "\0" * (column + 1)
     return f"{ABSENT}: {headings}"
 
 
-def _stated_columns(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dict[str, list[int]]:
+def _stated_columns(table: Table, options: RecordingOptions, joints: Joints) -> dict[str, list[int]]:
     """Return the column indices of the series that the options name.
 
     Args:
@@ -219,7 +226,11 @@ def _stated_columns(table: Table, options: RecordingOptions, joints: Sequence[st
     columns_of: dict[str, list[int]] = {}
     of_series = {key: heading for key, heading in options.columns.items() if key in SYNONYMS}
     for name, heading in {**options.names, **of_series}.items():
-        columns = _stamp_column(table, [heading]) if name == "t" else _joint_columns(table, [heading], joints)
+        columns: list[int] = []
+        if name == "t":
+            columns = _stamp_column(table, [heading])
+        elif "{" not in heading:
+            columns = _joint_columns(table, [heading], joints.names)
         columns = columns or list(log_columns.stated(heading, table.header, joints))
         if not columns:
             near = log_columns.near_names(heading, table.header, joints)
@@ -231,7 +242,7 @@ def _stated_columns(table: Table, options: RecordingOptions, joints: Sequence[st
     return columns_of
 
 
-def _advice(table: Table, columns_of: dict[str, list[int]], joints: Sequence[str]) -> str:
+def _advice(table: Table, columns_of: dict[str, list[int]], joints: Joints) -> str:
     """Return advice for a table without positions or without torques: a line to paste, or to join two files.
 
     Args:
@@ -246,7 +257,7 @@ def _advice(table: Table, columns_of: dict[str, list[int]], joints: Sequence[str
     read_columns: set[int] = set()
     for columns in columns_of.values():
         read_columns.update(columns)
-    header = [f"\0{column}" if column in read_columns else name for column, name in enumerate(table.header)]
+    header = ["\0" * (column + 1) if column in read_columns else name for column, name in enumerate(table.header)]
     line = log_columns.paste(header, joints, needed)
     if line:
         return f". If these are meant, state them in the options (--options FILE), joints in this order: {line}"
@@ -393,6 +404,9 @@ def read_recording(
         check_units(name, [unit] * len(joints.names if joints else ()), joints, file)
     reader = _reader(Path(file), (start, stop))
     recording = _described(reader(Path(file), joints, options), options.controller)
+    for note in recording.notes:
+        if note.startswith("read as"):
+            _LOG.info("%s: %s", Path(file).name, note)
     if (start, stop) != (None, None):
         recording = recording.cut(start, stop)
     recording = in_pieces(recording, options.samples)

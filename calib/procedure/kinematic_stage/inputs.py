@@ -15,7 +15,8 @@ from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, MeasurementError, UsageError, require
 from calib.extensions import Point
-from calib.geometry.first_guess import as_seen_by_instrument, check_orientations, check_scale
+from calib.geometry.checks.pose_direction import as_seen_by_instrument
+from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
 from calib.geometry.repeatability import repeated, repeated_rows, without_copies
