@@ -43,6 +43,9 @@ if TYPE_CHECKING:
     from calib.results.result import Result
     from calib.results.result_classes import open_result
     from calib.robot.calibrated import CalibratedChain
+    from calib.simulation.cell import SimulatedInstrument
+    from calib.simulation.population import PlantedArm, population
+    from calib.simulation.virtual_cells import PlantedErrors
 
 # names that `import calib` provides, and their modules, which are loaded at first use to keep `calib --help` fast
 _HOMES = {
@@ -64,6 +67,9 @@ _HOMES = {
     "procedure.excitation.settings": ("ExcitationSettings", "PlanSettings"),
     "identification.identify_options": ("IdentifySettings",),
     "identification.friction.friction_terms": ("FrictionTerm",),
+    "simulation.population": ("population", "PlantedArm"),
+    "simulation.virtual_cells": ("PlantedErrors",),
+    "simulation.cell": ("SimulatedInstrument",),
     "errors": ("CalibError",),
 }
 
@@ -88,6 +94,7 @@ __all__ = [  # noqa: RUF022 (in the order of use)
     "compensate",
     "new_session",
     "run_sessions",
+    "population",
     "CalibratedChain",
     "PoseSelection",
     "GeometryFit",
@@ -102,6 +109,9 @@ __all__ = [  # noqa: RUF022 (in the order of use)
     "PlanSettings",
     "IdentifySettings",
     "FrictionTerm",
+    "PlantedArm",
+    "PlantedErrors",
+    "SimulatedInstrument",
     "CalibError",
 ]
 
