@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from calib.api.kinematic import GeometryFit, PoseSelection, fit_geometry, select_poses
     from calib.api.motions import ExcitationDesign, MotionPlan, design_excitation, plan_motion
     from calib.api.reading import load, read_poses, read_recording
+    from calib.api.result_table import ResultTable
+    from calib.api.sweeps import sweep
     from calib.apps.compensation.api import JointCommands, compensate
     from calib.apps.fleet.fleet import run_sessions
     from calib.apps.joining.joining import join
@@ -53,6 +55,8 @@ _HOMES = {
     "api.kinematic": ("select_poses", "fit_geometry", "PoseSelection", "GeometryFit"),
     "api.motions": ("design_excitation", "plan_motion", "ExcitationDesign", "MotionPlan"),
     "api.dynamic": ("identify_dynamics", "methods", "DynamicsModel"),
+    "api.sweeps": ("sweep",),
+    "api.result_table": ("ResultTable",),
     "api.exporting": ("validate", "export"),
     "procedure.session.commands": ("new_session",),
     "apps.fleet.fleet": ("run_sessions",),
@@ -95,6 +99,7 @@ __all__ = [  # noqa: RUF022 (in the order of use)
     "new_session",
     "run_sessions",
     "population",
+    "sweep",
     "CalibratedChain",
     "PoseSelection",
     "GeometryFit",
@@ -103,6 +108,7 @@ __all__ = [  # noqa: RUF022 (in the order of use)
     "DynamicsModel",
     "JointCommands",
     "Result",
+    "ResultTable",
     "SelectionSettings",
     "FitSettings",
     "ExcitationSettings",

@@ -13,9 +13,9 @@ from calib.errors import UsageError, one_of, refused_as
 if TYPE_CHECKING:
     from pandas import DataFrame  # pyright: ignore[reportMissingImports]
 
-# Lines that ``print`` shows of a table, and the width of its cells [characters].
+# Rows and columns that ``print`` shows of a table.
 SHOWN_ROWS = 10
-CELL_WIDTH = 12
+SHOWN_COLUMNS = 10
 
 
 class ResultTable:
@@ -83,28 +83,29 @@ class ResultTable:
     def __str__(self) -> str:
         rows: list[tuple[object, ...]] = [self.columns]
         rows += list(self)[:SHOWN_ROWS]
-        lines = []
-        for row in rows:
-            cells = [_shown(cell) for cell in row]
-            lines.append("  ".join(cells).rstrip())
-        if len(self) > SHOWN_ROWS:
-            lines.append(f"… {len(self)} rows")
+        columns = []
+        for cells in list(zip(*rows))[:SHOWN_COLUMNS]:
+            texts = [_shown(cell) for cell in cells]
+            width = max(map(len, texts))
+            columns.append([text.ljust(width) for text in texts])
+        lines = ["  ".join(cells).rstrip() for cells in zip(*columns)]
+        if len(self) > SHOWN_ROWS or len(self.columns) > SHOWN_COLUMNS:
+            lines.append(f"… {len(self)} rows, {len(self.columns)} columns")
         return "\n".join(lines)
 
 
 def _column(values: Sequence[object]) -> np.ndarray:
-    """Return the cells of a column as an array of str if any is a text, else of float, with NaN for None."""
-    if any(isinstance(value, str) and value for value in values):
+    """Return the cells of a column as an array of str if any is a text, else of float, with NaN for None and ""."""
+    texts = [isinstance(value, str) for value in values]
+    if all(texts) or any(value for value, is_text in zip(values, texts) if is_text):
         return np.array([str(value) for value in values])
     numbers = [np.nan if value is None or value == "" else value for value in values]
     return np.array(numbers, dtype=float)
 
 
 def _shown(cell: object) -> str:
-    """Return a cell as a text of at least `CELL_WIDTH` characters."""
-    if isinstance(cell, float):
-        return f"{cell:<{CELL_WIDTH}.6g}"
-    return f"{cell!s:<{CELL_WIDTH}}"
+    """Return a cell as a text, with six digits of a number."""
+    return f"{cell:.6g}" if isinstance(cell, float) else str(cell)
 
 
 def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:

@@ -1,4 +1,4 @@
-"""Simulated measurements of every kind: positions, poses, distances, ball bars, sockets and planes, with white noise."""
+"""Simulated measurements of every kind: positions, poses, distances, bars, sockets and planes, with white noise."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace

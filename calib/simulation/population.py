@@ -152,7 +152,7 @@ class PlantedArm:
             return cells.measure(self.cell, values, rng, name)
         instrument = self.cell.instrument
         return measure_kind(
-            self.cell.truth,
+            replace(self.cell.truth, deflection=self.truth.deflection),
             kind,
             values,
             rng,
