@@ -44,7 +44,7 @@ HOMES = {
     "ruamel": ["calib.data.images.lens", "calib.procedure.measuring.moveit"],
     "mcap": ["calib.data."],
     "rosbags": ["calib.data.recordings.bags", "calib.data.images."],
-    "pandas": ["calib.api.rendering"],
+    "pandas": ["calib.api.result_table"],
     "starlette": ["calib.apps.serve.pages"],
     "uvicorn": ["calib.apps.serve.commands"],
     "python_multipart": ["calib.apps.serve.uploads"],

@@ -30,8 +30,7 @@ from calib.robot.calibrated import CalibratedChain, like_joints
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
-    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
-
+    from calib.api.result_table import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -58,11 +57,15 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
         """
         titles = self.found.settings.torque_rows.titles(self.inputs.chain.joint_names)
         cases = (*self.inputs.cases, *self.inputs.unseen)
-        files = [np.full(len(case.motion.t), case.name) for case in cases]
-        times = [case.motion.t for case in cases]
-        torques = np.concatenate([case.target - self.predictions[case.name] for case in cases])
+        files = []
+        times = []
+        torques = []
+        for case in cases:
+            files.append(np.full(len(case.motion.t), case.name))
+            times.append(case.motion.t)
+            torques.append(case.target - self.predictions[case.name])
         columns = {"file": np.concatenate(files), "t [s]": np.concatenate(times)}
-        for title, unit, residual in zip(titles, self.inputs.row_units, torques.T, strict=True):
+        for title, unit, residual in zip(titles, self.inputs.row_units, np.concatenate(torques).T, strict=True):
             columns[f"{title} [{unit}]"] = residual
         return ResultTable(columns)
 

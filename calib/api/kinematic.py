@@ -34,8 +34,7 @@ from calib.robot.calibrated import CalibratedChain, like_joints
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
-    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
-
+    from calib.api.result_table import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 

@@ -11,7 +11,7 @@ from numpy.typing import DTypeLike
 from calib.errors import UsageError, one_of, refused_as
 
 if TYPE_CHECKING:
-    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
+    from pandas import DataFrame as DataFrame  # pyright: ignore[reportMissingImports]
 
 # Rows and columns that ``print`` shows of a table.
 SHOWN_ROWS = 10
@@ -59,7 +59,7 @@ class ResultTable:
 
     def to_numpy(self) -> np.ndarray:
         """Return the rows as a structured array (m,), whose fields are the columns."""
-        fields = [(name, self._arrays[name].dtype) for name in self.columns]
+        fields = [(name, values.dtype) for name, values in self._arrays.items()]
         array = np.empty(len(self), dtype=fields)
         for name in self.columns:
             array[name] = self._arrays[name]
@@ -96,11 +96,14 @@ class ResultTable:
 
 def _column(values: Sequence[object]) -> np.ndarray:
     """Return the cells of a column as an array of str if any is a text, else of float, with NaN for None and ""."""
-    texts = [isinstance(value, str) for value in values]
-    if all(texts) or any(value for value, is_text in zip(values, texts) if is_text):
-        return np.array([str(value) for value in values])
-    numbers = [np.nan if value is None or value == "" else value for value in values]
-    return np.array(numbers, dtype=float)
+    texts = [value for value in values if isinstance(value, str)]
+    if len(texts) == len(values) or any(texts):
+        return np.array(values, dtype=str)
+    numbers = np.full(len(values), np.nan)
+    for number, value in enumerate(values):
+        if value is not None and value != "":
+            numbers[number] = value
+    return numbers
 
 
 def _shown(cell: object) -> str:

@@ -79,16 +79,15 @@ def sweep(
 
     runs = _runs(over)
     tasks = [_task(verb, arguments, options, run, figures) for run in runs]
-    here = workers == 1
-    if not here:
+    if workers != 1:
         with refused_as(UsageError, (pickle.PicklingError, AttributeError, TypeError), _UNSENT):
             pickle.dumps(tasks[0])
     results: list[Mapping[str, object]] = [{} for _ in tasks]
     with opened(workers) as crew:
-        for done, (number, result) in enumerate(crew.completed(_row, tasks), 1):
+        for finished, (number, result) in enumerate(crew.completed(_row, tasks), 1):
             results[number] = result if isinstance(result, Mapping) else {ERROR: str(result)}
             if progress is not None:
-                progress(f"run {done} of {len(tasks)}")
+                progress(f"run {finished} of {len(tasks)}")
     return _table(tasks, results)
 
 
@@ -122,23 +121,27 @@ def _task(
     """
     parameters = signature(verb).parameters
     kind = _settings_class(verb)
-    setting_names = {entry.name for entry in fields(kind)} if kind is not None else set()
-    given = dict(options)
+    setting_names: set[str] = set()
+    if kind is not None:
+        setting_names.update(entry.name for entry in fields(kind))
+    call_options = dict(options)
     changes: dict[str, object] = {}
     for name, value in varied.items():
         if name in setting_names and not (callable(value) and name in parameters):
             changes[name] = value
         elif name in parameters:
-            given[name] = value
+            call_options[name] = value
         else:
-            known = ", ".join(sorted({*setting_names, *parameters}))
-            raise UsageError(f"over: '{name}' is neither a setting nor an argument of {verb.__name__}: {known}")
+            names = ", ".join(sorted({*setting_names, *parameters}))
+            raise UsageError(f"over: '{name}' is neither a setting nor an argument of {verb.__name__}: {names}")
     if changes and kind is not None:
-        base = given.get("settings")
+        base = call_options.get("settings")
         positional = list(parameters).index("settings") < len(arguments)
         require(not positional, "settings: give them by name: settings=…", UsageError)
-        given["settings"] = kind(**changes) if base is None else replace(base, **changes)  # type: ignore[type-var]
-    return _Task(verb, arguments, given, figures, varied)
+        if base is None:
+            base = kind()
+        call_options["settings"] = replace(base, **changes)  # type: ignore[type-var]
+    return _Task(verb, arguments, call_options, figures, varied)
 
 
 def _settings_class(verb: Callable[..., object]) -> type | None:
@@ -147,7 +150,10 @@ def _settings_class(verb: Callable[..., object]) -> type | None:
         return None
     hint = get_type_hints(verb)["settings"]
     kinds = get_args(hint) or (hint,)
-    return next((kind for kind in kinds if isinstance(kind, type) and is_dataclass(kind)), None)
+    for kind in kinds:
+        if isinstance(kind, type) and is_dataclass(kind):
+            return kind
+    return None
 
 
 @one_blas_thread()
@@ -177,8 +183,12 @@ def _numbers(values: Mapping[str, object], start: str = "") -> Iterator[tuple[st
 
 def _table(tasks: Sequence[_Task], results: Sequence[Mapping[str, object]]) -> ResultTable:
     """Return the table of the runs: what varied, figures in the order of their first run, and errors."""
-    varied = list(dict.fromkeys(name for task in tasks for name in task.varied))
-    names = list(dict.fromkeys(name for result in results for name in result if name != ERROR))
+    varied: dict[str, None] = {}
+    names: dict[str, None] = {}
+    for task, result in zip(tasks, results, strict=True):
+        varied.update(dict.fromkeys(task.varied))
+        names.update(dict.fromkeys(result))
+    names.pop(ERROR, None)
     rows = []
     for task, result in zip(tasks, results, strict=True):
         row = [_label(task.varied.get(name)) for name in varied]
@@ -190,7 +200,6 @@ def _table(tasks: Sequence[_Task], results: Sequence[Mapping[str, object]]) -> R
 
 def _label(value: object) -> object:
     """Return a varied value as a cell: numbers and texts unchanged, functions by name, all else as text."""
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return str(value) if isinstance(value, bool) or value is None else value
-    name = getattr(value, "__name__", "")
-    return name or str(value)
+    if isinstance(value, (int, float, str)) and not isinstance(value, bool):
+        return value
+    return getattr(value, "__name__", "") or str(value)

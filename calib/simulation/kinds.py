@@ -37,7 +37,7 @@ def measure_kind(
     *,
     sigma: float = 0.0,
     sigma_rotation: float | None = None,
-    stated: bool = True,
+    with_sigma: bool = True,
     station: int = 0,
     tools: Sequence[int] = (0,),
     torque: Callable[[np.ndarray], np.ndarray] | None = None,
@@ -55,7 +55,7 @@ def measure_kind(
         rng: generator of the noise, the centres and the places of sockets and planes.
         sigma: σ of each coordinate or distance [m].
         sigma_rotation: σ about each axis [rad]; None: the number of `sigma`.
-        stated: whether the measurements state their σ.
+        with_sigma: whether the measurements state their σ.
         station: index of the station.
         tools: indices of the tools, taken in turn.
         torque: function of q that returns the gravity torques (m, n) [N m]; None: none are stated.
@@ -68,31 +68,31 @@ def measure_kind(
     count = len(q)
     tool = np.resize(np.array(tools), count)
     if kind in ("sockets", "plane"):
-        return _touched(truth, kind, q, tool, sigma, stated, file, rng)
+        return _touched(truth, kind, q, tool, sigma, with_sigma, file, rng)
     gravity = torque(q) if torque else None
     bases = evaluate(truth.deflection, q, gravity)
-    seen = see(truth, q, station, tool, bases)
-    point = seen.point.T
-    used = np.unique(tools)
+    sighting = see(truth, q, station, tool, bases)
+    point = sighting.point.T
+    tool_numbers = np.unique(tools)
     common: FieldValues = {
         "q": q,
         "joint_names": truth.chain.joint_names,
-        "tool": np.searchsorted(used, tool),
-        "tool_names": tuple(truth.tool_names[k] for k in used),
+        "tool": np.searchsorted(tool_numbers, tool),
+        "tool_names": tuple(truth.tool_names[k] for k in tool_numbers),
         "station": truth.station_names[station],
         "file": file,
         "torque": gravity,
         "sigma": None,
     }
-    if stated and sigma:
+    if with_sigma and sigma:
         common["sigma"] = np.full(count if kind in ("distance", "bar") else (count, 3), sigma)
     if kind in ("pose", "position"):
         common["position"] = point + sigma * rng.normal(size=point.shape)
     if kind == "pose":
         angle = sigma if sigma_rotation is None else sigma_rotation
         turn = Rotation.from_rotvec(angle * rng.normal(size=point.shape))
-        common["quaternion"] = (turn * Rotation.from_matrix(seen.poses()[:, :3, :3])).as_quat()
-        common["sigma_rotation"] = np.full((count, 3), angle) if stated and angle else None
+        common["quaternion"] = (turn * Rotation.from_matrix(sighting.poses()[:, :3, :3])).as_quat()
+        common["sigma_rotation"] = np.full((count, 3), angle) if with_sigma and angle else None
     elif kind == "distance":
         gap = np.linalg.norm(point[0::2] - point[1::2], axis=1) + sigma * rng.normal(size=count // 2)
         common["distance"] = np.repeat(gap, 2)
@@ -111,7 +111,7 @@ def _touched(
     q: np.ndarray,
     tool: np.ndarray,
     sigma: float,
-    stated: bool,
+    with_sigma: bool,
     file: str,
     rng: np.random.Generator,
 ) -> PoseMeasurements:
@@ -123,7 +123,7 @@ def _touched(
         q: joint values from which the joints are moved.
         tool: (m,) indices of the tools.
         sigma: σ of the touching [m].
-        stated: whether the measurements state their σ.
+        with_sigma: whether the measurements state their σ.
         file: name of the file for messages.
         rng: generator of the noise and of the places.
     """
@@ -138,9 +138,9 @@ def _touched(
     aim = sockets[group] + sigma * rng.normal(size=(len(q), 3))
     missed = np.full(len(q), np.inf)
     for _ in range(STEPS):
-        seen = see(inner, q, 0, tool)
-        slope = joint_jacobian(truth.chain, seen.walked, seen.point)[:, :3]
-        miss = (aim - seen.point.T)[:, :, None]
+        sighting = see(inner, q, 0, tool)
+        slope = joint_jacobian(truth.chain, sighting.walked, sighting.point)[:, :3]
+        miss = (aim - sighting.point.T)[:, :, None]
         if kind == "plane":
             normal = normals[group]
             miss = np.einsum("mi,mi->m", normal, miss[:, :, 0])[:, None, None]
@@ -163,7 +163,7 @@ def _touched(
         "tool_names": (truth.tool_names[tool[0]],),
         "file": file,
     }
-    spread = np.full((int(good.sum()), 3), sigma) if stated and sigma else None
+    spread = np.full((int(good.sum()), 3), sigma) if with_sigma and sigma else None
     if kind == "plane":
         return Planes(sigma=None if spread is None else spread[:, 0], **common)
     links = tuple((2 * k, 2 * k + 1, PAIR) for k in range(pairs))

@@ -14,7 +14,7 @@ follows from the seed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
@@ -106,8 +106,8 @@ class PlantedArm:
         Raises:
             CalibError: the description has no masses.
         """
-        scale = self.errors.unmodelled
-        unmodelled = TorqueErrors(*(scale * size for size in vars(UNMODELLED).values()))
+        sizes = self.errors.unmodelled * np.array(astuple(UNMODELLED))
+        unmodelled = TorqueErrors(*sizes.tolist())
         name = self.cell.nominal.name
         arm = moving_arm(self.cell, name, self.seed, unmodelled, self.errors.masses)
         plant = arm.plant
@@ -210,8 +210,8 @@ class PlantedArm:
         Raises:
             CalibError: the description has no masses.
         """
-        states = [shaped(values, (None, self.cell.nominal.n), name) for name, values in zip("qva", (q, v, a))]
-        return self.moving.true_torque(*states)
+        positions = self.nominal.joint_rows(q)
+        return self.moving.true_torque(positions, shaped(v, positions.shape, "v"), shaped(a, positions.shape, "a"))
 
     def position_errors(self, calibrated: CalibratedChain | Outcome, q: ArrayLike) -> np.ndarray:
         """Return the distances (m,) [m] of the tool from where the true arm has it, at joint values q (m, n).
@@ -261,8 +261,8 @@ def _series(motion: Motion, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray,
     arrays = (motion.t, motion.q, motion.v, motion.a) if isinstance(motion, Reference) else tuple(motion)
     require(len(arrays) == 4, f"motion: expected t, q, v, a, found {len(arrays)} arrays", UsageError)
     t = shaped(arrays[0], (None,), "t")
-    q, v, a = (shaped(array, (len(t), n), name) for name, array in zip("qva", arrays[1:]))
-    return t, q, v, a
+    shape = (len(t), n)
+    return t, shaped(arrays[1], shape, "q"), shaped(arrays[2], shape, "v"), shaped(arrays[3], shape, "a")
 
 
 @checked

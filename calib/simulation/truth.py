@@ -58,9 +58,9 @@ def position_errors(cell: Cell, calibrated: Installation, urdf: Chain) -> tuple[
     return _rms(nominal_arm, block), _rms(calibrated, block), _rms(urdf_arm, block)
 
 
-def placed(chain: Chain, block: Poses, known: Deflection | None = None) -> Installation:
-    """Return an arm, with known deflections if any, with its best station and tool for the poses of a block."""
-    guess = install(chain, [block], known)
+def placed(chain: Chain, block: Poses, deflection: Deflection | None = None) -> Installation:
+    """Return an arm, with its deflection if any, with its best station and tool for the poses of a block."""
+    guess = install(chain, [block], deflection)
     return polish_frames(guess, [block]).cell
 
 

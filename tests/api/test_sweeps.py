@@ -38,7 +38,7 @@ def test_runs_have_figures_of_ones_own_and_errors_in_a_column():
     table = calib.sweep(calib.fit_geometry, robot=ARM.nominal, settings=OFFSETS, over=runs, figures=model_and_error)
     assert table.columns[1:] == ("model", "rms", "error") and table["model"][0] == "offsets"
     assert np.isfinite(table["rms"][0]) and np.isnan(table["rms"][1])
-    assert table["error"][0] == "" and "2 poses are too few" in table["error"][1]
+    assert table["error"][0] == "" and "2 usable rows" in table["error"][1]
 
 
 @pytest.mark.slow
