@@ -24,7 +24,7 @@ from calib.identification.registry import METHODS
 from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
 from calib.procedure.excitation import coefficients
 from calib.procedure.robot_kinds import Mechanism, stage_of
-from calib.records import as_subclass, plain, shaped
+from calib.records import Floats, as_subclass, plain, shaped
 from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain, like_joints
 from calib.workers.threads import one_blas_thread
@@ -83,7 +83,7 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
         return replace(estimate, covariance=self.carried.covariance)
 
     @one_blas_thread()
-    def torques(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> np.ndarray:
+    def torques(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
         """Return the predicted torques [N m or N]: (N, rows) of a motion (N, n), (rows,) of one state (n,).
 
         Args:
@@ -96,7 +96,7 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
         return like_joints(q, dynamics.model.torque(dynamics.values, *self._states(q, v, a)))
 
     @one_blas_thread()
-    def torque_sigma(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> np.ndarray:
+    def torque_sigma(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
         """Return the standard deviations σ [N m or N] of predicted torques, in the shape of `torques`.
 
         ± 1.96 σ contains 95 % of the errors.

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 # Rows and columns that ``print`` shows of a table.
 SHOWN_ROWS = 10
-SHOWN_COLUMNS = 10
+SHOWN_COLUMNS = 12
 
 
 class ResultTable:

@@ -31,7 +31,7 @@ from calib.identification.closed_loop.controllers import Reference
 from calib.identification.friction.friction_terms import FrictionTerm
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import gravity_of
-from calib.records import shaped
+from calib.records import Floats, shaped
 from calib.robot.calibrated import CalibratedChain, CorrectedChain, Deflection, as_calibrated, evaluate
 from calib.robot.chain import random_joints
 from calib.robot.library import load_calibrated
@@ -117,11 +117,11 @@ class PlantedArm:
             plant = replace(plant, terms=(*plant.terms, *terms), parameters=parameters)
         return replace(arm, plant=plant, sensors=arm.sensors or self.torque_sensors)
 
-    def postures(self, count: int, seed: int = 0) -> np.ndarray:
+    def postures(self, count: int, seed: int = 0) -> Floats:
         """Return random joint values (count, n) [rad or m] within the joints' limits; collisions are not checked."""
         return random_joints(self.cell.nominal, count, np.random.default_rng([self.seed, seed]))
 
-    def poses(self, q: ArrayLike) -> np.ndarray:
+    def poses(self, q: ArrayLike) -> Floats:
         """Return the true poses of the tip in the base frame [m], with all that is planted: (m, 4, 4), or (4, 4).
 
         Args:
@@ -201,7 +201,7 @@ class PlantedArm:
         recording = record(arm, play(t, q, v, a, repeats), noise)
         return replace(recording, file=f"{self.cell.nominal.name}-{self.seed}-log{seed}")
 
-    def torques(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> np.ndarray:
+    def torques(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
         """Return the true motor torques (N, n) [N m or N] of a warm arm along a finely sampled motion, without noise.
 
         Args:
@@ -213,7 +213,7 @@ class PlantedArm:
         positions = self.nominal.joint_rows(q)
         return self.moving.true_torque(positions, shaped(v, positions.shape, "v"), shaped(a, positions.shape, "a"))
 
-    def position_errors(self, calibrated: CalibratedChain | Outcome, q: ArrayLike) -> np.ndarray:
+    def position_errors(self, calibrated: CalibratedChain | Outcome, q: ArrayLike) -> Floats:
         """Return the distances (m,) [m] of the tool from where the true arm has it, at joint values q (m, n).
 
         Args:

@@ -61,8 +61,8 @@ def measure(
     rng = np.random.default_rng(seed)
     q = random_joints(truth.chain, count, rng)
     return measure_kind(
-        truth, kind, q, rng, sigma=sigma, sigma_rotation=sigma_rotation, with_sigma=stated, station=station, tools=tools,
-        torque=torque, file=file,
+        truth, kind, q, rng, sigma=sigma, sigma_rotation=sigma_rotation, with_sigma=stated, station=station,
+        tools=tools, torque=torque, file=file,
     )  # fmt: skip
 
 

@@ -3,8 +3,8 @@
     tau_j += parameter_j · f(v_j)        or        tau_j += parameter_j · f(q_j)
 
 The parameter is identified with all others. The function is made a table over the joint's range
-(`calib.identification.friction.function_tables`), so that the identified model is data: it is stored, simulated and read
-back without the function. URDF and MJCF have no place for it; exports say so.
+(`calib.identification.friction.function_tables`), so that the identified model is data: it is stored, simulated and
+read back without the function. URDF and MJCF have no place for it; exports say so.
 """
 
 import math

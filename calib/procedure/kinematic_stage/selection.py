@@ -257,8 +257,8 @@ def _feasible_candidates(
     if len(numbers) < m:
         exceeding = int(((q < space.lower) | (q > space.upper)).any(axis=1).sum())
         raise UsageError(
-            f"candidates: {len(numbers)} of {len(q)} keep the constraints, and {m} are to be chosen: {exceeding} exceed "
-            "the joint limits [rad or m]; give more candidates, or loosen the constraints"
+            f"candidates: {len(numbers)} of {len(q)} keep the constraints, and {m} are to be chosen: {exceeding} "
+            "exceed the joint limits [rad or m]; give more candidates, or loosen the constraints"
         )
     return q, numbers
 
