@@ -10,6 +10,7 @@ from itertools import product
 from typing import Protocol, TypeVar, get_args, get_type_hints
 
 from calib.api.result_table import ResultTable
+from calib.arguments import checked
 from calib.errors import CalibError, UsageError, brief, refused_as, require
 from calib.workers.threads import one_blas_thread
 
@@ -43,6 +44,7 @@ class _Task:
     varied: Mapping[str, object] = field(default_factory=dict)
 
 
+@checked
 def sweep(
     verb: Callable[..., R],
     *arguments: object,

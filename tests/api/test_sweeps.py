@@ -66,6 +66,11 @@ def test_sweeps_of_nothing_known_are_refused(over, message):
         calib.sweep(calib.fit_geometry, ARM.nominal, MEASURED, over=over)
 
 
+def test_a_wrong_argument_is_named():
+    with pytest.raises(UsageError, match="sweep: over: expected a mapping or several, each a mapping, found 3"):
+        calib.sweep(calib.fit_geometry, ARM.nominal, MEASURED, over=3)
+
+
 def test_functions_that_cannot_be_sent_to_processes_are_named():
     with pytest.raises(UsageError, match="define functions at the top of a module, or leave workers = 1"):
         calib.sweep(calib.fit_geometry, ARM.nominal, MEASURED, over={"loss": [lambda z: z]}, workers=2)
