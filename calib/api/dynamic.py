@@ -113,17 +113,16 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
             raise UsageError("torque errors cannot be estimated, since the recording is too short: record longer")
         return like_joints(q, self.errors.sigma(self.found.dynamics, *self._states(q, v, a)))
 
-    def _states(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> list[np.ndarray]:
+    def _states(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> tuple[Floats, Floats, Floats]:
         """Return positions, velocities and accelerations as arrays (N, n) of equal shape.
 
         Args:
             q, v, a: (N, n) or (n,) joint positions, velocities and accelerations.
         """
         positions = self.robot.joint_rows(q)
-        states = [positions]
-        for name, values in (("v", v), ("a", a)):
-            states.append(shaped(np.atleast_2d(np.asarray(values, dtype=float)), positions.shape, name))
-        return states
+        velocities = shaped(np.atleast_2d(np.asarray(v, dtype=float)), positions.shape, "v")
+        accelerations = shaped(np.atleast_2d(np.asarray(a, dtype=float)), positions.shape, "a")
+        return positions, velocities, accelerations
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -11,7 +11,9 @@ from numpy.typing import DTypeLike
 from calib.errors import UsageError, one_of, refused_as
 
 if TYPE_CHECKING:
-    from pandas import DataFrame as DataFrame  # pyright: ignore[reportMissingImports]
+    import pandas  # pyright: ignore[reportMissingImports]
+
+    DataFrame: TypeAlias = pandas.DataFrame
 
 # Rows and columns that ``print`` shows of a table.
 SHOWN_ROWS = 10
@@ -54,7 +56,7 @@ class ResultTable:
     def __iter__(self) -> Iterator[tuple[object, ...]]:
         return iter(self.to_numpy().tolist())
 
-    def __array__(self, dtype: DTypeLike = None, copy: bool | None = None) -> np.ndarray:
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self.to_numpy(), dtype=dtype)
 
     def to_numpy(self) -> np.ndarray:

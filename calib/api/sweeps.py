@@ -159,7 +159,7 @@ def _settings_class(verb: Callable[..., object]) -> type | None:
 
 
 @one_blas_thread()
-def _row(task: _Task) -> dict[str, object]:
+def _row(task: _Task) -> Mapping[str, object]:
     """Run a task and return the figures of its result, or its error."""
     try:
         result = task.verb(*task.arguments, **task.options)
