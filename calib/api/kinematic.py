@@ -31,6 +31,7 @@ from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import Floats, as_subclass, plain
 from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain, like_joints
+from calib.workers.extras import available
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
@@ -72,12 +73,13 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
         Raises:
             UsageError: a file exists and must not be replaced.
         """
-        from calib.procedure.report.style import save
-
         path = Path(path)
+        plots = plots and available("matplotlib")
         figure_paths = selection.beside_poses(path, plots)
         with files.results(selection.targets(path, plots), overwrite=overwrite):
             if plots:
+                from calib.procedure.report.style import save
+
                 for name, figure in self.plot().items():
                     save(figure, figure_paths[name])
             return selection.write(self, path)

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, overload
 from calib.errors import CalibError, UsageError, one_of
 from calib.procedure.findings import NOT_JUDGED, Verdict
 from calib.result_kinds import ResultKind
+from calib.workers.extras import needing
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
@@ -172,7 +173,8 @@ class ChartedResult(Kept):
 
     def figures(self) -> Mapping[str, Picture]:
         """Return the figures by name, as PNG images."""
-        from calib.procedure.report.charts import picture
+        with needing("matplotlib"):
+            from calib.procedure.report.charts import picture
 
         return {name: picture(chart, "") for name, chart in self.charts().items()}
 
@@ -191,7 +193,8 @@ class ChartedResult(Kept):
         Raises:
             UsageError: there is no figure of this name.
         """
-        from calib.procedure.report import charts
+        with needing("matplotlib"):
+            from calib.procedure.report import charts
 
         charts_by_name = self.charts()
         if name is None:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Self, TypeAlias
 import numpy as np
 from numpy.typing import DTypeLike
 
-from calib.errors import UsageError, one_of, refused_as
+from calib.errors import UsageError, one_of
+from calib.workers.extras import needing
 
 if TYPE_CHECKING:
     import pandas  # pyright: ignore[reportMissingImports]
@@ -123,7 +124,6 @@ def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:
     Raises:
         UsageError: pandas is not installed.
     """
-    message = "data frames need pandas: pip install 'armature-calib[pandas]'; to_dict() and save() do without"
-    with refused_as(UsageError, ImportError, message):
+    with needing("pandas", "; to_dict() and save() do without"):
         import pandas  # pyright: ignore[reportMissingImports]
     return pandas.DataFrame(list(rows), columns=list(columns))

@@ -283,7 +283,7 @@ def test_residuals_are_columns_without_pandas(fitted, model, tmp_path, monkeypat
     last = model.inputs.unseen[0].target[-1] - model.predictions["other.npz"][-1]
     np.testing.assert_array_equal(list(torques)[-1][2:], last)
 
-    with pytest.raises(UsageError, match=r"need pandas: pip install 'armature-calib\[pandas\]'"):
+    with pytest.raises(UsageError, match=r"pandas, for data frames, .*: pip install 'armature-calib\[pandas\]'"):
         residuals.to_dataframe()
     frame = SimpleNamespace(DataFrame=lambda rows, columns: [columns, *rows])
     monkeypatch.setitem(sys.modules, "pandas", frame)
@@ -362,9 +362,13 @@ def test_session_in_python_is_the_commands(logs, tmp_path, monkeypatch, capsys):
     """A session in Python is the command's session."""
     monkeypatch.chdir(tmp_path)
     robot = str(logs / "robot.toml")
-    made = calib.new_session("script", robot, "cmm", poses=8, validation=0, dynamics=False)
+    keys = {"poses": 8, "validation": 0, "holdout": 0.25, "dynamics": False}
+    made = calib.new_session("script", robot, "cmm", **keys)
     command = ["new", "command", "--robot", robot, "--instrument", "cmm", "--poses", "8", "--validation", "0"]
-    assert cli.run([*command, "--geometry-only"]) == 0
+    assert cli.run([*command, "--holdout", "0.25", "--geometry-only"]) == 0
+    assert cli.run(["new", "free", "--robot", robot, "--instrument", "cmm", "--no-plan"]) == 0
+    free = tomllib.loads((tmp_path / "free/session.toml").read_text())
+    assert not free["poses"]["plan"] and not free["dynamics"]["plan"]
     own, other = (tomllib.loads((tmp_path / name / "session.toml").read_text()) for name in ("script", "command"))
     assert made == Path("script") and own | {"created": ""} == other | {"created": ""}
     script, command = calib.run_sessions(["script", "command/session.toml"], plots=False)

@@ -11,6 +11,7 @@ from calib.errors import Finding, NotConverged, finding
 from calib.estimation.robust import Loss, loss_name
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.joint_range import joint_range
+from calib.geometry.checks.pose_direction import parted_set_up
 from calib.geometry.checks.row_changes import row_changes
 from calib.geometry.diagnosis import diagnose
 from calib.geometry.error_model import ErrorModel, learn_errors
@@ -195,6 +196,9 @@ def run(
     rigid = selection.rigid_fit(inputs.fit, weighing, inputs.bare)
     outliers = named_outliers(selection.fit)
     notes = _residual_findings(selection, inputs, changes, rigid_misfit, weighing)
+    if not changes:
+        for block in inputs.fit:
+            notes += parted_set_up(inputs.chain, block)
     if prediction is not None:
         ratio = compared_with_fit(prediction, selection.fit)
         if ratio is not None:
@@ -272,6 +276,7 @@ def _residual_findings(
         notes.append(rigid_misfit)
     notes += _moved_between(selection.nominal.cell, inputs.fit, weighing)
     notes += diagnose(selection.fit, with_changes=not changes)
+    notes += plausibility.joint_scales(selection.fit)
     notes += image_notes(selection.fit)
     return notes
 
