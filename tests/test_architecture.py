@@ -45,7 +45,7 @@ HOMES = {
     "ruamel": ["calib.data.trees", "calib.procedure.measuring.moveit"],
     "mcap": ["calib.data."],
     "rosbags": ["calib.data.recordings.bags", "calib.data.images."],
-    "pandas": ["calib.api.rendering"],
+    "pandas": ["calib.api.result_table"],
     "starlette": ["calib.apps.serve."],
     "uvicorn": ["calib.apps.serve.commands"],
     "python_multipart": ["calib.apps.serve.uploads"],
