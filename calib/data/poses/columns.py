@@ -7,12 +7,12 @@ from typing import NoReturn
 
 import numpy as np
 
-from calib.controllers.table import as_described
+from calib.controllers.axes import as_described, named_joints
 from calib.data.csv_table import Table
 from calib.data.poses import IGNORED, MEASURED
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import KINDS
-from calib.data.schema import BOUNDS, Column
+from calib.data.schema import BOUNDS, Column, Joints
 from calib.errors import MeasurementError, one_of, suggestion
 
 SUFFIXES = ("", "_meas", "_measured")
@@ -109,16 +109,18 @@ class Sheet:
             values.append(self.table.numbers(name, column.dimension, unit, gaps))
         return column.check(np.stack(values, axis=1), self.table, names)
 
-    def joints(self, joints: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    def joints(self, joints: Joints | Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return joint values (m, n) [rad or m], and the file's names of the joint columns.
 
         Args:
-            joints: names of the robot's n joints, in the robot's order.
+            joints: the robot's n joints, or only their names (then taken as revolute), in the robot's order.
         """
-        names = self.find_joints(joints)
-        q = self.numbers(names, Column(tuple(joints), "joint", "joints"))
+        robot = Joints.of(joints)
+        names = self.find_joints(robot.names)
+        q = self.numbers(names, Column(robot.names, "joint", "joints"))
         if self.options.controller:
-            q = as_described(self.options.controller, q)
+            named = named_joints(robot.names, robot.kinds)
+            q = as_described(self.options.controller, q, named, self.options.external)
         return q, names
 
     def check_names(self, joints: Sequence[str]) -> None:

@@ -248,7 +248,7 @@ def read_measurements(
     if len(layout.positions) > 1:
         columns_with_gaps.update(*layout.positions, *layout.sigmas)
     sheet.table.check([name for name in sheet.table.header if name in number_columns], columns_with_gaps)
-    q, _ = sheet.joints(robot.names)
+    q, _ = sheet.joints(robot)
     notes = (*sheet.table.notes, *notes, *layout.notes, *base_notes)
     notes = (*notes, *plausible.check_joints(q, sheet, layout.joints, robot))
     if layout.positions:

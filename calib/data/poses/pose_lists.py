@@ -132,7 +132,7 @@ def read_poses(
         return shaped(q, (None, len(robot.names)), "joint values")
     sheet = Sheet(read_table(source), options or FileOptions())
     sheet.check_names(robot.names)
-    q, columns = sheet.joints(robot.names)
+    q, columns = sheet.joints(robot)
     if len(q) > 1:
         check_planned(q, sheet, columns, robot)
     return q
