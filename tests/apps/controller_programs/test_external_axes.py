@@ -116,7 +116,13 @@ def test_fanuc_units_behind_numbers_count(tmp_path):
 @pytest.mark.parametrize(
     ("name", "names", "kinds", "external", "words"),
     [
-        ("krl", ["a", "b", *"rsuvwx"], ["revolute"] * 8, (), "state which joints are external, --external NAME"),
+        (
+            "krl",
+            ["tilt", "turn", "base", "arm", "elbow", "roll", "bend", "twist"],
+            ["revolute"] * 8,
+            (),
+            "state which joints are external, --external NAME",
+        ),
         ("krl", [f"joint{k}" for k in range(1, 8)], ["revolute"] * 7, (), "7 joints .* takes 6 turning"),
         ("krl", CELLS["rail"][0], CELLS["rail"][1], ("joint1",), "are not such an arm"),
         ("krl", CELLS["rail"][0], CELLS["rail"][1], ("rial",), "joint 'rial' is not one of"),
@@ -130,8 +136,8 @@ def test_unclear_axes_are_refused_with_a_cure(name, names, kinds, external, word
 
 
 def test_stated_axes_are_external_in_their_order(tmp_path):
-    names = ["a", "b", *"rsuvwx"]
-    path = written(tmp_path, "krl", names, ["revolute"] * 8, external=("b", "a [deg]"))
+    names = ["tilt", "turn", "base", "arm", "elbow", "roll", "bend", "twist"]
+    path = written(tmp_path, "krl", names, ["revolute"] * 8, external=("turn", "tilt [deg]"))
     q, joints = read_back(path, "krl", [])
     assert joints == [f"{joint}:revolute" for joint in names]
     np.testing.assert_allclose(q, poses(["revolute"] * 8), atol=1e-8)
