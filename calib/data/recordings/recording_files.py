@@ -282,6 +282,26 @@ def read_recording(
     return check_recording(earlier(recording, options.lag), joints)
 
 
+def read_at_rest(path: Path, joints: Joints, options: RecordingOptions) -> tuple[Recording, bool]:
+    """Return the rows of a table of joints and torques, and whether they have stamps; values are only checked for gaps.
+
+    Rows without stamps are numbered by t; they may be standing poses.
+
+    Args:
+        path: the table.
+        joints: the robot's joints.
+        options: options for reading the file.
+
+    Raises:
+        MeasurementError: no joint or torque columns, or cells that are no numbers.
+    """
+    try:
+        recording, stamped = read_log(path, joints, options), True
+    except MeasurementError:
+        recording, stamped = read_log(path, joints, replace(options, rate=1.0)), False
+    return _described(recording, options, joints), stamped
+
+
 def _described(recording: Recording, options: RecordingOptions, joints: Joints | None) -> Recording:
     """Return a recording converted from the controller's joint convention to that of the robot's description.
 
