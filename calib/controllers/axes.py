@@ -72,8 +72,9 @@ class Axes:
 
     def labels(self) -> list[str]:
         """Return the axes' labels in a program's order: ``axis 1`` … of the arm, ``E1`` … of the external axes."""
-        arm = [f"axis {number}" for number in range(1, len(self.arm) + 1)]
-        return [*arm, *(f"E{number}" for number in range(1, len(self.external) + 1))]
+        arm = [f"axis {number}" for number, _ in enumerate(self.arm, 1)]
+        external = [f"E{number}" for number, _ in enumerate(self.external, 1)]
+        return arm + external
 
     def shown(self, controller: Controller, q: np.ndarray) -> np.ndarray:
         """Return a description's joint values q (…, n) [rad or m] as the controller displays them.
@@ -132,19 +133,18 @@ def axes_of(controller: Controller, joints: Sequence[NamedJoint], external: Sequ
     if not controller.axes:
         return Axes.plain(joints)
     names = [joint.name for joint in joints]
-    stated = []
+    indices = []
     for text in external:
         name, _ = named_axis(text)
-        stated.append(names.index(one_of(name, names, "joint", UsageError)))
-    candidates = [tuple(stated)]
-    if not stated:
+        indices.append(names.index(one_of(name, names, "joint", UsageError)))
+    candidates = [tuple(indices)]
+    if not indices:
         candidates = _candidates(controller, joints)
     if len(candidates) == 1:
-        rest = tuple(index for index in range(len(joints)) if index not in candidates[0])
-        axes = Axes(joints, rest, candidates[0])
+        axes = _beside(joints, candidates[0])
         if _accepted(controller, axes):
             return axes
-    raise UsageError(_refusal(controller, joints, bool(stated)))
+    raise UsageError(_refusal(controller, joints, bool(indices)))
 
 
 def named_axis(text: str) -> tuple[str, str]:
@@ -212,15 +212,20 @@ def _candidates(controller: Controller, joints: tuple[NamedJoint, ...]) -> list[
     candidates, numbered = [], []
     for count in controller.axes:
         for first in range(len(joints) - count + 1):
-            arm = range(first, first + count)
-            external = tuple(index for index in range(len(joints)) if index not in arm)
-            axes = Axes(joints, tuple(arm), external)
+            external = (*range(first), *range(first + count, len(joints)))
+            axes = _beside(joints, external)
             if not _accepted(controller, axes):
                 continue
             candidates.append(external)
             if _is_numbered(axes):
                 numbered.append(external)
     return numbered or candidates
+
+
+def _beside(joints: tuple[NamedJoint, ...], external: tuple[int, ...]) -> Axes:
+    """Return axes with these external ones, and all other joints as the arm's."""
+    arm = [index for index in range(len(joints)) if index not in external]
+    return Axes(joints, tuple(arm), external)
 
 
 def _accepted(controller: Controller, axes: Axes) -> bool:
@@ -244,29 +249,29 @@ def _is_numbered(axes: Axes) -> bool:
     return numbers == expected and len(arm_stems) == 1 and not arm_stems & external_stems
 
 
-def _refusal(controller: Controller, joints: tuple[NamedJoint, ...], stated: bool) -> str:
+def _refusal(controller: Controller, joints: tuple[NamedJoint, ...], is_stated: bool) -> str:
     """Return why a controller cannot have these joints, and what to state.
 
     Args:
         controller: the controller.
         joints: the robot's joints.
-        stated: whether external axes were stated.
+        is_stated: whether external axes were stated.
     """
-    found = f"{len(joints)} joints ({', '.join(joint.name for joint in joints)})"
+    summary = f"{len(joints)} joints ({', '.join(joint.name for joint in joints)})"
     sliding = [joint.name for joint in joints if joint.kind not in TURNING]
     if sliding:
-        found += f", of which {', '.join(sliding)} slide"
+        summary += f", of which {', '.join(sliding)} slide"
     counts = [count for count in controller.axes if count != len(SCARA) or not controller.scara]
     takes = " or ".join(str(count) for count in counts)
     expected = f"{controller.title} takes {takes} turning joints"
     if controller.scara:
         expected += " or the four of a SCARA (the third slides)"
     if not controller.external:
-        return f"{found}; {expected}, and no external axes in its programs"
+        return f"{summary}; {expected}, and no external axes in its programs"
     expected += f", and up to {counted(controller.external, 'external axis', 'external axes')}"
-    if stated:
-        return f"{found}; {expected}: the joints beside the stated external axes are not such an arm"
-    return f"{found}; {expected}: state which joints are external, --external NAME (session: external of [robot])"
+    if is_stated:
+        return f"{summary}; {expected}: the joints beside the stated external axes are not such an arm"
+    return f"{summary}; {expected}: state which joints are external, --external NAME (session: external of [robot])"
 
 
 def check_pulses(controller: Controller, axes: Axes, pulses: Sequence[float]) -> None:

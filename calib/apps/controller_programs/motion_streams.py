@@ -58,7 +58,9 @@ def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[Name
     joints: list[NamedJoint] = []
     for name in columns:
         unit = table.units[table.index(name)].lower()
-        kind = "prismatic" if unit in LENGTHS else "revolute"
+        kind = "revolute"
+        if unit in LENGTHS:
+            kind = "prismatic"
         joints.append(PlainJoint(name.removeprefix(PREFIX), kind))
     rising = np.all(np.diff(t) > 0.0)
     if len(t) <= 3 or not rising:

@@ -69,8 +69,8 @@ def joints_in(
     if not joints:
         columns = ", ".join(table.header)
         raise UsageError(f"{path}: no column of joint angles with its unit, as 'joint1 [deg]'; found {columns}")
-    names, kinds = [joint.name for joint in joints], [joint.kind for joint in joints]
-    return read_poses(path, Joints(tuple(names), kinds)), joints
+    names, kinds = zip(*((joint.name, joint.kind) for joint in joints))
+    return read_poses(path, Joints(names, kinds)), joints
 
 
 def _read(path: Path, source: str, settings: ProgramSettings | None) -> Program:
@@ -226,9 +226,13 @@ def _poses(controller: Controller, axes: Axes, q: np.ndarray, settings: ProgramS
     count = len(axes.arm)
     units = axes.units(controller.unit)
     names = [axes.joints[index].name for index in axes.order]
+    poses, external = [], []
+    for row in texts:
+        poses.append(row[:count])
+        external.append(row[count:])
     return {
-        "poses": [row[:count] for row in texts],
-        "external": [row[count:] for row in texts],
+        "poses": poses,
+        "external": external,
         "group": _group(controller, axes, settings),
         "joints": names,
         "units": units,
@@ -264,10 +268,16 @@ def _head(controller: Controller, axes: Axes, moving: bool) -> list[str]:
             remarks = [labels[index], units[index]]
         elif not axes.turning[index]:
             remarks = [units[index]]
-        names.append(f"{joint.name} ({', '.join(remarks)})" if remarks else joint.name)
+        name = joint.name
+        if remarks:
+            name += f" ({', '.join(remarks)})"
+        names.append(name)
     joints = [f"Joints: {', '.join(names)}."]
     arm_names = [axes.joints[index].name for index in axes.arm]
-    for axis, partner, sign in () if axes.scara else controller.coupled:
+    coupled = controller.coupled
+    if axes.scara:
+        coupled = ()
+    for axis, partner, sign in coupled:
         operator = {1: "+", -1: "-"}[sign]
         joints.append(f"Axis {axis} = {arm_names[axis - 1]} {operator} {arm_names[partner - 1]}.")
     if moving:

@@ -75,14 +75,19 @@ class Target:
         """
         joined = list(zip(self.spans, self.values))
         arm, further = joined[: self.arm], joined[self.arm :]
-        external = [pair for pair in further if abs(pair[1]) < ABSENT]
+        external = _connected(further)
         count, external_count = len(axes.arm), len(axes.external)
-        beyond = arm[count:]
-        if len(arm) < count or len(external) < external_count or any(value for _, value in beyond):
+        surplus = arm[count:]
+        if len(arm) < count or len(external) < external_count or any(value for _, value in surplus):
             return None
         chosen = [*arm[:count], *external[:external_count]]
         spans, values = zip(*chosen)
         return replace(self, spans=spans, values=values, external=external_count)
+
+
+def _connected(entries: Sequence[tuple[tuple[int, int], float]]) -> list[tuple[tuple[int, int], float]]:
+    """Return the external axes, spans with numbers, that a controller has."""
+    return [entry for entry in entries if abs(entry[1]) < ABSENT]
 
 
 @dataclass(frozen=True)
@@ -288,8 +293,11 @@ def read_program(
         else:
             axes = axes_of(kind, joints, external)
         check_pulses(kind, axes, pulses)
-    complete = [target.of_axes(axes) for target in joint_targets]
-    targets = [target for target in complete if target is not None]
+    targets = []
+    for target in joint_targets:
+        complete = target.of_axes(axes)
+        if complete is not None:
+            targets.append(complete)
     targets += _targets_of_kind(text, "pose", kind)
     if not targets and joint_targets:
         counts = f"{joint_targets[0].arm} axes and {joint_targets[0].external} external ones"
@@ -339,10 +347,10 @@ def _axes_in(
     joints = []
     for number_, unit in enumerate(units, 1):
         joints.append(_joint(f"q{number_}", unit))
-    stated = [named_axis(entry) for entry in external]
-    external_units = _external_units(path, text, targets, stated)
+    statements = [named_axis(entry) for entry in external]
+    external_units = _external_units(path, text, targets, statements)
     for k, unit in enumerate(external_units):
-        name = stated[k][0] if k < len(stated) else f"E{k + 1}"
+        name = statements[k][0] if k < len(statements) else f"E{k + 1}"
         joints.append(_joint(name, unit))
     arm = tuple(range(count))
     return Axes(tuple(joints), arm, tuple(range(count, len(joints)))), notes
@@ -364,7 +372,9 @@ def _axes_of_line(controller: Controller, text: str) -> Axes:
 
 
 def _joint(name: str, unit: str) -> PlainJoint:
-    return PlainJoint(name, "prismatic" if unit in LENGTHS else "revolute")
+    if unit in LENGTHS:
+        return PlainJoint(name, "prismatic")
+    return PlainJoint(name)
 
 
 def _unwrapped(text: str, controller: Controller) -> str:
@@ -378,10 +388,14 @@ def _unwrapped(text: str, controller: Controller) -> str:
 def _unit_behind(text: str, span: tuple[int, int]) -> str:
     """Return the unit that stands behind a number, ``mm`` or ``deg``; empty where none does."""
     match = re.match(r"\s*(mm|deg)\b", text[span[1] : span[1] + NEAR])
-    return match[1] if match else ""
+    if match is None:
+        return ""
+    return match[1]
 
 
-def _external_units(path: Path, text: str, targets: Sequence[Target], stated: Sequence[tuple[str, str]]) -> list[str]:
+def _external_units(
+    path: Path, text: str, targets: Sequence[Target], statements: Sequence[tuple[str, str]]
+) -> list[str]:
     """Return the units of a program's external axes, of those that are stated or not always 0.
 
     Args:
@@ -395,15 +409,14 @@ def _external_units(path: Path, text: str, targets: Sequence[Target], stated: Se
     written: list[str] = []
     used = 0
     for target in targets:
-        further = zip(target.spans[target.arm :], target.values[target.arm :])
-        connected = [pair for pair in further if abs(pair[1]) < ABSENT]
-        for number_, (span, value) in enumerate(connected, 1):
+        further = list(zip(target.spans[target.arm :], target.values[target.arm :]))
+        for number_, (span, value) in enumerate(_connected(further), 1):
             unit = _unit_behind(text, span)
             if number_ > len(written):
                 written.append(unit)
             if value or unit:
                 used = max(used, number_)
-    entries = list(stated) or [(f"E{number_}", "") for number_ in range(1, used + 1)]
+    entries = list(statements) or [(f"E{number_}", "") for number_ in range(1, used + 1)]
     count = len(entries)
     result = []
     for (name, stated_unit), unit in zip_longest(entries, written[:count], fillvalue=""):
@@ -459,7 +472,10 @@ def _targets_of_kind(text: str, kind: str, controller: Controller) -> list[Targe
         pose_number = _pose_number(text, match, controller)
         external: list[tuple[int, int]] = []
         if kind == "joints":
-            end = matches[k + 1].start() if k + 1 < len(matches) else len(text)
+            following = matches[k + 1 : k + 2]
+            end = len(text)
+            if following:
+                end = following[0].start()
             external = _external_spans(text, match, end, pose_number, controller)
         spans += external
         values = tuple(float(text[begin:end]) for begin, end in spans)

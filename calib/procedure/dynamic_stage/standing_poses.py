@@ -45,6 +45,7 @@ from calib.robot.formats.urdf_tree import is_urdf
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.formats.urdf_tree import text as description_text
 from calib.robot.library import load_calibrated, resolve
+from calib.units import motion_units
 
 # suffixes of tables
 TABLES = (".csv", ".txt", ".tsv", ".dat")
@@ -150,12 +151,12 @@ class GravityModel:
     @property
     def standard(self) -> np.ndarray:
         """Standard parameters (p,) nearest to the description's that have the identified base parameters."""
-        found = self._nearest(MASS_SHARE)
+        estimate = self._nearest(MASS_SHARE)
         count = 10 * self.chain.n
-        described, masses = self.reference[9:count:10], found[9:count:10]
+        described, masses = self.reference[9:count:10], estimate[9:count:10]
         if np.any(masses < LEAST_SHARE * described):
             return self._nearest(0.0)
-        return found
+        return estimate
 
     def _nearest(self, mass_share: float) -> np.ndarray:
         """Return the nearest standard parameters, if masses may deviate by this share of the description's."""
@@ -175,9 +176,9 @@ class GravityModel:
     def bodies(self) -> np.ndarray:
         """Standard parameters (n, 10) of the arm's bodies; moments about the centres of mass are the description's."""
         count = self.chain.n
-        found = self.standard[: 10 * count].reshape(-1, 10)
+        estimate = self.standard[: 10 * count].reshape(-1, 10)
         reference = self.reference[: 10 * count].reshape(-1, 10)
-        return np.array([_with_centre(old, new) for old, new in zip(reference, found)])
+        return np.array([_with_centre(old, new) for old, new in zip(reference, estimate)])
 
     def payload(self, label: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Return first moments and mass (4,) of a payload in the tip's frame, and their covariance (4, 4).
@@ -185,21 +186,21 @@ class GravityModel:
         None where the poses do not determine them.
         """
         first = 10 * self.model.bodies.labels.index(label)
-        wanted = np.zeros((4, len(self.reference)))
-        wanted[np.arange(4), first + np.arange(6, 10)] = 1.0
+        selection = np.zeros((4, len(self.reference)))
+        selection[np.arange(4), first + np.arange(6, 10)] = 1.0
         transform = self.base.transform
-        combination = np.linalg.lstsq(transform.T, wanted.T, rcond=None)[0].T
-        if np.abs(combination @ transform - wanted).max() > EXACT:
+        combination = np.linalg.lstsq(transform.T, selection.T, rcond=None)[0].T
+        if np.abs(combination @ transform - selection).max() > EXACT:
             return None
         return combination @ self.values, combination @ self.covariance @ combination.T
 
 
-def _with_centre(reference: np.ndarray, found: np.ndarray) -> np.ndarray:
+def _with_centre(reference: np.ndarray, estimate: np.ndarray) -> np.ndarray:
     """Return a body (10,) with the mass and first moments found, and the reference's moments about the centre."""
     _, _, moments = urdf_write.centred(reference)
-    body = np.concatenate([np.zeros(6), found[6:10]])
+    body = np.concatenate([np.zeros(6), estimate[6:10]])
     _, _, steiner = urdf_write.centred(body)
-    return np.concatenate([moments - steiner, found[6:10]])
+    return np.concatenate([moments - steiner, estimate[6:10]])
 
 
 def _regressor(model: IdentificationModel, poses: StandingPoses) -> np.ndarray:
@@ -248,8 +249,10 @@ def _standing_rows(recording: Recording) -> list[np.ndarray]:
     for first, last in zip(starts, [*starts[1:], len(recording.q)]):
         if recording.t[last - 1] - recording.t[first] >= STANDING:
             standing.append(np.arange(first, last))
-    rows = sum(len(part) for part in standing)
-    return standing if rows >= SHARE * len(recording.q) else []
+    rows = sum(map(len, standing))
+    if rows < SHARE * len(recording.q):
+        return []
+    return standing
 
 
 def read_poses(path: str, chain: Chain, options: IdentifyOptions) -> StandingPoses:
@@ -270,16 +273,20 @@ def read_poses(path: str, chain: Chain, options: IdentifyOptions) -> StandingPos
             "has currents: gravity at rest is identified from torques; write columns tau1 … with gain x current [N m]",
             path,
         )
-    groups = _standing_rows(recording) if stamped else np.arange(len(recording.q))[:, None]
-    q = np.array([recording.q[rows].mean(axis=0) for rows in groups])
-    torque = np.array([recording.effort[rows].mean(axis=0) for rows in groups])
+    groups: Sequence[np.ndarray] = list(np.arange(len(recording.q))[:, None])
+    if stamped:
+        groups = _standing_rows(recording)
+    q, torque = [], []
+    for rows in groups:
+        q.append(recording.q[rows].mean(axis=0))
+        torque.append(recording.effort[rows].mean(axis=0))
     approach = None
     table = read_table(path)
     names = [f"approach{joint}" for joint in range(1, chain.n + 1)]
     if all(name in table for name in names):
         sides = np.column_stack([table.numbers(name, None) for name in names])
         approach = np.array([np.sign(sides[rows[0]]) for rows in groups])
-    return StandingPoses(path, q, torque, approach, tuple(settings.payload))
+    return StandingPoses(path, np.array(q), np.array(torque), approach, tuple(settings.payload))
 
 
 def fitted(chain: Chain, options: IdentifyOptions, poses: Sequence[StandingPoses]) -> GravityModel:
@@ -300,14 +307,14 @@ def fitted(chain: Chain, options: IdentifyOptions, poses: Sequence[StandingPoses
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     offsets = drives.standard(["off"] * chain.n, linear=linear)
     model = IdentificationModel(make_bodies(chain, options.settings), offsets)
-    loads = tuple({block.carried for block in poses})
+    loads = _loads(poses)
     q = np.concatenate([block.q for block in poses])
     zero = np.zeros(q.shape)
     base = base_parameters.find(model, States(q, zero, zero), loads)
     columns = [_regressor(model, block)[..., base.kept] for block in poses]
     W = np.concatenate(columns)
     torque = np.concatenate([block.torque for block in poses])
-    told = all(block.approach is not None for block in poses)
+    sided = all(block.approach is not None for block in poses)
     count, n = torque.shape
     if W.shape[0] * n < ROWS * base.b:
         needed = int(np.ceil(ROWS * base.b / n))
@@ -316,18 +323,23 @@ def fitted(chain: Chain, options: IdentifyOptions, poses: Sequence[StandingPoses
             "over the joints' ranges",
             poses[0].name,
         )
-    if told:
+    if sided:
         approach = np.concatenate([block.approach for block in poses])
         W = np.concatenate([W, approach[:, :, None] * np.eye(n)], axis=2)
     values, covariance, residual = _least_squares(W, torque)
     friction = np.quantile(np.abs(residual), 0.95, axis=0), np.full(n, np.nan)
-    if told:
+    if sided:
         friction = np.abs(values[base.b :]), np.sqrt(np.diag(covariance))[base.b :]
     reference = np.zeros(model.p)
     if chain.inertias is not None:
         arm = standard_parameters(chain)
         reference[: len(arm)] = arm
     return GravityModel(chain, model, base, values[: base.b], covariance[: base.b, : base.b], friction, reference)
+
+
+def _loads(blocks: Sequence[StandingPoses]) -> tuple[tuple[str, ...], ...]:
+    """Return the distinct sets of payloads with which the poses were measured."""
+    return tuple(dict.fromkeys(block.carried for block in blocks))
 
 
 def _least_squares(W: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -363,8 +375,8 @@ def divided(blocks: Sequence[StandingPoses], seed: int) -> tuple[list[StandingPo
     for block in blocks:
         _, pose = np.unique(np.round(block.q / SAME), axis=0, return_inverse=True)
         distinct = int(pose.max()) + 1
-        held = random.permutation(distinct)[: max(1, round(HELD_OUT * distinct))]
-        out = np.isin(pose.ravel(), held)
+        chosen = random.permutation(distinct)[: max(1, round(HELD_OUT * distinct))]
+        out = np.isin(pose.ravel(), chosen)
         training.append(block.where(~out))
         unseen.append(block.where(out))
     return training, unseen
@@ -387,7 +399,9 @@ class GravityResult:
 
     def errors(self, described: bool = False) -> np.ndarray:
         """Return the torque errors (N, n) at the held-out poses, of the model or of the description."""
-        predict = self.gravity.described if described else self.gravity.torque
+        predict = self.gravity.torque
+        if described:
+            predict = self.gravity.described
         return np.concatenate([block.torque - predict(block) for block in self.unseen])
 
     def unexplained(self, described: bool = False) -> float:
@@ -403,7 +417,7 @@ class GravityResult:
         gravity = self.gravity
         if gravity.chain.inertias is None:
             return None
-        stated = np.asarray(gravity.model.bodies.gravity)
+        assumed = np.asarray(gravity.model.bodies.gravity)
         columns = []
         for direction in np.eye(3):
             model = replace(gravity.model, bodies=gravity.model.bodies.with_gravity(direction))
@@ -411,8 +425,8 @@ class GravityResult:
             columns.append(_varying(np.concatenate(blocks)))
         W = np.array(columns).T
         torque = _varying(np.concatenate([block.torque for block in self.training]))
-        size = np.linalg.norm(stated)
-        expected = W @ stated
+        size = np.linalg.norm(assumed)
+        expected = W @ assumed
         if not np.linalg.norm(expected):
             return None
         direction = np.linalg.lstsq(W, torque, rcond=None)[0]
@@ -423,7 +437,7 @@ class GravityResult:
         if scale < ABSENT * size:
             reason = f"the torques vary by {100 * scale / size:.2g} % of the described masses' gravity"
             return Verdict("fail", reason, "", "are they compensated for gravity already? Log them before compensation")
-        if direction @ stated < ALIKE * scale * size and after < BETTER * before:
+        if direction @ assumed < ALIKE * scale * size and after < BETTER * before:
             believed = direction / scale * size
             # an arm on a wall or a ceiling stands along an axis
             upright = np.round(believed / size)
@@ -453,7 +467,10 @@ class GravityResult:
         if share <= PASS:
             return Verdict("pass", reason)
         advice = "are torques those of the motors at rest, and are joints, signs and units the description's?"
-        return Verdict("marginal" if share <= FAIL else "fail", reason, "", advice)
+        level = "fail"
+        if share <= FAIL:
+            level = "marginal"
+        return Verdict(level, reason, "", advice)
 
     def lines(self) -> list[str]:
         """Return the lines for the console and ``summary.txt``."""
@@ -468,10 +485,12 @@ class GravityResult:
         rms = np.sqrt(np.mean(self.errors() ** 2, axis=0))
         band, sigma = gravity.friction
         for joint, error, width, deviation in zip(chain.joints, rms, band, sigma):
-            unit = "N" if joint.kind == "prismatic" else "N m"
-            known = "band of 95 %" if np.isnan(deviation) else f"± {deviation:.2g}, from both approaches"
+            _, _, _, unit = motion_units([joint.kind])
+            basis = f"± {deviation:.2g}, from both approaches"
+            if np.isnan(deviation):
+                basis = "band of 95 %"
             result.append(
-                f"{joint.name}: held out {error:.3g} {unit} rms; friction at rest ± {width:.3g} {unit} ({known})"
+                f"{joint.name}: held out {error:.3g} {unit} rms; friction at rest ± {width:.3g} {unit} ({basis})"
             )
         if np.isnan(sigma).all():
             result.append("with columns approach1 … (+1, -1: the side from which a joint came) friction is estimated")
@@ -485,16 +504,21 @@ class GravityResult:
         return result
 
     def _labels(self) -> list[str]:
-        carried = {label for block in self.training for label in block.carried}
+        carried: set[str] = set()
+        for block in self.training:
+            carried.update(block.carried)
         return sorted(carried)
 
     def _payload_line(self, label: str) -> str:
-        found = self.gravity.payload(label)
-        if found is None:
+        estimate = self.gravity.payload(label)
+        if estimate is None:
             return f"payload {label}: not determined; measure the same poses without it too, with the wrist turned"
-        values, covariance = found
+        values, covariance = estimate
         centre, sigma = _centre(values, covariance)
-        position = ", ".join(f"{1e3 * x:.1f} ± {1e3 * s:.1g}" for x, s in zip(centre, sigma))
+        coordinates = []
+        for coordinate, deviation in zip(1e3 * centre, 1e3 * sigma):
+            coordinates.append(f"{coordinate:.1f} ± {deviation:.1g}")
+        position = ", ".join(coordinates)
         mass = f"{values[3]:.4g} ± {np.sqrt(covariance[3, 3]):.2g} kg"
         return f"payload {label}: {mass} at {position} mm in '{self.gravity.chain.tip}'"
 
@@ -505,13 +529,14 @@ class GravityResult:
         lower, upper = gravity.chain.sampling_limits()
         states = base_parameters.random_samples(model, lower=lower, upper=upper)
         zero = np.zeros(states.q.shape)
-        loads = tuple({block.carried for block in self.training})
-        possible = base_parameters.find(model, States(states.q, zero, zero), loads)
+        possible = base_parameters.find(model, States(states.q, zero, zero), _loads(self.training))
         missing = [name for name in possible.names if name not in gravity.base.names]
         if possible.b <= gravity.base.b:
             return []
         count = possible.b - gravity.base.b
-        names = f", such as {listing(missing, 3)}" if missing else ""
+        names = ""
+        if missing:
+            names = f", such as {listing(missing, 3)}"
         return [f"{count} more parameters of gravity need other poses{names}: move all joints over their ranges"]
 
     def write(self, out: Path) -> Path:
@@ -523,16 +548,16 @@ class GravityResult:
         gravity = self.gravity
         sigma = np.sqrt(np.diag(gravity.covariance))
         rows = zip(gravity.base.names, gravity.base.units, gravity.values, sigma)
-        files.write_table(out / "gravity.csv", ["name", "unit", "value", "sigma"], [list(row) for row in rows])
+        files.write_table(out / "gravity.csv", ["name", "unit", "value", "sigma"], list(rows))
         names = gravity.chain.joint_names
-        friction = [list(row) for row in zip(names, *gravity.friction)]
+        friction = list(zip(names, *gravity.friction))
         files.write_table(out / "friction_at_rest.csv", ["joint", "band", "sigma"], friction)
         payloads = []
         for label in self._labels():
-            found = gravity.payload(label)
-            if found is not None:
-                centre, centre_sigma = _centre(*found)
-                payloads.append([label, found[0][3], *centre, np.sqrt(found[1][3, 3]), *centre_sigma])
+            estimate = gravity.payload(label)
+            if estimate is not None:
+                centre, centre_sigma = _centre(*estimate)
+                payloads.append([label, estimate[0][3], *centre, np.sqrt(estimate[1][3, 3]), *centre_sigma])
         if payloads:
             head = ["payload", "mass [kg]", "x [m]", "y [m]", "z [m]"]
             head += ["sigma_mass [kg]", "sigma_x [m]", "sigma_y [m]", "sigma_z [m]"]
@@ -590,15 +615,16 @@ def _edited(gravity: GravityModel, source: Path) -> str | None:
     path = tree.path(gravity.chain.base, gravity.chain.tip)
     change = gravity.bodies - gravity.reference[: 10 * gravity.chain.n].reshape(-1, 10)
     links = {}
-    for joint, step in zip([joint for joint in path if joint.moves], change):
+    moving = [joint for joint in path if joint.moves]
+    for joint, step in zip(moving, change):
         body = tree.bodies[joint.child]
         if body is None:
             return None
         turn = urdf.align(joint.axis)[:3, :3]
-        found = np.concatenate([np.zeros(6), body[6:9] + turn @ step[6:9], body[9:] + step[9:]])
-        if not found[9] > 0.0:
+        estimate = np.concatenate([np.zeros(6), body[6:9] + turn @ step[6:9], body[9:] + step[9:]])
+        if not estimate[9] > 0.0:
             return None
-        links[joint.child] = _with_centre(body, found)
+        links[joint.child] = _with_centre(body, estimate)
     text = urdf_write.put(xml, str(source), links)
     written = urdf.parse(text, str(source), gravity.chain.base, gravity.chain.tip)
     if written.inertias is None or np.abs(written.inertias - gravity.bodies)[:, 6:].max() > 1e-6:
@@ -643,7 +669,7 @@ def check_target(out: Path, inputs: Sequence[str | Path | None]) -> None:
     """Raise UsageError if a folder contains files that this command does not write, or one of the inputs."""
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out} is a file: give a folder")
-    names = [path.name for path in out.iterdir()] if out.is_dir() else []
+    names = [path.name for path in out.glob("*")]
     foreign = [name for name in names if name not in NAMES]
     resolved = {Path(name).resolve() for name in inputs if name}
     if foreign or any((out / name).resolve() in resolved for name in names):
