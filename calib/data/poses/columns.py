@@ -7,7 +7,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from calib.controllers.table import as_described
+from calib.controllers.axes import as_described, named_joints
 from calib.data.csv_table import Table
 from calib.data.joint_columns import (
     described,
@@ -143,12 +143,14 @@ class Sheet:
         """Return joint values (m, n) [rad or m], and the file's names of the joint columns.
 
         Args:
-            joints: names of the robot's n joints, in the robot's order, or the joints with their types.
+            joints: the robot's n joints, or only their names (then taken as revolute), in the robot's order.
         """
+        robot = Joints.of(joints)
         names = self.find_joints(joints)
-        q = self.numbers(names, Column(Joints.of(joints).names, "joint", "joints"))
+        q = self.numbers(names, Column(robot.names, "joint", "joints"))
         if self.options.controller:
-            q = as_described(self.options.controller, q)
+            named = named_joints(robot.names, robot.kinds)
+            q = as_described(self.options.controller, q, named, self.options.external)
         return q, names
 
     def check_names(self, joints: Sequence[str]) -> None:
