@@ -12,7 +12,7 @@ are compared by these angles first; those that agree are placed (Shah 2013) and 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from calib.errors import refuse_data
 from calib.records import evenly
 from calib.toolkit.installations import direction, median_misfit
-from calib.toolkit.pose_pairs import MAX_METRES, PoseList, PosePairs, poses_of
+from calib.toolkit.pose_pairs import PoseList, PosePairs, poses_of
 from calib.transforms import invert
 from calib.units import DEG, LENGTHS
 
@@ -75,61 +75,54 @@ def agreed(pairs: PosePairs) -> tuple[Reading, list[str]]:
     """
     robot_position, robot_note = pairs.robot.metres()
     seen_position, seen_note = pairs.seen.metres()
+    best = _best_reading(pairs, robot_position, seen_position)
+    if not pairs.seen.length_unit and len(pairs) >= MIN_ROWS and not direction(best.robot, best.seen).agrees:
+        for unit in UNITS:
+            reading = _best_reading(pairs, robot_position, pairs.seen.position * LENGTHS[unit])
+            ways = direction(reading.robot, reading.seen)
+            if ways.agrees and ways.is_inverse is not None:
+                best = reading
+                name = pairs.seen.name or "poses"
+                seen_note = f"{name}: the lengths are read as {unit}, with which the poses agree (no unit is stated)"
+                break
     notes = [note for note in (robot_note, seen_note) if note]
+    for poses, convention in zip((pairs.robot, pairs.seen), best.conventions):
+        if convention and convention != poses.convention:
+            stated = f" ({poses.convention} is stated)" if poses.convention else ""
+            name = poses.name or "poses"
+            notes.append(f"{name}: the orientation is read as {convention}, with which the poses agree{stated}")
+    return best, notes
+
+
+def _best_reading(pairs: PosePairs, robot_position: np.ndarray, seen_position: np.ndarray) -> Reading:
+    """Return the reading of the orientations in which poses agree; the stated one unless another agrees clearly better.
+
+    Args:
+        pairs: m pairs of poses.
+        robot_position, seen_position: (m, 3) their positions [m].
+    """
     rows = evenly(len(pairs), MAX_ROWS)
     robot_turns = dict(pairs.robot.readings())
     seen_turns = dict(pairs.seen.readings())
     choices = list(_choices(robot_turns, seen_turns, rows))
-    stated = pairs.robot.convention, pairs.seen.convention
-    is_stated = _states(pairs.robot) and _states(pairs.seen)
-    first = choices[0]
     smallest = min(gap for gap, _ in choices)
     limit = max(MAX_GAP, GAP_RATIO * smallest)
     likely = sorted((choice for choice in choices if choice[0] <= limit), key=lambda choice: choice[0])
     readings = []
-    for _, names in dict.fromkeys([first, *likely[:MAX_PLACED]]):
+    for _, names in dict.fromkeys([choices[0], *likely[:MAX_PLACED]]):
         robot = poses_of(robot_position, robot_turns[names[0]])
         seen = poses_of(seen_position, seen_turns[names[1]])
         readings.append(_placed(robot, seen, names, rows))
     as_stated = readings[0]
     readings.sort(key=lambda reading: reading.misfit)
     best = readings[0]
+    is_stated = _states(pairs.robot) and _states(pairs.seen)
     if is_stated and as_stated.misfit <= CLEAR_RATIO * best.misfit:
-        return _in_likely_unit(pairs, as_stated, notes), notes
+        return as_stated
     others = [reading for reading in readings[1:] if not reading.equals(best)]
     if others and not is_stated:
         _check_clear(pairs, best, others[0])
-    for poses, convention, name in zip((pairs.robot, pairs.seen), best.conventions, stated):
-        if convention and convention != name:
-            notes.append(
-                f"{poses.name or 'poses'}: the orientation is read as {convention}, with which the poses agree"
-                f"{f' ({name} is stated)' if name else ''}"
-            )
-    return _in_likely_unit(pairs, best, notes), notes
-
-
-def _in_likely_unit(pairs: PosePairs, reading: Reading, notes: list[str]) -> Reading:
-    """Return a reading with the lengths of the poses seen in the unit with which they agree, where none is stated.
-
-    Args:
-        pairs: the pairs.
-        reading: their reading.
-        notes: remarks, to which that on the unit is added.
-    """
-    if pairs.seen.length_unit or len(pairs) < MIN_ROWS or direction(reading.robot, reading.seen).agrees:
-        return reading
-    read_unit = "m" if np.abs(pairs.seen.position).max() <= MAX_METRES else "mm"
-    for unit in UNITS:
-        factor = LENGTHS[unit] / LENGTHS[read_unit]
-        seen = reading.seen.copy()
-        seen[:, :3, 3] *= factor
-        ways = direction(reading.robot, seen)
-        if unit != read_unit and ways.agrees and ways.is_inverse is not None:
-            name = pairs.seen.name or "poses"
-            notes[:] = [note for note in notes if not note.startswith(f"{name}: up to")]
-            notes.append(f"{name}: the lengths are read as {unit}, with which the poses agree (no unit is stated)")
-            return replace(reading, seen=seen)
-    return reading
+    return best
 
 
 def _states(poses: PoseList) -> bool:

@@ -133,8 +133,8 @@ def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurem
     if not ways.is_inverse:
         return block
     note = (
-        f"the poses agree as their inverse ({1e3 * ways.inverse:.3g} mm, as they are {1e3 * ways.direct:.3g} mm, median "
-        "misfit): read as what stands (board) seen from what the arm carries (camera)"
+        f"the poses agree as their inverse ({1e3 * ways.inverse:.3g} mm, as they are {1e3 * ways.direct:.3g} mm, "
+        "median misfit): read as what stands (board) seen from what the arm carries (camera)"
     )
     if not block.mounting:
         note += "; if the arm carries the board, state [camera] mounting = 'to hand' in the options"
