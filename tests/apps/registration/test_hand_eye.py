@@ -213,7 +213,7 @@ def test_camera_turned_halfway_is_named_with_its_row(tmp_path):
     fit = calib.hand_eye(None, table(tmp_path / "pairs.csv", robot, seen))
     assert fit.verdict == "fail"
     text = str(fit)
-    assert "rows 1–8 and 9–14 agree each by themselves" in text
+    assert "rows 1–8 and 9–14 agree apart" in text
     assert "what the arm carries was turned by 180°" in text
 
 
