@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import Bars, Distances, Planes, PoseMeasurements, Poses, Positions, Sockets
 from calib.errors import refuse_data
+from calib.estimation.robust import Loss
 from calib.geometry.installation import Seen
 
 # largest number of Gauss–Newton steps for the centre of a bar, and length of a step that ends them [m]
@@ -117,7 +118,7 @@ class ResidualPart:
         return self
 
     def common_noise(
-        self, sigma: np.ndarray, unknowns: int, loss: str, scale: float | None, start: bool
+        self, sigma: np.ndarray, unknowns: int, loss: str | Loss, scale: float | None, start: bool
     ) -> CommonNoise | None:
         """Return the errors that rows share, estimated from the residuals; None for kinds without shared errors.
 

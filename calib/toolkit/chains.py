@@ -15,6 +15,8 @@ from calib.robot.formats.urdf_tree import text as description_text
 from calib.robot.kinematics import forward, joint_frames
 from calib.robot.library import load, load_calibrated, resolve
 from calib.robot.library import names as robot_names
+from calib.robot.tables import dumps as toml_text
+from calib.robot.tables import load as toml_table
 
 __all__ = [
     "AXES",
@@ -49,6 +51,8 @@ __all__ = [
     "read_tree",
     "resolve",
     "robot_names",
+    "toml_table",
+    "toml_text",
     "urdf_meshes",
     "write_calibrated",
 ]

@@ -4,7 +4,6 @@ from contextlib import suppress
 from itertools import product
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from calib import files
@@ -13,6 +12,10 @@ from calib.data.images.board import KINDS, MIN_CORNERS, Board, corners, read_boa
 from calib.data.images.images import quiet
 from calib.data.poses import BOARD
 from calib.errors import CalibError, UsageError, require
+from calib.workers.extras import needing
+
+with needing("cv2"):
+    import cv2
 
 # Formats of paper: short and long side [m].
 PAPERS = {"a4": (0.210, 0.297), "a3": (0.297, 0.420), "a2": (0.420, 0.594), "a1": (0.594, 0.841), "a0": (0.841, 1.189)}

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from calib.data.images.board import MIN_CORNERS, Board, corners
@@ -19,6 +18,10 @@ from calib.data.images.images import quiet, read_image
 from calib.data.images.marker_layout import INNER, OLD_PATTERN, has_two_patterns, layout_words, other_dictionary
 from calib.data.images.pixels import Detection, Detections
 from calib.errors import MeasurementError
+from calib.workers.extras import needing
+
+with needing("cv2"):
+    import cv2
 
 # Lower bound of a corner's sigma [px]; tags' corners move with blur.
 FLOOR = {"charuco": 0.02, "chessboard": 0.02, "apriltag": 0.2}

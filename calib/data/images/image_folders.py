@@ -68,7 +68,7 @@ def read_images(
     board = read_own_board(path)
     table = joint_table(path)
     sheet = Sheet(table, options)
-    q, columns = sheet.joints(robot.names)
+    q, columns = sheet.joints(robot)
     notes = list(plausible.check_joints(q, sheet, columns, robot))
     names = table.texts("image")
     detection = find_corners(path, board, names, progress)

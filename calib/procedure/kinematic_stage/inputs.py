@@ -8,6 +8,7 @@ import numpy as np
 
 from calib.data.images.pixels import Pixels
 from calib.data.poses import JOINTS, is_image_folder
+from calib.data.poses.columns import Undecided
 from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.plausible import check_block
@@ -19,6 +20,7 @@ from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
 from calib.geometry.repeatability import repeated, repeated_rows, without_copies
+from calib.procedure.kinematic_stage.readings import decided
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import joints_of
 from calib.robot import calibrated, description
@@ -350,7 +352,10 @@ def read_file(
             for planned_poses in PLANNED_POSES.all():
                 blocks += planned_poses(path, chain, file_options)
         if not blocks:
-            blocks = read_measurements(path, joints, file_options)
+            try:
+                blocks = read_measurements(path, joints, file_options)
+            except Undecided as undecided:
+                blocks = decided(chain, undecided, joints)
 
     result = []
     for block in blocks:
