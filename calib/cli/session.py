@@ -102,8 +102,8 @@ def formats(topic: Annotated[str | None, typer.Argument(autocompletion=topics)] 
 
     Args:
         topic: measurements, instruments, robodk, join, images, descriptions, moveit, ros2, targets, programs, frames,
-            logs, pairs, identify-options, options, identified, exports, constraints, mdh, parallel, robot, session,
-            limits, waypoints, excitation, study or recordings
+            logs, identify-options, options, identified, exports, constraints, mdh, parallel, robot, session, limits,
+            waypoints, excitation, study, pairs or recordings
         schema: the JSON schema of a TOML file, for editors that complete its keys
     """
     from calib.procedure import formats as documents

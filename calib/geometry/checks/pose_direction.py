@@ -134,7 +134,8 @@ def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurem
         return block
     note = (
         f"the poses agree as their inverse ({1e3 * agreement.inverse:.3g} mm, as they are "
-        f"{1e3 * agreement.direct:.3g} mm, median misfit): read as what stands (board) seen from what the arm carries (camera)"
+        f"{1e3 * agreement.direct:.3g} mm, median misfit): read as what stands (board) seen from what the arm carries "
+        "(camera)"
     )
     if not block.mounting:
         note += "; if the arm carries the board, state [camera] mounting = 'to hand' in the options"
