@@ -40,6 +40,7 @@ HOMES = {
         "calib.data.images.images",
         "calib.data.images.board_and_lens",
         "calib.data.images.board_print",
+        "calib.data.images.marker_layout",
         "calib.simulation.rendered_camera",
     ],
     "ruamel": ["calib.data.trees", "calib.procedure.measuring.moveit"],

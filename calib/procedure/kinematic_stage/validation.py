@@ -143,7 +143,7 @@ def judge(
     if worst is None:
         return Verdict.of("", [finding("no-unseen-poses"), *common])
     if frames_only:
-        return _frames_verdict(worst, tolerance, arm, common)
+        return _frames_verdict(worst, fitted_rms, tolerance, arm, common)
 
     # Grossly wrong unseen rows refute no promise of the fit.
     if gross:
@@ -155,19 +155,23 @@ def judge(
     return verdict
 
 
-def _frames_verdict(worst: _Proof, tolerance: float | None, arm: str, findings: Sequence[Finding]) -> Verdict:
+def _frames_verdict(
+    worst: _Proof, fitted_rms: float, tolerance: float | None, arm: str, findings: Sequence[Finding]
+) -> Verdict:
     """Return the verdict if only base and tool placement (frames) were fitted.
 
     With a tolerance it is pass or follows from the findings; without a tolerance it is not judged.
 
     Args:
         worst: the errors on which the verdict is based.
+        fitted_rms: rms error on the fitted poses [m].
         tolerance: largest acceptable rms on held-out poses [m]; None if not stated.
         arm: name of the deliverable if there are several; otherwise empty.
         findings: findings on these errors.
     """
     if tolerance is not None:
-        return Verdict.of(_figures(worst, arm, tolerance), findings)
+        above = finding("fitted-above-tolerance", rms=fitted_rms, tolerance=tolerance, times=fitted_rms / tolerance)
+        return Verdict.of(_figures(worst, arm, tolerance), [*findings, above])
     verdict = Verdict.of(sentence(finding("frames-only", rms=worst.after, where=worst.where)), findings)
     if verdict.level == "pass":
         return replace(verdict, level=NOT_JUDGED)
