@@ -62,7 +62,7 @@ from calib.toolkit.pose_data import (
     read_fit_options,
     read_table,
 )
-from calib.toolkit.result_folders import lines_of
+from calib.toolkit.result_folders import joints_of, lines_of
 
 METHODS = ("name", "time", "row", "geometry", "motion")
 # requirements of each method except motion, for messages
@@ -199,7 +199,7 @@ def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joine
     else:
         pose = np.arange(len(points))
     if chain is not None and by != "time":
-        q, _ = Sheet(joints).joints(chain.joint_names)
+        q, _ = Sheet(joints).joints(joints_of(chain))
         candidates = {} if by == "geometry" else {f"joined by {by}": pose}
         pose, notes = ordered(chain, q, points, candidates)
     else:
