@@ -44,6 +44,7 @@ HOMES = {
     "ruamel": ["calib.data.images.lens", "calib.procedure.measuring.moveit"],
     "mcap": ["calib.data."],
     "rosbags": ["calib.data.recordings.bags", "calib.data.images."],
+    "pyarrow": ["calib.data.recordings.datasets"],
     "pandas": ["calib.api.rendering"],
     "starlette": ["calib.apps.serve.pages"],
     "uvicorn": ["calib.apps.serve.commands"],

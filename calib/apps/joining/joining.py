@@ -47,6 +47,7 @@ from calib.errors import MeasurementError, UsageError, counted, finding, listing
 from calib.toolkit.chains import CalibratedChain, Chain, load_calibrated
 from calib.toolkit.installations import check_scale
 from calib.toolkit.pose_data import POSITION, SIGMA, PoseMeasurements, Sheet, Table, read_table
+from calib.toolkit.recordings import dataset_table, is_dataset
 from calib.toolkit.result_folders import lines_of
 
 METHODS = ("name", "time", "row", "geometry", "motion")
@@ -110,6 +111,8 @@ def join(
         return join_streams(joints_file, points_file, robot.complete, mapping)
     if is_program(joints_file):
         joint_table = joints_table(joints_file)
+    elif is_dataset(joints_file):
+        joint_table = dataset_table(joints_file)
     else:
         joint_table = read_table(joints)
     chain = None if robot is None else robot.complete

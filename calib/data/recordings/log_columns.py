@@ -218,24 +218,28 @@ def paste(header: Sequence[str], joints: Joints, needed: Sequence[str]) -> str:
         needed: the toolkit's names of the series.
     """
     patterns = [family.pattern for family in families(header, joints) if not family.series]
-    headings = [heading for heading in header if not heading.startswith("\0")]
+    count = len(joints.names)
+    by_series: dict[str, list[str]] = {}
+    for heading in header:
+        if not heading.startswith("\0"):
+            by_series.setdefault(series_of(words_of(heading)), []).append(heading)
+    unknown = by_series.get("", [])
     entries = []
     for series in needed:
-        if patterns:
+        headings = by_series.get(series, [])
+        if count and len(headings) >= count:
+            entries += _joint_by_joint(series, headings[:count])
+        elif patterns:
             entries.append(f'{series} = "{patterns.pop(0)}"')
-        elif not entries and len(joints.names) and len(headings) >= len(joints.names) * len(needed):
-            entries += _joint_by_joint(headings, len(joints.names), needed)
-            break
+        elif count and len(unknown) >= count * len(needed):
+            entries += _joint_by_joint(series, unknown[:count])
+            unknown = unknown[count:]
     return f"columns = {{ {', '.join(entries)} }}" if entries else ""
 
 
-def _joint_by_joint(headings: Sequence[str], count: int, needed: Sequence[str]) -> list[str]:
-    """Return entries of the options' [columns] for each series and joint, in the order of the headings."""
-    entries = []
-    remaining = iter(headings)
-    for series in needed:
-        entries += [f'{series}{number} = "{next(remaining)}"' for number in range(1, count + 1)]
-    return entries
+def _joint_by_joint(series: str, headings: Sequence[str]) -> list[str]:
+    """Return entries of the options' [columns] for a series, with one heading per joint."""
+    return [f'{series}{number} = "{heading}"' for number, heading in enumerate(headings, 1)]
 
 
 def mapping_line(header: Sequence[str], joints: Joints, columns_of: Mapping[str, Sequence[int]]) -> str:

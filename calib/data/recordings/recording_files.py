@@ -1,4 +1,4 @@
-"""Recordings from files: NumPy archives, CSV tables or ROS bags, recognised by their first bytes.
+"""Recordings from files: NumPy archives, CSV tables, ROS bags or LeRobot data sets, by their first bytes.
 
 A CSV table has one column of stamps, one per joint and quantity (``q1 [deg]``, ``tau_elbow [Nm]``). A quantity's name
 (`recording_options`) is before or after the joint's number or name, with or without a ``_`` (``q1``, ``q_1``,
@@ -20,6 +20,7 @@ from calib.data.joint_columns import words_of
 from calib.data.recordings import log_columns
 from calib.data.recordings.archives import read_archive
 from calib.data.recordings.checks import check_recording
+from calib.data.recordings.datasets import dataset_table, is_dataset
 from calib.data.recordings.recording import Ends, Recording, earlier, in_pieces, named, parse_cut, rows_used
 from calib.data.recordings.recording_options import (
     MEASURED,
@@ -56,7 +57,7 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
         options: options for reading the file.
         ends: begin and end of the part to read; None: no bound.
     """
-    table = _numbered_brackets(read_table(path, doubles=True))
+    table = dataset_table(path) if is_dataset(path) else _numbered_brackets(read_table(path, doubles=True))
     robot_joints = joints or NO_JOINTS
     joint_names = robot_joints.names
     columns_of, column_notes = _find_columns(table, options, robot_joints)
@@ -451,6 +452,8 @@ def _reader(path: Path, ends: Ends) -> Reader:
     try:
         if path.exists():
             check_regular(path)
+        if is_dataset(path) and path.exists():
+            return partial(read_log, ends=ends)
         if path.is_dir() or path.suffix in (".bag", ".mcap", ".db3"):
             from calib.data.recordings.bags import read_bag
 
