@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.typesys.store import Typestore
 
+Message = Any  # as rosbags makes it from the message's definition
 JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 FRANKA_STATE = ("franka_msgs/msg/FrankaRobotState",)  # of franka_ros2
 DYNAMIC_STATE = ("control_msgs/msg/DynamicJointState", "control_msgs/DynamicJointState")
@@ -167,7 +168,7 @@ def _interface_names(reader: AnyReader) -> dict[str, tuple[str, ...]]:
     connections = [connection for connection in reader.connections if connection.msgtype == INTERFACE_NAMES]
     if connections:
         for connection, _, raw in reader.messages(connections=connections):
-            message: Any = reader.deserialize(raw, connection.msgtype)
+            message: Message = reader.deserialize(raw, connection.msgtype)
             names.setdefault(_namespace(connection), tuple(message.names))
     return names
 
@@ -180,7 +181,7 @@ def _is_there(values: np.ndarray) -> bool:
     return len(values) > 0 and not np.isnan(values).all()
 
 
-def as_joint_state(message: Any, interfaces: Sequence[str] = ()) -> JointState:
+def as_joint_state(message: Message, interfaces: Sequence[str] = ()) -> JointState:
     """Return a message of any accepted type as a joint state.
 
     Args:
@@ -210,7 +211,7 @@ def as_joint_state(message: Any, interfaces: Sequence[str] = ()) -> JointState:
     return JointState(stamp, tuple(message.name), message.position, message.velocity, message.effort, empty)
 
 
-def _first_point(message: Any, names: Sequence[str]) -> Any:
+def _first_point(message: Message, names: Sequence[str]) -> Message:
     """Return the first of a message's points that has positions; the first that there is if none has."""
     points = [getattr(message, name) for name in names if hasattr(message, name)]
     return next((point for point in points if len(point.positions)), points[0])
@@ -337,7 +338,7 @@ def joint_states(
     return names, arrays, skipped
 
 
-def header_stamp(message: Any) -> int:
+def header_stamp(message: Message) -> int:
     """Return the time stamp in a message's header [ns]; 0 if it is not set."""
     return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 

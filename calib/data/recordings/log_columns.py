@@ -231,7 +231,7 @@ def paste(header: Sequence[str], joints: Joints, needed: Sequence[str]) -> str:
             entries += _joint_by_joint(series, headings[:count])
         elif patterns:
             entries.append(f'{series} = "{patterns.pop(0)}"')
-        elif count and len(unknown) >= count * len(needed):
+        elif count and len(unknown) >= count:
             entries += _joint_by_joint(series, unknown[:count])
             unknown = unknown[count:]
     return f"columns = {{ {', '.join(entries)} }}" if entries else ""

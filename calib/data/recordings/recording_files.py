@@ -2,8 +2,12 @@
 
 A CSV table has one column of stamps, one per joint and quantity (``q1 [deg]``, ``tau_elbow [Nm]``). A quantity's name
 (`recording_options`) is before or after the joint's number or name, with or without a ``_`` (``q1``, ``q_1``,
-``position_elbow``, ``elbow_position``, ``J1 pos``; ``q[1]`` has a number, not a unit); numbers start at 0 or 1. What
-bags hold: ``calib formats logs``.
+``position_elbow``, ``elbow_position``, ``J1 pos``; ``q[1]`` has a number, not a unit); numbers start at 0 or 1. Other
+names are told by their words (``/joint_states/elbow/position`` of PlotJuggler, ``A1 current [mA]``, ``Winkel A1``), and
+said as a line ``columns = { … }``, which options files take. Rows without positions (of other topics) are left out;
+quantities that are NaN in every row are not provided. Times without a unit that can be no seconds are read in the only
+plausible one. Bags, data sets, and what ROS's tools print: ``calib formats logs``. Positions and torques in files of
+their own: ``calib join``.
 """
 
 import logging

@@ -1,4 +1,4 @@
-"""Logs as ROS's tools and PlotJuggler export them: any order of joints, other topics between, quantities not provided."""
+"""Logs as ROS's tools and PlotJuggler export them: any order of joints, rows of other topics, absent quantities."""
 
 import re
 import tomllib
@@ -178,11 +178,7 @@ def test_columns_are_told_by_words(tmp_path, series, names, words, decimal):
 
 @pytest.mark.parametrize(
     "header",
-    [
-        ["enc_{joint}", "load_{joint}"],
-        ["pan_a lift_a wrist_a", "pan_b lift_b wrist_b"],
-        ["pos_x pos_y pos_z", "u1 u2 u3"],
-    ],
+    [["enc_{joint}", "load_{joint}"], ["pan_a lift_a wrist_a", "pan_b lift_b wrist_b"], ["aa bb cc", "u1 u2 u3"]],
 )
 def test_proposed_line_works(tmp_path, series, header):
     """The line that a message proposes is valid TOML, and the file is read with it."""
@@ -251,7 +247,7 @@ def test_column_of_times_is_told_by_words():
     assert time_column(["time_constant", "q1"]) is None
 
 
-@pytest.mark.parametrize("back", [0.3e-3, 2e-3])
+@pytest.mark.parametrize("back", [0.3e-3, 2.1e-3])
 def test_small_steps_back_are_no_second_log(tmp_path, series, back):
     """Stamps that run back by 0.3 to 2 ms at 4 kHz are put in order."""
     t = np.arange(ROWS) / 4000.0
