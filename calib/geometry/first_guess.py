@@ -258,7 +258,7 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
 
 
 def checked_rows(block: Poses) -> np.ndarray:
-    """Return the indices of the rows by which orientations are checked, all of one tool."""
+    """Return the indices of the rows by which a block's orientations are checked: of the target with most rows."""
     rows = np.flatnonzero(block.tool == np.argmax(np.bincount(block.tool)))
     return rows[evenly(len(rows), CHECKED_ROWS)]
 

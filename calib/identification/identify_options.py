@@ -144,6 +144,7 @@ FINDINGS = (
     "gravity",
     "encoder",
     "payload",
+    "robot",
 )
 """Names in ``accept``: the codes in chapters 9 and 10 of the catalogue of findings."""
 Texts = Annotated[tuple[Name, ...], Spread(words="a text, or a list of texts")]

@@ -38,6 +38,8 @@ def join(
         by: how rows are matched. Default: the first that both files have columns for
         options: TOML with [columns] and [units], as for calib fit and calib identify
         robot: its nominal geometry checks the order, or finds it (--by geometry), or the clocks (--by motion)
+        options: TOML whose [columns], [units], controller and euler say how the two files are read: calib formats
+            options; calib fit reads the result without them
     """
     from calib.apps.joining import joining
     from calib.files import results

@@ -10,8 +10,13 @@ import numpy as np
 from calib import files
 from calib.toolkit.pose_data import Table
 
-NAMES = ("name", "point", "pointname", "pointid", "pose", "poseid", "id", "label", "target", "number", "no", "nr")
-CLOCKS = ("t", "time", "timestamp", "datetime")
+# in small letters, without punctuation; English, German, French, Italian, Spanish
+NAMES = (
+    *("name", "point", "pointname", "pointid", "pose", "poseid", "id", "label", "target", "number", "no", "nr"),
+    *("punkt", "punktname", "punktnummer", "punktnr", "messpunkt", "ziel", "nummer"),
+    *("nom", "numero", "nome", "punto", "nombre"),
+)
+CLOCKS = ("t", "time", "timestamp", "datetime", "zeit", "zeitstempel", "temps", "tempo", "tiempo")
 
 
 def column_of(table: Table, names: Sequence[str]) -> str:

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from calib.apps.joining.joined import CLOCKS
 from calib.config import parse, read_toml, strict
 from calib.config_types import Name, Text
 from calib.errors import MeasurementError, suggestion
@@ -51,6 +52,15 @@ def read_mapping(path: Path | None) -> JoinOptions:
     tables = read_toml(path)
     own_tables = {key: tables[key] for key in ("columns", "units") if key in tables}
     return parse(JoinOptions, own_tables, str(path))
+
+
+def clock_names(columns: Mapping[str, str]) -> JoinOptions:
+    """Return the options that name the columns of times alone.
+
+    Args:
+        columns: the toolkit's name of a column → the file's.
+    """
+    return JoinOptions({name: heading for name, heading in columns.items() if name in CLOCKS})
 
 
 def mapped(tables: tuple[Table, Table], options: JoinOptions) -> tuple[tuple[Table, Table], list[str]]:

@@ -28,7 +28,8 @@ PLACE_WORDS = frozenset(("t", "tvec", "trans", "translation", "p", "pos", "posit
 REJECTED_WORDS = (OTHER_WORDS - {"v", "i", "name"}) | {"base", "late", "offset", "std", "cov", "unc"}
 UNIT_WORDS = frozenset(("mm", "cm", "deg", "rad"))
 # three angles by names of their own, in the order of rx ry rz
-ANGLE_NAMES = (("roll", "pitch", "yaw"), ("alpha", "beta", "gamma"), ("phi", "theta", "psi"), ("a", "b", "c"))
+ANGLE_NAMES = (("roll", "pitch", "yaw"), ("alpha", "beta", "gamma"), ("phi", "theta", "psi"))
+ANGLE_NAMES += (("a", "b", "c"), ("o", "a", "t"))
 AXES = "xyz"
 QUATERNION = ("qx", "qy", "qz", "qw")
 ANGLES = ("rx", "ry", "rz")

@@ -51,6 +51,7 @@ from calib.data.poses.columns import (
     TIME,
     Layout,
     Sheet,
+    Undecided,
     find_layout,
     with_shapes,
 )
@@ -67,6 +68,7 @@ from calib.data.poses.measurements import (
 )
 from calib.data.poses.robodk import FORMS
 from calib.data.poses.silent_units import with_silent_units
+from calib.data.poses.unnamed import arrangements
 from calib.data.schema import Joints, refuse
 from calib.records import FieldValues
 
@@ -228,6 +230,8 @@ def read_measurements(
     path = source.file if isinstance(source, Table) else source
     notes: tuple[str, ...] = ()
     form = options.format
+    if table is None and not form:
+        _ask_for_names(path, robot, options)
     if not form:
         header = read_header(path)[0] if table is None else ()
         matching = [name for name, (matches, _) in FORMS.items() if matches(header)]
@@ -262,6 +266,26 @@ def read_measurements(
     ignored = tuple(name for name in sheet.table.header if name not in layout.used)
     station = options.station or Path(path).stem
     return [replace(block, station=station, ignored=ignored, notes=(*notes, *block.notes))]
+
+
+def _ask_for_names(path: str | Path, robot: Joints, options: FileOptions) -> None:
+    """Raise `Undecided` for a file without names whose number of columns suits the robot.
+
+    Args:
+        path: the file.
+        robot: the robot's joints.
+        options: options for reading the file.
+    """
+    possible = arrangements(path, len(robot.names), options)
+    if possible is None:
+        return
+    table, choices = possible
+    lines = " or ".join(list(choices)[:2])
+    message = (
+        f"has no header: put a line of names and units (q1 [deg], x [mm]) above the numbers, as in {lines}, or state "
+        "`format` in the options for a known headerless format"
+    )
+    raise Undecided(table, message, choices)
 
 
 def _without_units(columns: Mapping[str, str], table: Table) -> dict[str, str]:
@@ -351,6 +375,8 @@ def _read_targets(sheet: Sheet, layout: Layout, q: np.ndarray) -> Positions:
         quaternion = plausible.orientation(sheet, layout.orientation)
         common["sigma_rotation"] = _sigma_rotation(sheet, layout)
         common["euler"] = sheet.options.euler if len(layout.orientation) == 3 else ""
+        if sheet.options.camera.mounting != "auto":
+            common["mounting"] = sheet.options.camera.mounting
         block = Poses(q[row], layout.joints, block.position, quaternion, **common)
     if not layout.base:
         return block

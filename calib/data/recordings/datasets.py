@@ -20,8 +20,9 @@ import numpy as np
 from calib.data.csv_table import Table
 from calib.data.joint_columns import words_of
 from calib.data.recordings.log_columns import QUANTITIES
-from calib.errors import MeasurementError, UsageError, refuse_data, refused_as
+from calib.errors import MeasurementError, refuse_data, refused_as
 from calib.records import frozen
+from calib.workers.extras import needing
 
 INFO = Path("meta") / "info.json"
 # Time between two episodes [s] (our choice): longer than any gap that is bridged.
@@ -111,7 +112,7 @@ def _columns(file: Path, names: dict[str, list[str]]) -> dict[str, np.ndarray]:
         file: the file.
         names: names of the numbers in each list.
     """
-    with refused_as(UsageError, ImportError, "Parquet files need pyarrow: pip install 'armature-calib[parquet]'"):
+    with needing("pyarrow"):
         import pyarrow
         from pyarrow import parquet
     with refused_as(MeasurementError, (OSError, pyarrow.ArrowException), "cannot be read as Parquet ({})", file):

@@ -13,26 +13,21 @@ TX40 was 0.46; therefore, if the description has masses, the ratio relative to t
 nearer to 1 (0.9 to 1.2 on these recordings).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from itertools import combinations
 
 import numpy as np
-from scipy.optimize import nnls
 
-from calib.column_changes import Change, Explanation, best_changes, coupling, couplings, exchange, reversal
+from calib.column_changes import Explanation
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.rigid_body import inverse_dynamics
 from calib.estimation.whiteness import inflation
+from calib.identification.checks.joint_columns import rearranged, wrong_joints
 from calib.identification.checks.recorded_motion import (
     MotionSamples,
     basis,
     bodies_under,
-    drive_columns,
     share_of_nominal,
-    spanning,
     take_samples,
 )
 from calib.identification.checks.torque_lag import Lag, lag_of
@@ -50,19 +45,6 @@ MIN_FACTOR_SIGMAS = 5.0
 """Sigmas from which on a factor of the inertias or masses is identified."""
 ROUNDS = 3
 """Rounds of weighing joints by their residuals."""
-MAX_LEFT = 0.8
-"""Share of a joint's residual that a reversed sign may leave.
-
-Sound recordings at hand keep 0.91 and more, and 0.84 by couplings (our choice, as the next two).
-"""
-MAX_LEFT_COUPLED = 0.7
-"""The same of a coupling."""
-MAX_LEFT_EXCHANGED = 0.6
-"""The same of an exchange."""
-MAX_LEFT_RECORDED = 0.5
-"""Largest share of their torques' variance that joints to exchange leave as recorded."""
-MIN_EXCHANGED_SPEED = 0.3
-"""Rms speed in units of the fastest joint's: one that hardly moves may have any column."""
 SPIKE_SHARE = 0.01
 """Share of the samples that may be spikes."""
 DATE_ERROR = 0.01
@@ -174,152 +156,6 @@ def _without(orthonormal: np.ndarray, values: np.ndarray) -> np.ndarray:
     return values - orthonormal @ (orthonormal.T @ values)
 
 
-def wrong_joints(samples: MotionSamples) -> Explanation | None:
-    """Return the joints with reversed or exchanged torques, or coupled positions; None if all joints are correct.
-
-    For each tested change one model of all joints is fitted: bodies and offsets of any size, and non-negative motor
-    inertia, viscous and Coulomb friction of every drive. The robot's masses need not be known. Residuals are shares of
-    the joints' torque variances.
-
-    Args:
-        samples: samples of a recording of motor torques.
-    """
-    n = samples.q.shape[1]
-    unexplained_shares = cache(_unexplained_function)
-
-    def with_torques(matrix: np.ndarray) -> Callable[[tuple], tuple]:
-        return lambda data: (data[0], matrix @ data[1])
-
-    def with_positions(matrix: np.ndarray) -> Callable[[tuple], tuple]:
-        return lambda data: (_changed(data[0], matrix), data[1])
-
-    changes = []
-    for joint in range(n):
-        reversed_sign = with_torques(reversal(n, joint))
-        changes.append(Change("torque-sign", reversed_sign, (joint,), max_left=MAX_LEFT))
-    for pair in combinations(range(n), 2):
-        exchanged = with_torques(exchange(n, *pair))
-        changes.append(Change("torques-exchanged", exchanged, pair, max_left=MAX_LEFT_EXCHANGED))
-    for joint, motor, direction in couplings(n):
-        coupled = with_positions(coupling(n, joint, motor, direction))
-        values = {"way": "-" if direction < 0.0 else "+"}
-        changes.append(Change("axis-coupled", coupled, (joint, motor), values, MAX_LEFT_COUPLED))
-    return best_changes((samples, np.eye(n)), changes, lambda data: unexplained_shares(data[0])(data[1]), max_changes=n)
-
-
-def _unexplained_function(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function that maps a mixing matrix of the torques to unexplained shares of the joints' variances (n,).
-
-    The matrix (n, n) multiplies the recorded torques: the identity, or one with signs reversed or rows exchanged.
-
-    Args:
-        samples: samples of a recording of n joints.
-    """
-    m, n = samples.q.shape
-    scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
-
-    def weighted_rows(columns: np.ndarray) -> np.ndarray:
-        scaled = (columns * scale[:, None]).transpose(1, 0, 2)
-        return scaled.reshape(n * m, -1)
-
-    # Bodies and offsets are free, the drives' other parameters not negative.
-    drives = samples.drives.reshape(m, n, n, 4)
-    free = weighted_rows(np.concatenate([samples.inertial, drives[..., 3]], axis=2))
-    free = free @ spanning(free.T @ free)
-    positive = weighted_rows(drives[..., :3].reshape(m, n, -1))
-    positive /= np.maximum(np.abs(positive).max(axis=0), 1e-12)
-    positive -= free @ (free.T @ positive)
-    orthonormal, triangle = np.linalg.qr(positive)
-
-    def unexplained(mixing: np.ndarray) -> np.ndarray:
-        torque = (scale * (samples.torque @ mixing.T)).T.ravel()
-        power = torque.reshape(n, m).var(axis=1)
-        torque = torque - free @ (free.T @ torque)
-        values, _ = nnls(triangle, orthonormal.T @ torque)
-        residual = torque - positive @ values
-        mean_square = (residual.reshape(n, m) ** 2).mean(axis=1)
-        return np.maximum(mean_square / np.maximum(power, 1e-300), 1e-9)
-
-    return unexplained
-
-
-def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
-    """Return the exchange of two joints, or zero offset of a joint, that best explains the torques; None if none does.
-
-    The torques are predicted from the robot's masses. Residuals are shares of the variance of each joint's torque.
-
-    Args:
-        samples: samples of a recording of motor torques.
-        chain: the arm with its masses.
-    """
-    n = chain.n
-    masses = standard_parameters(chain)
-    samples = replace(samples, index=np.arange(len(samples.index)), effort=samples.torque)
-
-    def with_exchange(pair: tuple[int, int]) -> Callable[[MotionSamples], MotionSamples]:
-        matrix = exchange(n, *pair)
-        return lambda data: replace(_changed(data, matrix), effort=data.effort @ matrix)
-
-    def with_zero(joint: int, angle: float) -> Callable[[MotionSamples], MotionSamples]:
-        offset = angle * np.eye(n)[joint]
-        return lambda data: replace(data, q=data.q + offset)
-
-    speed = samples.v.std(axis=0)
-    moves = speed > MIN_EXCHANGED_SPEED * speed.max()
-    unexplained = _unexplained_by_masses(samples, masses) < MAX_LEFT_RECORDED
-    pairs = combinations(np.flatnonzero(moves & unexplained).tolist(), 2)
-    changes = [Change("columns-exchanged", with_exchange(pair), pair) for pair in pairs]
-    for number, joint in enumerate(chain.joints):
-        if joint.kind == "prismatic":
-            continue
-        for angle in (0.5 * np.pi, np.pi, -0.5 * np.pi):
-            turned = with_zero(number, angle)
-            changes.append(Change("zero-elsewhere", turned, (number,), {"angle": angle}))
-    return best_changes(samples, changes, lambda changed: _unexplained_by_masses(changed, masses))
-
-
-def _changed(samples: MotionSamples, matrix: np.ndarray) -> MotionSamples:
-    """Return the samples with joint positions, velocities and accelerations multiplied by a matrix (n, n).
-
-    Args:
-        samples: samples of a recording of n joints.
-        matrix: matrix that multiplies the joint values of each sample.
-    """
-    q = np.ascontiguousarray(samples.q @ matrix.T)
-    v = np.ascontiguousarray(samples.v @ matrix.T)
-    a = np.ascontiguousarray(samples.a @ matrix.T)
-    return replace(samples, q=q, v=v, a=a)
-
-
-def _unexplained_by_masses(samples: MotionSamples, masses: np.ndarray) -> np.ndarray:
-    """Return the share (n,) of each joint's torque variance that the robot's masses do not explain.
-
-    Each torque is modelled by four parts: a factor times the gravity torque of the robot's masses, a factor times their
-    torque of motion, the drive of the joint, and the drives of the neighbouring joints. The last part is needed because
-    wrists are coupled by their gears, which could be mistaken for an exchange of joints.
-
-    Args:
-        samples: samples of a recording.
-        masses: (10 B,) standard parameters of the robot.
-    """
-    q = samples.q
-    v = samples.v
-    a = samples.a
-    of_gravity = inverse_dynamics(samples.bodies, masses, q, np.zeros_like(v), np.zeros_like(a))
-    of_motion = inverse_dynamics(samples.bodies, masses, q, v, a) - of_gravity
-    drives = drive_columns(v, a)
-    centred = samples.torque - samples.torque.mean(axis=0)
-    shares = []
-    for joint, torque in enumerate(centred.T):
-        near = drives[:, max(joint - 1, 0) : joint + 2]
-        neighbours = near.reshape(len(torque), -1)
-        joint_columns = np.column_stack([of_gravity[:, joint], of_motion[:, joint], neighbours])
-        orthonormal = basis(joint_columns)
-        explained = ((torque @ orthonormal) ** 2).sum()
-        shares.append(1.0 - explained / max(float(torque @ torque), 1e-300))
-    return np.maximum(shares, 1e-9)
-
-
 @dataclass(frozen=True)
 class RecordingSizes:
     """Comparison of a recording with the robot's description: masses, limits, velocities, lag and clock.
@@ -353,6 +189,11 @@ class RecordingSizes:
     clock: ClockRatio | None = None
     other: Explanation | None = None
     jumps: tuple[str, ...] = ()
+
+    def without_masses(self) -> "RecordingSizes":
+        """Return the comparison without masses and clock, which wrong columns of the recording change as well."""
+        unknown = np.full_like(self.masses, np.nan)
+        return replace(self, masses=unknown, clock=None, other=None)
 
 
 def compare_sizes(
@@ -413,9 +254,9 @@ def compare_sizes(
 
 
 def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -> Explanation | None:
-    """Return the joints of a recording with reversed or exchanged torques, or coupled positions.
+    """Return the changes of a recording's columns that explain its torques much better.
 
-    The result is None if all joints are correct or the recording is too short.
+    The result is None if all columns are correct or the recording is too short.
 
     Args:
         case: a recording.

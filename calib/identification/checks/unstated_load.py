@@ -18,6 +18,11 @@ MAX_LEFT = 0.8
 """Rms residual with the load over that without (geometric mean over the joints; all below: our choice)."""
 MAX_BEYOND = 1.15
 """Rms residual with the load over that with masses of their own in each recording."""
+MAX_SHORT = 0.05
+"""Share of what masses of their own in each recording explain that the load may leave, if that is more.
+
+A load that explains nearly all leaves little else, of which separate masses absorb a part (our choice).
+"""
 MAX_SCALED = 0.93
 """Rms residual with the load over that with other gains of the joints' torques.
 
@@ -88,7 +93,9 @@ def unstated_load(samples: Mapping[str, MotionSamples]) -> UnstatedLoad | None:
     mass = float(fit.values[MASS])
     first_moment = float(np.linalg.norm(fit.values[FIRST_MOMENT]))
     reach = first_moment / max(abs(mass), 1e-12)
-    explained = after < MAX_LEFT * before and after < MAX_BEYOND * _size(separate)
+    alone = _size(separate)
+    most = max(MAX_BEYOND * alone, alone + MAX_SHORT * (before - alone))
+    explained = after < MAX_LEFT * before and after < most
     explained = explained and after < MAX_SCALED * _size(_scaled(rows, best))
     if not explained or mass < MIN_SIGMAS * fit.sigma or reach > MAX_REACH:
         return None

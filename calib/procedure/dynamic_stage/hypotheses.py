@@ -1,11 +1,14 @@
 """Findings on another gravity or load that explains recordings better than the stated one (catalogue, chapter 9)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from calib.column_changes import MAX_RIVAL_RATIO, Explanation
 from calib.errors import Finding, finding
 from calib.identification.checks.gravity import GravityHypotheses, gravity_of
+from calib.identification.checks.joint_columns import corrected
 from calib.identification.checks.recorded_motion import bodies_under, take_samples
 from calib.identification.checks.recording_sizes import MAX_SAMPLES
 from calib.identification.checks.unstated_load import unstated_load
@@ -16,13 +19,16 @@ from calib.units import TORQUE
 MAX_COMPARED = 12  # recordings in which an unstated load is looked for (our choice)
 
 
-def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None:
+def gravity_hypotheses(
+    inputs: IdentificationInputs, columns: Mapping[str, Explanation | None] | None = None
+) -> GravityHypotheses | None:
     """Return how well other gravity vectors explain the training recordings.
 
     The recordings are grouped by payload, and the group with the most recordings is used.
 
     Args:
         inputs: robot, recordings and options.
+        columns: recording name -> changes of its columns, which are made first; None: columns as recorded.
 
     Returns:
         The hypotheses; None without motor torques or with too few samples.
@@ -32,9 +38,43 @@ def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None
     bodies = bodies_under(inputs.chain, inputs.options.settings.gravity)
     loads = [case.carried for case in inputs.cases]
     usual = max(loads, key=loads.count)
-    sampled = [take_samples(case, bodies, MAX_SAMPLES) for case in inputs.cases if case.carried == usual]
-    usable = [samples for samples in sampled if samples is not None]
+    usable = []
+    for case in inputs.cases:
+        samples = take_samples(case, bodies, MAX_SAMPLES) if case.carried == usual else None
+        if samples is not None:
+            explanation = columns.get(case.name) if columns else None
+            usable.append(corrected(samples, explanation))
     return gravity_of(usable, inputs.chain, inputs.unit == TORQUE) if usable else None
+
+
+def likelier_gravity(
+    inputs: IdentificationInputs, hypotheses: GravityHypotheses | None, columns: Mapping[str, Explanation | None]
+) -> GravityHypotheses | None:
+    """Return the gravity hypotheses, for corrected columns if these explain the training recordings better.
+
+    Wrong columns may look like another gravity. The hypothesis that leaves the smaller share of the torques decides;
+    of equal ones it is gravity. Joints with clipped torques do not tell whether gravity is absent.
+
+    Args:
+        inputs: robot, recordings and options.
+        hypotheses: gravity, for columns as recorded; None: unknown.
+        columns: recording name -> changes of its columns that explain its torques.
+    """
+    if hypotheses is None:
+        return None
+    shares = []
+    clipped = set()
+    for case in inputs.cases:
+        explanation = columns.get(case.name)
+        if explanation is not None:
+            shares.append(explanation.factor)
+        for fault in case.motion.faults:
+            if fault.kind == "clipped":
+                clipped.add(fault.joint)
+    if shares and (hypotheses.direction is None or min(shares) * MAX_RIVAL_RATIO < hypotheses.factor):
+        hypotheses = gravity_hypotheses(inputs, columns) or hypotheses
+    absent = tuple(joint for joint in hypotheses.absent if joint not in clipped)
+    return replace(hypotheses, absent=absent)
 
 
 def gravity_findings(hypotheses: GravityHypotheses | None, joints: Sequence[str]) -> list[Finding]:

@@ -16,7 +16,12 @@ from calib.identification.checks.torque_lag import Lag
 from calib.identification.loop import LoopDisagreement
 from calib.identification.physical_consistency.solve import Contradiction
 from calib.identification.rows import Case
-from calib.procedure.dynamic_stage.hypotheses import gravity_findings, gravity_hypotheses, load_findings
+from calib.procedure.dynamic_stage.hypotheses import (
+    gravity_findings,
+    gravity_hypotheses,
+    likelier_gravity,
+    load_findings,
+)
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.findings import level_of, limit, settle
 from calib.robot.chain import Chain
@@ -47,14 +52,19 @@ def implausible(
     """
     chain, gravity = inputs.chain, inputs.options.settings.gravity
     cases = [*inputs.cases, *inputs.unseen]
-    hypotheses = gravity_hypotheses(inputs)
+    columns = {case.name: signs_of(case, chain, gravity) for case in cases}
+    hypotheses = likelier_gravity(inputs, gravity_hypotheses(inputs), columns)
     if hypotheses is not None and hypotheses.direction is not None:
         # columns that seem exchanged or coupled under a wrong gravity need not be
         x, y, z = hypotheses.direction.tolist()
         gravity = (x, y, z)
-    sizes = [compare_sizes(case, chain, gravity, inputs.unit == TORQUE) for case in inputs.cases]
-    signs = {case.name: signs_of(case, chain, gravity) for case in cases}
-    result = gravity_findings(hypotheses, chain.joint_names)
+        columns = {case.name: signs_of(case, chain, gravity) for case in cases}
+    sizes = []
+    for case in inputs.cases:
+        recording = compare_sizes(case, chain, gravity, inputs.unit == TORQUE)
+        sizes.append(recording if columns[case.name] is None else recording.without_masses())
+    result = wrong_joints(columns, chain.joint_names)
+    result += gravity_findings(hypotheses, chain.joint_names)
     result += load_findings(inputs, gravity)
     result += standing_columns(cases, chain.joint_names)
     result += findings(sizes, chain.joint_names)
@@ -64,7 +74,6 @@ def implausible(
     for label, load in inputs.options.settings.payloads.items():
         if not load.parameters and not any(label in case.carried for case in inputs.cases):
             result.append(finding("payload-never", label=label))
-    result += wrong_joints(signs, chain.joint_names)
     return settle(result, inputs.options.accept)
 
 
@@ -145,18 +154,26 @@ def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Findi
 
 
 def wrong_joints(explanations: Mapping[str, Explanation | None], joints: Sequence[str]) -> list[Finding]:
-    """Return findings on joints with a reversed sign, or with an angle that is measured relative to another joint.
+    """Return findings on columns of another joint, sign, factor or zero, or relative to another joint.
 
     Args:
-        explanations: recording name -> changes of joints that explain the torques; None: no change is needed.
+        explanations: recording name -> changes of columns that explain the torques; None: no change is needed.
         joints: names of the joints.
     """
     result = []
     for name, explanation in explanations.items():
         if explanation is None:
             continue
-        changed = sorted({change.joints[0] for change in explanation.changes})
+        changed = sorted({change.joints[0] for change in explanation.changes if change.joints})
+        rival = None
+        if explanation.rival is not None:
+            rival_joints = [joints[joint] for joint in explanation.rival.joints]
+            rival = " at ".join([explanation.rival.code, *filter(None, [", ".join(rival_joints)])])
         for change in sorted(explanation.changes, key=_joints_of_change):
+            if not change.joints:
+                shares = {"before": _typical(explanation.before), "after": _typical(explanation.after)}
+                result.append(finding(change.code, file=name, rival=rival, **change.values, **shares))
+                continue
             j, k = change.joints[0], change.joints[-1]
             result.append(
                 finding(
@@ -164,15 +181,22 @@ def wrong_joints(explanations: Mapping[str, Explanation | None], joints: Sequenc
                     file=name,
                     joint=joints[j],
                     other=joints[k],
+                    joints=[joints[joint] for joint in change.joints],
                     **change.values,
+                    rival=rival,
                     before=np.sqrt(explanation.before[j]),
                     after=np.sqrt(explanation.after[j]),
                     gain=1.0 - explanation.factor,
                     factor=explanation.factor,
-                    explained=1.0 - max(explanation.after[changed]),
+                    explained=1.0 - float(np.max(explanation.after[changed])),
                 )
             )
     return _of_some_level(result)
+
+
+def _typical(squares: np.ndarray) -> float:
+    """Return the geometric mean over the joints of their unexplained rms shares, from squared shares (n,)."""
+    return float(np.exp(0.5 * np.mean(np.log(squares))))
 
 
 def _joints_of_change(change: Change) -> tuple[int, ...]:

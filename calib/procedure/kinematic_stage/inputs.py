@@ -15,6 +15,7 @@ from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, MeasurementError, UsageError, require
 from calib.extensions import Point
+from calib.geometry.checks.pose_direction import as_seen_by_instrument
 from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
@@ -363,6 +364,7 @@ def read_file(
 
             block = complete_camera(chain, block, like)
         result.append(block)
+    result = [as_seen_by_instrument(chain, block) for block in result]
     for block in result:
         # of unseen files, too: the fit checks the rows that it fits only
         check_scale(block, chain)
