@@ -46,6 +46,8 @@ from calib.units import TIMES
 
 _LOG = logging.getLogger(__name__)
 NO_JOINTS = Joints(())
+# Letter of the heading of a column that is not looked at.
+HIDDEN = "\0"
 # What a note says of columns without any number.
 ABSENT = "not provided, NaN or empty in every row"
 
@@ -216,7 +218,7 @@ def _hide(header: list[str], columns: Sequence[int]) -> str:
     """Replace the headings of columns that the logger did not provide by unique blanks; return a note on them."""
     headings = ", ".join(header[column] for column in columns)
     for column in columns:
-        header[column] = "\0" * (column + 1)
+        header[column] = HIDDEN * (column + 1)
     return f"{ABSENT}: {headings}"
 
 
@@ -236,10 +238,10 @@ def _stated_columns(table: Table, options: RecordingOptions, joints: Joints) -> 
             columns = _stamp_column(table, [heading])
         elif "{" not in heading:
             columns = _joint_columns(table, [heading], joints.names)
-        columns = columns or list(log_columns.stated(heading, table.header, joints))
+        columns = columns or list(log_columns.columns_meant(heading, table.header, joints))
         if not columns:
-            near = log_columns.near_names(heading, table.header, joints)
-            table.fail(f"no columns are named '{heading}' ({name}){near}; found: {', '.join(table.header)}")
+            hint = log_columns.near_names(heading, table.header, joints)
+            table.fail(f"no columns are named '{heading}' ({name}){hint}; found: {', '.join(table.header)}")
         columns_of[name] = columns
     of_joints = {key: heading for key, heading in options.columns.items() if key not in SYNONYMS}
     for name, by_joint in log_columns.joint_keys(of_joints, joints, table).items():
@@ -262,14 +264,16 @@ def _advice(table: Table, columns_of: dict[str, list[int]], joints: Joints) -> s
     read_columns: set[int] = set()
     for columns in columns_of.values():
         read_columns.update(columns)
-    header = ["\0" * (column + 1) if column in read_columns else name for column, name in enumerate(table.header)]
+    header = list(table.header)
+    for column in read_columns:
+        header[column] = HIDDEN * (column + 1)
     line = log_columns.paste(header, joints, needed)
     if line:
         return f". If these are meant, state them in the options (--options FILE), joints in this order: {line}"
     if columns_of.keys() - {"t"}:
-        other = " and ".join("positions" if name == "q" else "torques" for name in needed)
+        quantities = " and ".join({"q": "positions", "torque": "torques"}[name] for name in needed)
         return (
-            f". Are the {other} in another file? If its times are of the same clock, join them first: "
+            f". Are the {quantities} in another file? If its times are of the same clock, join them first: "
             f"calib join {table.file} OTHER.csv --out log.csv"
         )
     return ""
