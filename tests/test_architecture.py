@@ -47,6 +47,7 @@ HOMES = {
     "mcap": ["calib.data."],
     "rosbags": ["calib.data.recordings.bags", "calib.data.images."],
     "pandas": ["calib.api.result_table"],
+    "pyarrow": ["calib.data.recordings.datasets"],
     "starlette": ["calib.apps.serve."],
     "uvicorn": ["calib.apps.serve.commands"],
     "python_multipart": ["calib.apps.serve.uploads"],

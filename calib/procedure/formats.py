@@ -55,7 +55,8 @@ TOPICS: Mapping[str, tuple[str, str]] = {
     ),
     "logs": (
         "logs of robot controllers, by brand, and ROS bags",
-        "calib.data.recordings.controller_logs calib.data.recordings.bags",
+        "calib.data.recordings.controller_logs calib.data.recordings.ros_texts calib.data.recordings.bags "
+        "calib.data.recordings.datasets",
     ),
     "descriptions": (
         "robots as xacro, MJCF and a UR's calibration.conf",

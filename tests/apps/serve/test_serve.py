@@ -126,7 +126,8 @@ def test_joints_and_points_apart_are_joined_in_the_page(session: Session, client
     assert (asked.joints, asked.points) == ("joints.dat.csv", "points.txt")
     notes = received.join_received(session, "measured", asked)
     shown = unescape(client.get("/").text)
-    assert all(note in shown for note in notes[:-1]) and "joined by name" in shown and "s, t, u, v, w, k, l read as q1" in shown
+    assert all(note in shown for note in notes[:-1]) and "joined by name" in shown
+    assert "s, t, u, v, w, k, l read as q1" in shown
 
     assert client.post("/take/measured").status_code == 200
     (path,) = session.brought("measured")
