@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from calib.apps.monitoring.comparison.robot_change import diff
     from calib.apps.registration.api import base, hand_eye, tool
     from calib.errors import CalibError
+    from calib.identification.friction.friction_terms import FrictionTerm
     from calib.identification.identify_options import IdentifySettings
     from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
     from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
@@ -62,6 +63,7 @@ _HOMES = {
     "procedure.kinematic_stage.settings": ("SelectionSettings", "FitSettings"),
     "procedure.excitation.settings": ("ExcitationSettings", "PlanSettings"),
     "identification.identify_options": ("IdentifySettings",),
+    "identification.friction.friction_terms": ("FrictionTerm",),
     "errors": ("CalibError",),
 }
 
@@ -99,6 +101,7 @@ __all__ = [  # noqa: RUF022 (in the order of use)
     "ExcitationSettings",
     "PlanSettings",
     "IdentifySettings",
+    "FrictionTerm",
     "CalibError",
 ]
 

@@ -11,6 +11,15 @@ DEG = math.pi / 180
 ANGLES = {"rad": 1.0, "deg": DEG, "mrad": 1e-3, "°": DEG, "degrees": DEG}
 LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "cm": 1e-2, "in": 0.0254}
 
+# words for units in headers, in small letters, with the unit
+UNIT_WORDS: Mapping[str, str] = {
+    **dict.fromkeys(("grad", "degree", "deg.", "degré", "degrés", "grado", "grados", "gradi", "graus", "度"), "deg"),
+    **dict.fromkeys(("radian", "radians", "radiant"), "rad"),
+    **dict.fromkeys(("millimeter", "millimeters", "millimetre", "millimetres", "мм", "毫米"), "mm"),
+    **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
+    **dict.fromkeys(("inch", "inches"), "in"),
+}
+
 # names of units of time in recordings, in small letters, with their factor to seconds
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
 POSITIONS = {"rad": 1.0, "m": 1.0, "deg": DEG, "°": DEG, "mrad": 1e-3, "mm": 1e-3}
@@ -134,3 +143,8 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def unit_of(text: str) -> str:
+    """Return a unit's short name for a word in a header: ``deg`` for ``Grad``; other texts as they are."""
+    return UNIT_WORDS.get(text.lower(), text)

@@ -243,8 +243,7 @@ def finding_list() -> str:
     intro = (
         "What `calib` may say about data and results: on the console, on the certificate, in `metrics.json`. "
         "`calib explain CODE` prints one. A verdict is the worst level among the findings; `accept` in the options "
-        "file makes a finding a note. Words in capitals stand for values; a part in brackets is left out if it has "
-        "none."
+        "file makes a finding a note. The numbers and names are examples."
     )
     parts = ["# Findings", intro]
     for line in Path(findings.__file__).with_suffix(".toml").read_text(encoding="utf-8").splitlines():
@@ -256,11 +255,12 @@ def finding_list() -> str:
 
 
 def _finding(name: str, one: findings.CatalogueEntry) -> str:
+    says, advice = findings.example_texts(name)
     rows = [
-        ("Says", cell(findings.in_words(one.says))),
+        ("Says", cell(says)),
         ("Level", cell(findings.levels(one))),
         ("Means", cell(one.means)),
-        ("Do", cell(findings.in_words(one.advice))),
+        ("Do", cell(advice)),
         ("Accept", code(f'accept = ["{one.accept}"]') if one.accept else ""),
     ]
     return f"(finding-{name})=\n### {name}\n\n" + table(("", ""), [row for row in rows if row[1]])

@@ -20,7 +20,8 @@ from calib.data.images.board_print import raster
 from calib.data.images.detection import detect
 from calib.data.images.images import decode as read_image_of
 from calib.data.images.images import read_image
-from calib.data.images.lens import Lens, read_lens, write_lens
+from calib.data.images.lens import Lens, write_lens
+from calib.data.images.lens_files import read_lens
 from calib.data.images.pixels import Detections, read_corners, write_corners
 from calib.data.poses.fit_options import read_options
 from calib.data.poses.pose_files import read_measurements

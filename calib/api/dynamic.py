@@ -9,25 +9,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from calib.api.rendering import ChartedResult, DataFrame, Progress, ReportedResult, data_frame, listed, optional
+from calib.api.rendering import ChartedResult, Progress, ReportedResult, listed, optional
+from calib.api.result_table import ResultTable, data_frame
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
 from calib.estimation.estimate import Estimate
+from calib.identification.friction.friction_terms import FrictionTerm
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
 from calib.identification.methods.method import Method
 from calib.identification.registry import METHODS
 from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
 from calib.procedure.excitation import coefficients
 from calib.procedure.robot_kinds import Mechanism, stage_of
-from calib.records import as_subclass, plain
+from calib.records import as_subclass, plain, shaped
 from calib.result_kinds import BY_NAME
-from calib.robot.calibrated import CalibratedChain
+from calib.robot.calibrated import CalibratedChain, like_joints
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
-    from calib.api.rendering import DataFrame
+    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
+
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -47,19 +51,20 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
     )
 
     @property
-    def residuals(self) -> DataFrame:
-        """Torque residuals, measured minus predicted, of every sample, fitted or held out, as a pandas DataFrame.
+    def residuals(self) -> ResultTable:
+        """Torque residuals, measured minus predicted, of every sample, fitted or held out.
 
-        The columns are the file, the time [s], and one residual for each torque row.
+        The columns are the file, the time [s], and one residual for each torque row [N m or N].
         """
         titles = self.found.settings.torque_rows.titles(self.inputs.chain.joint_names)
-        header = ["file", "t [s]"]
-        header += [f"{title} [{unit}]" for title, unit in zip(titles, self.inputs.row_units)]
-        rows = []
-        for case in (*self.inputs.cases, *self.inputs.unseen):
-            residuals = case.target - self.predictions[case.name]
-            rows += [(case.name, t, *row) for t, row in zip(case.motion.t, residuals)]
-        return data_frame(rows, header)
+        cases = (*self.inputs.cases, *self.inputs.unseen)
+        files = [np.full(len(case.motion.t), case.name) for case in cases]
+        times = [case.motion.t for case in cases]
+        torques = np.concatenate([case.target - self.predictions[case.name] for case in cases])
+        columns = {"file": np.concatenate(files), "t [s]": np.concatenate(times)}
+        for title, unit, residual in zip(titles, self.inputs.row_units, torques.T, strict=True):
+            columns[f"{title} [{unit}]"] = residual
+        return ResultTable(columns)
 
     @property
     def robot(self) -> CalibratedChain:
@@ -75,36 +80,47 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
         return replace(estimate, covariance=self.carried.covariance)
 
     @one_blas_thread()
-    def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the predicted torques (N, rows) [N m or N] of a motion.
+    def torques(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> np.ndarray:
+        """Return the predicted torques [N m or N]: (N, rows) of a motion (N, n), (rows,) of one state (n,).
 
         Args:
-            q, v, a: (N, n) joint positions [rad or m], velocities [per s] and accelerations [per s²].
+            q, v, a: (N, n) or (n,) joint positions [rad or m], velocities [per s] and accelerations [per s²].
+
+        Raises:
+            CalibError: an array of a wrong shape.
         """
         dynamics = self.found.dynamics
-        q = np.asarray(q, dtype=float)
-        v = np.asarray(v, dtype=float)
-        a = np.asarray(a, dtype=float)
-        return dynamics.model.torque(dynamics.values, q, v, a)
+        return like_joints(q, dynamics.model.torque(dynamics.values, *self._states(q, v, a)))
 
     @one_blas_thread()
-    def torque_sigma(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the standard deviations σ (N, rows) [N m or N] of predicted torques; ± 1.96 σ contains 95 %.
+    def torque_sigma(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> np.ndarray:
+        """Return the standard deviations σ [N m or N] of predicted torques, in the shape of `torques`.
+
+        ± 1.96 σ contains 95 % of the errors.
 
         They include the part of recorded torques, within the band of the filter, that the model does not explain.
 
         Args:
-            q, v, a: (N, n) joint positions [rad or m], velocities [per s] and accelerations [per s²].
+            q, v, a: (N, n) or (n,) joint positions [rad or m], velocities [per s] and accelerations [per s²].
 
         Raises:
             UsageError: the recordings were too short to estimate the model's errors.
         """
         if self.errors is None:
             raise UsageError("torque errors cannot be estimated, since the recording is too short: record longer")
-        q = np.asarray(q, dtype=float)
-        v = np.asarray(v, dtype=float)
-        a = np.asarray(a, dtype=float)
-        return self.errors.sigma(self.found.dynamics, q, v, a)
+        return like_joints(q, self.errors.sigma(self.found.dynamics, *self._states(q, v, a)))
+
+    def _states(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> list[np.ndarray]:
+        """Return positions, velocities and accelerations as arrays (N, n) of equal shape.
+
+        Args:
+            q, v, a: (N, n) or (n,) joint positions, velocities and accelerations.
+        """
+        positions = self.robot.joint_rows(q)
+        states = [positions]
+        for name, values in (("v", v), ("a", a)):
+            states.append(shaped(np.atleast_2d(np.asarray(values, dtype=float)), positions.shape, name))
+        return states
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
@@ -175,6 +191,7 @@ def identify_dynamics(
     validate: Recorded | Sequence[Recorded] = (),
     method: str | None = None,
     friction: str | None = None,
+    terms: Sequence[FrictionTerm] = (),
     options: IdentifyOptions | str | Path | None = None,
     excitation: str | Path | None = None,
     base: str | None = None,
@@ -198,6 +215,8 @@ def identify_dynamics(
         validate: recordings of other motion, which are used to validate the result only.
         method, friction: identification method (one of `methods`) and friction model, which replace those of the
             settings; None takes those of the settings.
+        terms: friction terms that are functions of a joint's velocity or position, in addition to those of the
+            friction model; exports say that URDF has no place for them.
         options: the settings as a TOML file (``calib formats identify-options``), or the options read from one, given
             instead of `settings`; None for no file.
         excitation: folder written by `design_excitation`, for methods that simulate the closed loop ([loop] in the
@@ -219,9 +238,11 @@ def identify_dynamics(
         options = options_of(settings)
     elif not isinstance(options, IdentifyOptions):
         options = read_options(optional(options))
+    options = replace(options, settings=replace(options.settings, functions=tuple(terms)))
     designed = [] if excitation is None else [coefficients.read(Path(excitation))]
     stage = stage_of(robot, "identify", base, tip)
     if stage is not None:
+        require(not terms, "terms: functions are for arms only; parallel robots have the standard friction", UsageError)
         return stage.run(
             listed(recordings),
             listed(validate),

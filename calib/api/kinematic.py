@@ -9,15 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calib import files
-from calib.api.rendering import ChartedResult, Progress, ReportedResult, WithoutVerdict, data_frame, listed, optional
+from calib.api.rendering import ChartedResult, Progress, ReportedResult, WithoutVerdict, listed, optional
+from calib.api.result_table import ResultTable, data_frame
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
-from calib.errors import TaskLost, UsageError, as_ours
+from calib.errors import TaskLost, UsageError, as_ours, require
 from calib.estimation.estimate import Estimate
+from calib.estimation.robust import Loss, check_loss
 from calib.geometry.observation import pose_sigmas
 from calib.procedure.kinematic_stage import fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.inputs import gravity_of
@@ -25,13 +28,15 @@ from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSetti
 from calib.procedure.measuring import prediction
 from calib.procedure.measuring.measuring_run import write_run
 from calib.procedure.robot_kinds import Mechanism, stage_of
-from calib.records import as_subclass, plain, shaped
+from calib.records import as_subclass, plain
 from calib.result_kinds import BY_NAME
-from calib.robot.calibrated import CalibratedChain
+from calib.robot.calibrated import CalibratedChain, like_joints
+from calib.workers.extras import available
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
-    from calib.api.rendering import DataFrame
+    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
+
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -69,12 +74,13 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
         Raises:
             UsageError: a file exists and must not be replaced.
         """
-        from calib.procedure.report.style import save
-
         path = Path(path)
+        plots = plots and available("matplotlib")
         figure_paths = selection.beside_poses(path, plots)
         with files.results(selection.targets(path, plots), overwrite=overwrite):
             if plots:
+                from calib.procedure.report.style import save
+
                 for name, figure in self.plot().items():
                     save(figure, figure_paths[name])
             return selection.write(self, path)
@@ -130,7 +136,10 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
 
 
 class PredictedPoses(NamedTuple):
-    """Poses (m, 4, 4) [m] of a tool in the robot's base frame, with σ (m, 2) of position [m] and orientation [rad]."""
+    """Poses (m, 4, 4) [m] of a tool in the robot's base frame, with σ (m, 2) of position [m] and orientation [rad].
+
+    Of one pose, asked for by joint values (n,): (4, 4) and (2,).
+    """
 
     pose: np.ndarray
     sigma: np.ndarray
@@ -149,11 +158,15 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
     )
 
     @property
-    def residuals(self) -> DataFrame:
-        """Residuals of every row, fitted or held out, with weight and expected error, as a pandas DataFrame."""
+    def residuals(self) -> ResultTable:
+        """Residuals (measured minus predicted) of every row, fitted or held out, with weight and expected error.
+
+        The columns are those of ``residuals.csv``: ``fit.residuals["dx [mm]"]`` is an array (m,), and
+        ``fit.residuals.to_dataframe()`` a pandas DataFrame.
+        """
         from calib.procedure.kinematic_stage.fit_tables import residuals
 
-        return data_frame(*residuals(self))
+        return ResultTable.of_rows(*residuals(self))
 
     @property
     def estimate(self) -> Estimate:
@@ -161,14 +174,14 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         return self.selection.fit.estimate
 
     @one_blas_thread()
-    def predict(self, q: object, tool: int = 0) -> PredictedPoses:
+    def predict(self, q: ArrayLike, tool: int = 0) -> PredictedPoses:
         """Return the tool poses of the calibrated robot at given joint values, in its base frame, with their σ.
 
         If the fit has an error model, σ of the position contains all expected errors (`position_sigma`), else only
         those due to the parameters. σ of the orientation contains only those due to the parameters.
 
         Args:
-            q: (m, n) joint values [rad or m].
+            q: joint values (m, n) [rad or m], or (n,) for one pose.
             tool: index of the fitted tool, from 0.
         """
         geometry = self.selection.fit
@@ -177,10 +190,10 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         if self.expected is not None:
             sigma[:, 0] = self.expected.position_sigma(poses, -1, tool)
         tool_poses = self.robot.forward(poses.q, poses.torque) @ geometry.cell.tools[tool]
-        return PredictedPoses(tool_poses, sigma)
+        return PredictedPoses(like_joints(q, tool_poses), like_joints(q, sigma))
 
     @one_blas_thread()
-    def position_sigma(self, q: object, tool: int = 0) -> np.ndarray:
+    def position_sigma(self, q: ArrayLike, tool: int = 0) -> np.ndarray:
         """Return the standard deviation (m,) [m] of the tool position error (norm over the axes) at given poses.
 
         It contains the parameters' covariance and unmodelled effects. It is estimated on held-out rows, and grows with
@@ -188,7 +201,7 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         value.
 
         Args:
-            q: (m, n) joint values [rad or m].
+            q: joint values (m, n) [rad or m], or (n,) for one pose.
             tool: index of the fitted tool, from 0.
 
         Raises:
@@ -196,13 +209,12 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         """
         if self.expected is None:
             raise UsageError("this fit has no expected errors: they need at least 20 measured positions")
-        return self.expected.position_sigma(self._poses(q), tool=tool)
+        return like_joints(q, self.expected.position_sigma(self._poses(q), tool=tool))
 
-    def _poses(self, q: object) -> PoseMeasurements:
+    def _poses(self, q: ArrayLike) -> PoseMeasurements:
         """Return poses at joint values q (m, n), with gravity torques (m, n) [N m] if the links' masses are known."""
-        chain = self.inputs.chain
-        q = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, chain.n), "q")
-        return PoseMeasurements(q, chain.joint_names, torque=gravity_of(self.inputs.weighed, q))
+        joints = self.robot.joint_rows(q)
+        return PoseMeasurements(joints, self.inputs.chain.joint_names, torque=gravity_of(self.inputs.weighed, joints))
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
@@ -257,6 +269,7 @@ def select_poses(
     *,
     constraints: Tables | None = None,
     existing: str | Path | PoseMeasurements | np.ndarray | None = None,
+    candidates: selection.Candidates | None = None,
     base: str | None = None,
     tip: str | None = None,
     workers: str | int = 1,
@@ -275,11 +288,14 @@ def select_poses(
             its tables; None takes the defaults.
         existing: poses measured before, to which the selection adds the most informative ones: a CSV, measurements, or
             joint values (m, n) [rad or m]; None for no such poses.
+        candidates: poses to choose from: a CSV with the joints' columns, joint values (N, n) [rad or m], or a function
+            of a number of poses that returns joint values; those that break the constraints are left out, and
+            ``selection.indices`` are the rows of the chosen ones. None draws ``settings.candidates`` poses at random.
         workers: number of local processes, or the address of a Dask scheduler.
         progress: called with texts on the progress; None for no report.
 
     Raises:
-        UsageError: an invalid argument or file of constraints.
+        UsageError: an invalid argument, file of constraints or candidate.
         RobotError: the robot is not found, or its file is invalid.
     """
     from calib.workers import workers as opened
@@ -298,6 +314,7 @@ def select_poses(
             settings,
             constraints=optional(constraints),
             existing=optional(existing),
+            candidates=optional(candidates),
             base=base,
             tip=tip,
             map=crew.map_without(lost_workers),
@@ -316,6 +333,7 @@ def fit_geometry(
     validate: Several = (),
     options: FitOptions | str | Path | None = None,
     poses: PoseSelection | str | Path | None = None,
+    loss: Loss | None = None,
     base: str | None = None,
     tip: str | None = None,
     on_read: Callable[[inputs.Inputs], None] | None = None,
@@ -333,14 +351,25 @@ def fit_geometry(
             TOML file (``calib formats options``). None takes the defaults.
         poses: the planned poses: result of `select_poses`, its CSV, or its folder. The predicted σ are compared with
             those of the fit (finding ``sigma-ratio``). None for no comparison.
+        loss: the loss as a function ρ of squared residuals z = (r/σ)² (m,), which returns the rows ρ, ρ' and ρ'' (3, m)
+            or the first two, as in ``scipy.optimize.least_squares`` (Triggs et al. 2000); row weights are ρ'. It takes
+            the place of the loss in `settings`. None for a loss by name.
         on_read: called with the inputs before the fit begins; None for no call.
         progress: called with the name of each step; None for no report.
 
     Raises:
+        UsageError: an invalid argument; for `loss`: ρ' is negative, not finite, or not the derivative of ρ.
         MeasurementError: a file is implausible; the message names row and column.
         Unidentifiable: no parameter is identifiable.
         NotConverged: the fit did not converge.
     """
+    if loss is not None:
+        require(
+            settings is None or settings.loss is None,
+            "loss: given both as a function and by name, in the settings: give only one of them",
+            UsageError,
+        )
+        check_loss(loss)
     if not isinstance(options, FitOptions):
         options = read_options(optional(options))
     expected = None
@@ -350,6 +379,7 @@ def fit_geometry(
         expected = prediction.read(Path(poses))
     stage = stage_of(robot, "fit", base, tip)
     if stage is not None:
+        require(loss is None, "loss: a function is for arms only; parallel robots are fitted without one", UsageError)
         return stage.run(
             listed(measured), listed(validate), settings=settings, options=options, poses=poses, progress=progress
         )
@@ -366,5 +396,5 @@ def fit_geometry(
     )
     if on_read is not None:
         on_read(fit_inputs)
-    outcome = fit.run(fit_inputs, options, settings, progress, expected or None)
+    outcome = fit.run(fit_inputs, options, settings, progress, expected or None, loss)
     return as_subclass(outcome, GeometryFit)

@@ -23,6 +23,7 @@ from calib.records import as_subclass
 from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain
 from calib.trajectories.setpoints import Setpoints
+from calib.workers.extras import available
 
 if TYPE_CHECKING:
     from calib.procedure.report.charts import Chart
@@ -61,9 +62,10 @@ class ExcitationDesign(ChartedResult, WithoutVerdict, design.Designed):
             out: folder to write; an earlier result of the same kind in it is replaced.
             plots: whether to write the figures.
         """
-        from calib.procedure.report import motion_figures
+        write_figures = None
+        if plots and available("matplotlib"):
+            from calib.procedure.report.motion_figures import write_design as write_figures
 
-        write_figures = motion_figures.write_design if plots else None
         return folder.write_design(self, Path(out), write_figures)
 
     def charts(self) -> dict[str, Chart]:
@@ -109,9 +111,10 @@ class MotionPlan(ChartedResult, WithoutVerdict, planning.Planned):
             out: folder to write; an earlier result of the same kind in it is replaced.
             plots: whether to write the figures.
         """
-        from calib.procedure.report import motion_figures
+        write_figures = None
+        if plots and available("matplotlib"):
+            from calib.procedure.report.motion_figures import write_plan as write_figures
 
-        write_figures = motion_figures.write_plan if plots else None
         return folder.write_plan(self, Path(out), write_figures)
 
     def charts(self) -> dict[str, Chart]:

@@ -13,11 +13,12 @@ from contextlib import contextmanager
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, overload
 
-from calib.errors import CalibError, UsageError, one_of, refused_as
+from calib.errors import CalibError, UsageError, one_of
 from calib.procedure.findings import NOT_JUDGED, Verdict
 from calib.result_kinds import ResultKind
+from calib.workers.extras import needing
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from calib.results.scene import Scene
 
 Progress = Callable[[str], None]
-DataFrame: TypeAlias = Any
-"""A pandas DataFrame; pandas is there for those who ask for data frames."""
 # number of characters of a line of text
 WIDTH = 120
 
@@ -174,7 +173,8 @@ class ChartedResult(Kept):
 
     def figures(self) -> Mapping[str, Picture]:
         """Return the figures by name, as PNG images."""
-        from calib.procedure.report.charts import picture
+        with needing("matplotlib"):
+            from calib.procedure.report.charts import picture
 
         return {name: picture(chart, "") for name, chart in self.charts().items()}
 
@@ -193,7 +193,8 @@ class ChartedResult(Kept):
         Raises:
             UsageError: there is no figure of this name.
         """
-        from calib.procedure.report import charts
+        with needing("matplotlib"):
+            from calib.procedure.report import charts
 
         charts_by_name = self.charts()
         if name is None:
@@ -237,19 +238,3 @@ class ReportedResult(Kept):
             frame = f'<iframe srcdoc="{escape(page)}" style="width: 100%; height: 60em; border: 0"></iframe>'
             bundle["text/html"] = frame
         return bundle
-
-
-def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:
-    """Return rows as a pandas DataFrame with the given columns.
-
-    Args:
-        rows: sequences or records, one per row.
-        columns: names of the columns.
-
-    Raises:
-        UsageError: pandas is not installed.
-    """
-    message = "data frames need pandas: pip install 'armature-calib[pandas]'; to_dict() and save() do without"
-    with refused_as(UsageError, ImportError, message):
-        import pandas  # pyright: ignore[reportMissingImports]
-    return pandas.DataFrame(list(rows), columns=list(columns))

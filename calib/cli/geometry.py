@@ -8,6 +8,7 @@ import typer
 from calib.cli.completion import Robot
 from calib.cli.shared import Out, check_destination, command, exit_failed, progress, say, say_written
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
+from calib.workers.extras import available
 
 if TYPE_CHECKING:
     from calib.procedure.kinematic_stage.inputs import Inputs
@@ -57,6 +58,7 @@ def select(
         sources += beside(constraints).values()
     stage_of(robot, "choosing poses")
     load_robot(robot, existing, FitOptions(), base, tip)
+    plots = plots and available("matplotlib")
     targets = selection.targets(out, plots)
     if run:
         targets = [*targets, (run, (".csv",))]

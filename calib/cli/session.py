@@ -23,6 +23,8 @@ def new(
     dynamics_only: bool = False,
     poses: Annotated[int, typer.Option(min=1)] = 40,
     validation: Annotated[int, typer.Option(min=0)] = 20,
+    plan: bool = True,
+    holdout: Annotated[float, typer.Option(min=0.0, max=0.99)] = 0.0,
     base: str | None = "",
     tip: str | None = "",
     seed: Seed = 0,
@@ -40,6 +42,8 @@ def new(
         dynamics_only: identify the dynamics only; the geometry is taken from the robot's file
         poses: poses to choose for the fit
         validation: poses to measure for validation only, not fitted; 0 for none
+        plan: choose poses and design motions; --no-plan: what is measured and recorded is already there, or is free
+        holdout: share of the measured poses, and of each recording, that is held out where no file of validation comes
     """
     from calib.procedure.session.commands import new_session
     from calib.procedure.session.questions import checked
@@ -53,7 +57,15 @@ def new(
     if answers.robot is None or answers.instrument is None:
         answers = _completed(answers)
     session_folder = new_session(
-        folder, poses=poses, validation=validation, base=base or "", tip=tip or "", seed=seed, **checked(answers)
+        folder,
+        poses=poses,
+        validation=validation,
+        plan=plan,
+        holdout=holdout,
+        base=base or "",
+        tip=tip or "",
+        seed=seed,
+        **checked(answers),
     )
     say(f"made {session_folder}; next: {command_line('next', session_folder)}")
 

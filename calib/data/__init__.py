@@ -1,1 +1,3 @@
-OFFERS = {"exports": ("recordings.controller_logs:translated", "poses.exports:translated")}
+OFFERS = {
+    "exports": ("recordings.controller_logs:translated", "recordings.ros_texts:translated", "poses.exports:translated")
+}

@@ -1,13 +1,14 @@
 """CSV tables: headers with units, columns converted to SI, errors with row and column.
 
 The separator is tab, semicolon, comma or bar (the first of these that the header contains). It is blanks if the first
-row of numbers, split at blanks, has as many cells as the header. Files are UTF-8 with or without a byte order mark, and
-the decimal mark is a point. Lines that begin with ``#`` are comments, except for a spreadsheet's error (``#REF!``). If
+row of numbers, split at blanks, has as many cells as the header. Files are UTF-8 with or without a byte order mark, or
+Windows-1252 (ANSI); the decimal mark is a point. Lines that begin with ``#`` are comments, except for a spreadsheet's error (``#REF!``). If
 only a comment names the columns (numpy's savetxt), the last comment before the numbers is the header.
 """
 
 from __future__ import annotations
 
+import codecs
 import csv
 import math
 import re
@@ -26,13 +27,29 @@ from calib.errors import MeasurementError, refuse_data, require, suggestion
 from calib.extensions import Point
 from calib.files import check_regular
 from calib.records import frozen, plain_text, read_only
-from calib.units import ANGLES, LENGTHS, QUANTITIES, TIMES, is_number
+from calib.units import (
+    ANGLES,
+    CURRENTS,
+    EFFORTS,
+    LENGTHS,
+    QUANTITIES,
+    TIMES,
+    UNIT_WORDS,
+    VELOCITIES,
+    is_number,
+    unit_of,
+)
 
 EXPORTS: Point[Callable[[str | Path], IO[str] | None]] = Point(
     "exports", "a file of another program as a stream of our text; None where it is our table"
 )
 
 _HEADING = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
+# x / mm (ISO 80000-1, 7.1.4)
+_QUOTIENT = re.compile(r"^(?P<name>[^/]+?)\s*/\s*(?P<unit>\(.+\)|[^/\s]+(/s)?)$")
+_QUOTED_UNITS = {*ANGLES, *LENGTHS, *TIMES, *VELOCITIES, *EFFORTS, *CURRENTS, *UNIT_WORDS}
+# q[0], T[0,1]: numbers of elements, no units
+_ELEMENT = re.compile(r"\d+(\s*,\s*\d+)*")
 # q1 [deg], where blanks separate the names
 _DETACHED_UNIT = re.compile(r"[ ]+([\[(])")
 # A cell of a spreadsheet, not a comment.
@@ -40,6 +57,8 @@ _ERROR = re.compile(r"#(REF!|N/A|NUM!|DIV/0!|VALUE!|NAME\?|NULL!)", re.I)
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
 # Rows read at a time.
 _CHUNK = 20_000
+# Bytes of a file by which its encoding is told (our choice).
+HEAD = 1 << 16
 # Letters of a line (our choice).
 LONGEST = 1 << 20
 # A row this many times as wide as the header probably has decimal commas.
@@ -247,7 +266,9 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
     """
     try:
         check_regular(path)
-        raw = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (closed below)
+        with open(path, "rb") as beginning:
+            encoding = encoding_of(beginning.read(HEAD))
+        raw = open(path, encoding=encoding, newline="")  # noqa: SIM115 (closed below)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         reason = getattr(error, "strerror", None) or error
         raise MeasurementError(f"cannot be read: {reason}", path) from error
@@ -256,6 +277,23 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
         if export is not None:
             file = export
         yield file, *_first_line(file, path, headed)
+
+
+def encoding_of(head: bytes) -> str:
+    """Return the encoding of a text file: UTF-8, UTF-16 by its mark, else Windows-1252 ('ANSI', contains Latin-1).
+
+    Args:
+        head: the first bytes of the file.
+    """
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    if b"\0" in head or head[:2] == b"PK":
+        return "utf-8-sig"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8-sig"
 
 
 def _as_our_text(path: str | Path) -> IO[str] | None:
@@ -382,15 +420,24 @@ def _comment_header(comment: str, separator: str, width: int, path: str | Path) 
 
 
 def split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the names and the units in a header's cells: ``q1 [deg]`` gives ``q1`` and ``deg``; "" without a unit."""
+    """Return the names and the units in a header's cells: ``q1 [deg]`` gives ``q1`` and ``deg``; "" without a unit.
+
+    A unit stands in brackets, or behind a slash (``q1 / deg``).
+
+    Args:
+        cells: cells of the header.
+    """
     names, units = [], []
     for number, cell in enumerate(cells, 1):
         name, unit = plain_text(cell), ""
         match = _HEADING.match(name)
-        if match:
-            name, unit = match["name"], match["unit"].strip()
+        quotient = _QUOTIENT.match(name)
+        if quotient and quotient["unit"].strip("()").strip().lower() in _QUOTED_UNITS:
+            match = quotient
+        if match and not _ELEMENT.fullmatch(match["unit"]):
+            name, unit = match["name"], match["unit"].strip("()").strip()
         names.append(name or f"column {number}")
-        units.append(unit)
+        units.append(unit_of(unit))
     return tuple(names), tuple(units)
 
 
@@ -484,14 +531,14 @@ def _read_cells(
                     is_last = index == len(chunk) - 1 and next(rows, None) is None
                     refuse_data(path, _ragged(row, names, separator, is_last), row=row_count + index + 1)
             for part, column in zip(parts, zip(*chunk)):
-                part.append(_convert(column))
+                part.append(as_column(column))
             row_count += len(chunk)
     except csv.Error as error:
         raise MeasurementError(f"is no CSV: {error}", path, row_count + 1) from error
     return parts
 
 
-def _convert(column: Sequence[str]) -> np.ndarray:
+def as_column(column: Sequence[str]) -> np.ndarray:
     """Return a column's cells as floats if all of them are numbers or empty, else as texts."""
     joined = "".join(column)
     try:
@@ -555,7 +602,7 @@ def _ragged(row: Sequence[str], names: Sequence[str], separator: str, last: bool
 def _not_utf8(error: UnicodeDecodeError, path: str | Path) -> MeasurementError:
     byte = error.object[error.start]
     if _begins_as_archive(path):
-        return MeasurementError("is an archive (.npz or spreadsheet), not a CSV table", path)
+        return MeasurementError("is an archive (.npz or spreadsheet), not a CSV table; save a spreadsheet as CSV", path)
     return MeasurementError(f"is not UTF-8 text (byte 0x{byte:02x}): save it as 'CSV UTF-8'", path)
 
 

@@ -31,7 +31,8 @@ class DriveTerm:
         shape: a key of `SHAPES`.
         acts: pairs (torque row, motion) for every row that the term affects; a motion is a tuple of pairs (joint,
             weight). Empty for a parameter without effect.
-        settings: values of the shape's settings; an ``edge`` may be omitted and is then infinite.
+        settings: values of the shape's settings; an ``edge`` may be omitted and is then infinite. Of a table: place,
+            value and slope of each knot.
         side: side of the joint torque sensor, "link" or "motor"; without such a sensor all terms are on the motor side.
         linear: whether the joint is prismatic, which decides the units.
     """
@@ -48,11 +49,37 @@ class DriveTerm:
         names = SHAPES[self.shape].settings
         if names[:1] == ("edge",) and len(self.settings) == len(names) - 1:
             object.__setattr__(self, "settings", (math.inf, *self.settings))
-        if len(self.settings) != len(names):
+        if self.form.tabulated:
+            self._check_table()
+        elif len(self.settings) != len(names):
             raise CalibError(
                 f"term '{self.name}': shape '{self.shape}' needs ({', '.join(names)}), not {self.settings}"
             )
         require(self.side in ("link", "motor"), f"term '{self.name}': side '{self.side}', expected 'link' or 'motor'")
+
+    def _check_table(self) -> None:
+        """Raise an error unless the settings are two or more knots at rising places."""
+        places = np.array(self.settings[::3])
+        knots_complete = len(self.settings) == 3 * len(places) and len(places) >= 2
+        if not knots_complete or not np.isfinite(self.settings).all() or (np.diff(places) <= 0.0).any():
+            raise CalibError(
+                f"term '{self.name}': shape '{self.shape}' needs two knots or more, each a place, a value and a slope, "
+                f"at rising places; found {len(self.settings)} numbers"
+            )
+
+    def packed(self, first: int) -> tuple[list[float], list[float]]:
+        """Return the term's seven settings for the compiled shapes, and what stands behind them in their row.
+
+        Args:
+            first: column of the row from which this stands.
+        """
+        settings = list(self.settings)
+        table: list[float] = []
+        if self.form.tabulated:
+            table = settings
+            steepest = float(np.abs(table[2::3]).max())
+            settings = [len(table) // 3, first, steepest, table[-3]]
+        return settings + [0.0] * (7 - len(settings)), table
 
     @property
     def form(self) -> Shape:
@@ -119,8 +146,8 @@ class DriveTerm:
         """
         from calib.dynamics import shape_kernels
 
-        acts = np.zeros((1, 8))
-        acts[0, 1 : 1 + len(self.settings)] = self.settings
+        settings, table = self.packed(8)
+        acts = np.array([[0.0, *settings, *table]])
         x = np.ascontiguousarray(joined.x)
         v = np.ascontiguousarray(joined.v)
         state = v if joined.state is None else np.ascontiguousarray(joined.state)

@@ -165,6 +165,8 @@ def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
 
 def _with_exact_sign(term: DriveTerm) -> DriveTerm:
     """Return the term with the exact Coulomb sign instead of the smoothed sign, which is smaller at low speed."""
+    if term.form.tabulated:
+        return term
     settings = []
     for name, setting in zip(term.form.settings, term.settings):
         settings.append(0.0 if name == "v0" else setting)

@@ -1,8 +1,9 @@
 """Compiled shapes (numba) of friction and other drive torques, used for arrays of samples and in simulations.
 
 Each shape is a formula with its derivatives. One row of `acts` contains a shape's settings, from column 1 on, in the
-order of `calib.dynamics.shapes.SHAPES`; the simulator uses the other columns. The code of a shape is the constant with
-the shape's name.
+order of `calib.dynamics.shapes.SHAPES`; the simulator uses the other columns. The settings of a table are the number of
+its knots, the column from which the knots stand (place, value, slope), its steepest slope, and the place of its last
+knot. The code of a shape is the constant with the shape's name.
 """
 
 from math import cos, exp, isinf, pi, sin, sqrt, tanh
@@ -13,6 +14,7 @@ from calib.dynamics.kernels import JOINED, OPTIONS
 
 ACCELERATION, VELOCITY, ONE, POSITION, SIGN, DEAD, SPEED, CUBIC, ROOT = range(9)
 STRIBECK, LOAD, LOAD_VELOCITY, STOP, PRESLIDING, SINE, COSINE, SINE_BAND, COSINE_BAND = range(9, 18)
+VELOCITY_TABLE, POSITION_TABLE = 18, 19
 FADE = 0.1
 """Travel over which ripple of a band fades outside the positions it was identified at [rad]."""
 
@@ -64,6 +66,41 @@ def _band(acts, t, x, v):
         return 0.0
     excess = max(max(lower - x, x - upper), 0.0)
     return gain * min(1.0, max(0.0, 1.0 - excess / FADE))
+
+
+@njit(**OPTIONS)
+def _tabulated(acts, t, place):
+    """Return value and slope of a table at a place: the cubic between two knots, constant beyond them (Hermite).
+
+    Args:
+        acts: array of settings, one row per shape.
+        t: row of this shape.
+        place: position or velocity [rad or m, per s].
+    """
+    first = int(acts[t, 2])
+    low = 0
+    high = int(acts[t, 1]) - 1
+    if not place > acts[t, first]:
+        return acts[t, first + 1], 0.0
+    if not place < acts[t, first + 3 * high]:
+        return acts[t, first + 3 * high + 1], 0.0
+    while high - low > 1:
+        middle = (low + high) // 2
+        if place < acts[t, first + 3 * middle]:
+            high = middle
+        else:
+            low = middle
+    left = first + 3 * low
+    right = left + 3
+    width = acts[t, right] - acts[t, left]
+    s = (place - acts[t, left]) / width
+    rise = acts[t, right + 1] - acts[t, left + 1]
+    start = acts[t, left + 2] * width - rise
+    stop = rise - acts[t, right + 2] * width
+    bend = start * (1.0 - s) + stop * s
+    value = acts[t, left + 1] + s * rise + s * (1.0 - s) * bend
+    slope = rise + (1.0 - 2.0 * s) * bend + s * (1.0 - s) * (stop - start)
+    return value, slope / width
 
 
 @njit(**OPTIONS)
@@ -122,6 +159,12 @@ def shape(code, acts, t, x, v, state):
         upper = smooth_sign(v - first, second)
         lower = smooth_sign(v + first, second)
         return 0.5 * (upper + lower), 0.0, 0.5 * (_sign_slope(upper, second) + _sign_slope(lower, second))
+    if code == VELOCITY_TABLE:
+        value, slope = _tabulated(acts, t, v)
+        return value, 0.0, slope
+    if code == POSITION_TABLE:
+        value, slope = _tabulated(acts, t, x)
+        return value, slope, 0.0
     if code == POSITION:
         return x, 1.0, 0.0
     if code == VELOCITY:
@@ -151,6 +194,8 @@ def steepest(code, acts, t):
         return 1.0 / sqrt(second), 0.0, second, 0.0
     if code == DEAD:
         return 0.5 / second, first, second, 0.0
+    if code == VELOCITY_TABLE:
+        return third, 0.0, acts[t, 4], 0.0
     if code == STOP:
         return 0.0, 0.0, 1.0, 1.0 / first
     if code == PRESLIDING:

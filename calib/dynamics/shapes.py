@@ -10,6 +10,10 @@ The Coulomb sign is smoothed as s(v) = tanh(v / v0); v0 = 0 is the exact sign, a
 
 Shapes that are nonlinear in speed are constant beyond an ``edge`` [rad/s or m/s], the fastest speed of their
 identification (infinite if not given). Beyond the edge, friction changes only by its linear terms.
+
+The shapes ``velocity_table`` and ``position_table`` are any function of v or x, given by its value and slope at knots,
+between which it is the cubic with these values and slopes (Hermite); beyond the knots it is constant. Their settings
+are the knots, one after the other: place, value, slope. `calib.dynamics.tables` makes them of a function.
 """
 
 import math
@@ -77,6 +81,7 @@ class Shape:
         nonnegative: whether the parameter is positive in every robot: inertia, viscous and Coulomb friction.
         exact: whether the shape's columns are free of the noise of q, v and a: constants, and signs except at
             reversals.
+        tabulated: whether the settings are knots of a table: any number of triples place, value, slope.
         undecided_at_rest: whether the shape depends on the sign of the speed, so that its value is unknown for a joint
             at rest.
     """
@@ -93,9 +98,11 @@ class Shape:
     nonnegative: bool = False
     exact: bool = False
     undecided_at_rest: bool = False
+    tabulated: bool = False
 
 
 BAND = ("order", "left", "middle", "right", "way", "lower", "upper")
+KNOT = ("place", "value", "slope")
 VISCOUS, VISCOUS_LINEAR = "N m s/rad", "N s/m"
 SHAPES: dict[str, Shape] = {
     "acceleration": Shape("kg m²", "kg", friction=False, nonnegative=True),
@@ -118,6 +125,10 @@ SHAPES: dict[str, Shape] = {
     "cosine": Shape("N m", "N", ("order", "speed")),
     "sine_band": Shape("N m", "N", BAND, slopes=False),
     "cosine_band": Shape("N m", "N", BAND, slopes=False),
+    "velocity_table": Shape(
+        "N m", "N", KNOT, dissipative=True, of_velocity=True, undecided_at_rest=True, tabulated=True
+    ),
+    "position_table": Shape("N m", "N", KNOT, friction=False, tabulated=True),
 }
 
 

@@ -54,6 +54,8 @@ MIN_TURN = 0.01
 # largest and smallest number of rows by which orientations are checked (our choice)
 CHECKED_ROWS = 200
 MIN_CHECKED_ROWS = 4
+# smallest number of positions that can contradict the arm: station and offset take 9 of their 24 numbers (our choice)
+MIN_PLACED_ROWS = 8
 # smallest median misfit of orientations [deg] that contradicts their stated convention (our choice)
 MIN_ANGLE = 20.0
 # largest median misfits of the reading that explains the orientations: an angle [deg], and a share of the
@@ -236,8 +238,7 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
     """
     if not isinstance(block, Poses):
         return
-    rows = np.flatnonzero(block.tool == np.argmax(np.bincount(block.tool)))
-    rows = rows[evenly(len(rows), CHECKED_ROWS)]
+    rows = checked_rows(block)
     if len(rows) < MIN_CHECKED_ROWS:
         return
     arm = forward(chain, block.q[rows])
@@ -254,6 +255,44 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
                 f"the orientations contradict the arm (read as x y z w: median error {error:.0f}° for the best "
                 f"placement of instrument and tool); {advice}",
             )
+
+
+def checked_rows(block: Poses) -> np.ndarray:
+    """Return the indices of the rows by which a block's orientations are checked: of the target with most rows."""
+    rows = np.flatnonzero(block.tool == np.argmax(np.bincount(block.tool)))
+    return rows[evenly(len(rows), CHECKED_ROWS)]
+
+
+def contradiction(chain: Chain, block: PoseMeasurements) -> float:
+    """Return how far measurements are from the nominal arm with instrument and tool placed; above 1 they contradict it.
+
+    It is the larger of the median distance over `MAX_MISFIT` of the positions' spread and, for poses, the median angle
+    over `MAX_ANGLE`.
+
+    Args:
+        chain: the nominal arm.
+        block: positions or poses; infinite for another kind, or too few rows.
+    """
+    if isinstance(block, Poses):
+        rows = checked_rows(block)
+        if len(rows) < MIN_CHECKED_ROWS:
+            return math.inf
+        arm = forward(chain, block.q[rows])
+        angle, distance = _misfit(arm, block.position[rows], block.quaternion[rows])
+        return max(angle / MAX_ANGLE, distance / MAX_MISFIT)
+    if not isinstance(block, Positions) or len(block) < MIN_PLACED_ROWS:
+        return math.inf
+    sample = take(block, evenly(len(block), CHECKED_ROWS))
+    arm = forward(chain, sample.q)
+    spread = math.sqrt(float(np.sum(np.var(sample.position, axis=0))))
+    worst = 0.0
+    for tool in np.unique(sample.tool):
+        rows = np.flatnonzero(sample.tool == tool)
+        station, offset = _place_position(arm[rows], sample.position[rows], None, None)
+        placed = station @ arm[rows] @ offset
+        distance = np.linalg.norm(placed[:, :3, 3] - sample.position[rows], axis=1)
+        worst = max(worst, float(np.median(distance)) / max(spread, 1e-9))
+    return worst / MAX_MISFIT
 
 
 def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tuple[float, float]:

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import Bars, Distances, Planes, PoseMeasurements, Poses, Positions, Sockets
 from calib.errors import refuse_data
+from calib.estimation.robust import Loss
 from calib.geometry.installation import Seen
 
 # largest number of Gauss–Newton steps for the centre of a bar, and length of a step that ends them [m]
@@ -117,7 +118,7 @@ class ResidualPart:
         return self
 
     def common_noise(
-        self, sigma: np.ndarray, unknowns: int, loss: str, scale: float | None, start: bool
+        self, sigma: np.ndarray, unknowns: int, loss: str | Loss, scale: float | None, start: bool
     ) -> CommonNoise | None:
         """Return the errors that rows share, estimated from the residuals; None for kinds without shared errors.
 
@@ -195,7 +196,29 @@ def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[ResidualPar
     if measured.sigma_rotation is not None:
         sigma = measured.sigma_rotation.T
     orientation = ResidualPart("orientation", turn, angular, sigma, 0, np.arange(len(measured)))
+    if measured.lever is not None:
+        measured, seen, jacobian = _at_lever(measured, measured.lever, seen, jacobian)
     return [*_position(measured, seen, jacobian), orientation]
+
+
+def _at_lever(measured: Poses, lever: np.ndarray, seen: Seen, jacobian: np.ndarray) -> tuple[Poses, Seen, np.ndarray]:
+    """Return poses, predicted targets and their Jacobian (f, 6, m) for points of the target instead of its origin.
+
+    Args:
+        measured: the block, m rows.
+        lever: (m, 3) points in the target's frame [m].
+        seen: the predicted targets.
+        jacobian: (f, 6, m), [v; ω] of the targets' origins per unit of each fitted parameter.
+    """
+    from_origin = np.einsum("edm,me->dm", seen.rotation, lever)
+    turns = Rotation.from_quat(measured.quaternion).as_matrix()
+    measured_from_origin = np.einsum("mde,me->md", turns, lever)
+    velocity = jacobian[:, :3] + np.cross(jacobian[:, 3:], from_origin[None], axis=1)
+    return (
+        replace(measured, position=measured.position + measured_from_origin),
+        replace(seen, point=seen.point + from_origin),
+        np.concatenate([velocity, jacobian[:, 3:]], axis=1),
+    )
 
 
 @parts.register

@@ -239,6 +239,7 @@ class Settings:
         loss: ``none``, ``huber`` or ``cauchy``, on the size of each row's whitened residual; ``auto`` lets the ladder
             of models choose ``cauchy`` for grossly wrong rows, else ``none`` (`calib.geometry.model_choice.ladder`).
         loss_scale: the constant of the loss, in sigmas; None for its default.
+        function: the loss as a function, of which `loss` is the name then; None for a loss with that name.
         damping: first λ of Levenberg–Marquardt; 0 for the iterative linear least squares of eq. 11.
         tolerance: relative size below which a column counts as dependent.
         limit: maximum number of linearisations per pass.
@@ -252,9 +253,23 @@ class Settings:
     tolerance: float = 1e-6
     limit: int = 300
     passes: int = 3
+    function: robust.Loss | None = None
 
     def __post_init__(self) -> None:
-        one_of(self.loss, ("auto", *robust.LOSSES), "loss", UsageError)
+        if self.function is None:
+            one_of(self.loss, ("auto", *robust.LOSSES), "loss", UsageError)
+
+    @property
+    def weighting(self) -> str | robust.Loss:
+        """The loss by which rows are weighted: its name or its function; for ``auto``, before a choice, ``none``."""
+        if self.function is not None:
+            return self.function
+        return "none" if self.loss == "auto" else self.loss
+
+    def with_loss(self, loss: str) -> Settings:
+        """Return the settings with another loss; a function stays if its name is given."""
+        function = self.function if loss == self.loss else None
+        return replace(self, loss=loss, function=function)
 
 
 class Weigher:
@@ -311,9 +326,7 @@ class Weigher:
             )
         determined = max(len(self.free) - round(resting), 0)
         share = max(1.0 - (unknowns - resting) / rows, MIN_FREE_SHARE)
-        loss = self.settings.loss
-        if loss == "auto":
-            loss = "none"
+        loss = self.settings.weighting
         scale = self.settings.loss_scale
         robustly = loss != "none"
         start = first and not robustly

@@ -16,6 +16,7 @@ from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, refuse_option, require
 from calib.identification.friction.friction_ladder import NAMES
+from calib.identification.friction.friction_terms import FrictionTerm
 from calib.identification.loop import LoopSettings, check_loop, per_joint
 from calib.identification.methods.constraint_settings import ConstraintSettings
 from calib.identification.methods.method import Method
@@ -129,6 +130,7 @@ class IdentificationSettings(Choices):
         sets: names of the standard drive terms, one text per joint, or one for all; empty: those of the rows.
         torque_rows: kind of torques to explain.
         couplings, terms: couplings and torque terms in addition to the model of single joints.
+        functions: torque terms that are functions, of a script.
         payloads: label → known mass and centre of mass.
         payload_values: label → ten standard parameters in the tip's frame, from a gain identification;
             these, or else the stated mass and centre, are used where no training recording has the payload.
@@ -140,6 +142,7 @@ class IdentificationSettings(Choices):
     torque_rows: TorqueRows = MOTOR
     couplings: tuple[Coupling, ...] = ()
     terms: tuple[DriveTerm, ...] = ()
+    functions: tuple[FrictionTerm, ...] = ()
     payloads: Mapping[str, Payload] = field(default_factory=dict)
     payload_values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     seed: int = 0
@@ -183,6 +186,14 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
             first_row, _ = term.acts[0]
             term = replace(term, linear=linear[first_row])
         terms.append(term)
+    for function in settings.functions:
+        for term in function.drive_terms(chain):
+            names = {earlier.name for earlier in terms}
+            if term.name in names:
+                raise UsageError(
+                    f"FrictionTerm {function.name}: {term.name} is already a parameter: choose another name"
+                )
+            terms.append(term)
     bodies = make_bodies(chain, settings)
     return IdentificationModel(bodies, tuple(terms), settings.torque_rows)
 

@@ -34,6 +34,7 @@ from calib.trajectories.constraints import BoxLimit, MotionConstraint, TwoSided
 from calib.trajectories.design.verify import dense_motion
 from calib.trajectories.setpoints import Setpoints
 from calib.units import headings
+from calib.workers.extras import available
 
 # Number of instants over the period during the search.
 SAMPLES = 100
@@ -157,8 +158,6 @@ class ParallelExcitation(ExcitationDesign):
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write the result folder of `calib excite`: one period at the controller's rate, and the actuators' series."""
-        from calib.procedure.report import motion_figures
-
         period_motion = folder.one_period(self)
         bounds = self.inputs.limits.bounds
 
@@ -167,8 +166,10 @@ class ParallelExcitation(ExcitationDesign):
             files.write(target / coefficients.NAME, dumps(series))
             if self.predicted:
                 prediction.write(self.predicted, target)
-            if plots:
-                motion_figures.write_design(self, target)
+            if plots and available("matplotlib"):
+                from calib.procedure.report.motion_figures import write_design
+
+                write_design(self, target)
 
         track = self._actuators(period_motion)
         return write_motion(self.robot, Path(out), track, period_motion.q, bounds, self.to_dict(), write_series)

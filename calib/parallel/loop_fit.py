@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calib import files
-from calib.api.rendering import ChartedResult, DataFrame, ReportedResult, data_frame
+from calib.api.rendering import ChartedResult, ReportedResult
+from calib.api.result_table import data_frame
 from calib.arguments import checked
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.fit_options import FitOptions
@@ -49,7 +50,8 @@ from calib.robot import calibrated
 from calib.robot.calibrated import ROBOT
 
 if TYPE_CHECKING:
-    from calib.api.rendering import DataFrame
+    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
+
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 

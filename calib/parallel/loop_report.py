@@ -19,6 +19,7 @@ from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.report import fit_report
 from calib.procedure.report.fit_report import CorrelatedPair, FittedParameter, Report, RowErrors
+from calib.workers.extras import available
 
 
 class ReportedFit(Protocol):
@@ -97,13 +98,14 @@ def report_of(fit: ReportedFit) -> Report:
 def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
     """Write ``report.json``, figures (if `plots`) and the certificate into a fit's folder."""
     from calib.procedure.report.certificate import results
-    from calib.procedure.report.charts import saved
-    from calib.procedure.report.geometry_figures import captioned
 
     report = report_of(fit)
     fit_report.write(report, folder / REPORT)
     drawn = {}
-    if plots:
+    if plots and available("matplotlib"):
+        from calib.procedure.report.charts import saved
+        from calib.procedure.report.geometry_figures import captioned
+
         drawn = saved(captioned(report), folder)
     results.write_fit(report, drawn, folder)
 

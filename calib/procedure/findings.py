@@ -288,7 +288,7 @@ def levels(entry: CatalogueEntry) -> str:
 
 
 def explain(code: str) -> str:
-    """Return the explanation of a finding's code (sentence, limits, advice) or of a term of the glossary.
+    """Return the explanation of a finding's code (example, limits, meaning) or of a term of the glossary.
 
     Raises:
         UsageError: for an unknown code or term.
@@ -301,26 +301,31 @@ def explain(code: str) -> str:
             return meaning
         hint = suggestion(code, [*catalogue(), *glossary()])
         raise UsageError(f"no finding or term is called '{code}'{hint}; `calib explain` lists all")
-    parts = [in_words(entry.says), f"level: {levels(entry)}", entry.means, in_words(entry.advice)]
+    says, advice = example_texts(code)
+    parts = [f"for example: {says}", advice, f"level: {levels(entry)}", entry.means]
     if entry.accept:
         parts.append(f'accept = ["{entry.accept}"] in the options file lets the verdict pass')
     lines = [f"  {part}" for part in parts if part]
     return "\n".join([code, *lines])
 
 
-def in_words(template: str) -> str:
-    """Return a sentence template in readable form: values as capitals with their units, optional parts in brackets.
+def example(code: str) -> Finding:
+    """Return a finding with plausible values, as an example of its message.
 
-    ``{rms:.3g mm} remain<, {rival} too>`` becomes ``RMS mm remain[, RIVAL too]``.
+    Values by name, and what a finding has otherwise, are in ``finding_examples.toml``.
     """
-    words = []
-    for text, name, format_spec, _ in Formatter().parse(template):
-        words.append(text.replace("<", "[").replace(">", "]"))
-        if name:
-            _, _, unit = (format_spec or "").partition(" ")
-            value = name.upper().replace("_", " ")
-            words.append(_with_unit(value, unit))
-    return "".join(words)
+    values = _example_values()
+    return Finding(code, {**values["any"], **values.get(code, {})})
+
+
+@cache
+def _example_values() -> Mapping[str, Mapping[str, object]]:
+    return tomllib.loads(Path(__file__).with_name("finding_examples.toml").read_text(encoding="utf-8"))
+
+
+def example_texts(code: str) -> tuple[str, str]:
+    """Return the sentence and the advice of a finding's example; the advice is empty if there is none."""
+    return sentence(example(code)), _filled(catalogue()[code].advice, example(code).values)
 
 
 def _with_unit(text: str, unit: str) -> str:

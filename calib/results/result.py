@@ -241,7 +241,8 @@ class StoredResult:
 
         certificate, report = self.pages(details, plots)
         remarks = rendering.write(self.path, certificate, report)
-        lines = [*remarks, f"written: {', '.join(str(self.path / name) for name in PAGES)}"]
+        written = [str(self.path / name) for name in PAGES if (self.path / name).exists()]
+        lines = [*remarks, f"written: {', '.join(written)}"]
         if svg is not None:
             lines.append(f"{rendering.write_figures(svg, report)} figures written to {svg}")
         return lines

@@ -287,37 +287,61 @@ class CalibratedChain:
         return self.nominal is not None and not np.array_equal(self.nominal.values, self.chain.values)
 
     def forward(self, q: ArrayLike, torque: np.ndarray | None = None) -> np.ndarray:
-        """Return the tip's poses (m, 4, 4) [m] in the base frame at joint values q (m, n) [rad or m].
+        """Return the tip's poses in the base frame [m]: (m, 4, 4) at joint values (m, n), (4, 4) at (n,).
 
         If the robot has joint corrections, they are applied to the geometry that was fitted with them.
 
         Args:
-            q: joint values (m, n), or (n,) for one pose.
-            torque: (m, n) gravity torques [N m] for corrections by compliance; None: computed from the masses that the
-                fit used.
+            q: joint values (m, n) [rad or m], or (n,) for one pose.
+            torque: gravity torques [N m] in the shape of `q`, for corrections by compliance; None: computed from the
+                masses that the fit used.
 
         Raises:
             CalibError: an array of a wrong shape, or corrections by compliance without torques or masses.
         """
-        values = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, self.chain.n), "q")
-        bases = evaluate(self.deflection, values, torque) if self.deflection.terms else None
-        return forward(self.complete, values, extra_displacements(self.complete, self.deflection, values, bases))
+        values = self.joint_rows(q)
+        bases = None
+        if self.deflection.terms:
+            torques = None if torque is None else shaped(np.atleast_2d(torque), values.shape, "torque")
+            bases = evaluate(self.deflection, values, torques)
+        poses = forward(self.complete, values, extra_displacements(self.complete, self.deflection, values, bases))
+        return like_joints(q, poses)
 
     def jacobian(self, q: ArrayLike) -> np.ndarray:
-        """Return the tip's Jacobian (m, 6, n) [v; ω] in the base frame at joint values q (m, n) [rad or m].
+        """Return the tip's Jacobians [v; ω] in the base frame: (m, 6, n) at joint values (m, n), (6, n) at (n,).
 
         v is the velocity of the tip, ω its angular velocity, per unit joint velocity. The derivatives of joint
         corrections are not included.
 
+        Args:
+            q: joint values (m, n) [rad or m], or (n,) for one pose.
+
         Raises:
             CalibError: joint values of a wrong shape.
         """
-        values = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, self.chain.n), "q")
-        return tip_jacobian(self.complete, values)
+        return like_joints(q, tip_jacobian(self.complete, self.joint_rows(q)))
+
+    def joint_rows(self, q: ArrayLike) -> np.ndarray:
+        """Return joint values (m, n) [rad or m]; those of one pose (n,) as one row.
+
+        Raises:
+            CalibError: joint values of a wrong shape.
+        """
+        return shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, self.chain.n), "q")
 
     def without_corrections(self) -> CalibratedChain:
         """Return the robot without its joint corrections, as a URDF can describe it."""
         return replace(self, corrections=None)
+
+
+def like_joints(q: ArrayLike, values: np.ndarray) -> np.ndarray:
+    """Return values (m, ...) of m poses as they are, those of one pose (1, ...) without their first axis.
+
+    Args:
+        q: the joint values as the user gave them: (m, n), or (n,) for one pose.
+        values: one entry per pose.
+    """
+    return values[0] if np.ndim(q) == 1 else values
 
 
 def as_calibrated(robot: Chain | CalibratedChain) -> CalibratedChain:

@@ -9,13 +9,16 @@ read² + shot · grey. Pixels of a board that bends are looked up on the bent su
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 
 from calib.data.images.board import Board
 from calib.data.images.board_print import raster
 from calib.data.images.lens import Lens, rays
 from calib.data.images.optics import BoardShape, shaped_points
+from calib.workers.extras import needing
+
+with needing("cv2"):
+    import cv2
 
 # Number of sub-pixels per pixel in each direction.
 SUB = 3

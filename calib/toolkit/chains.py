@@ -5,7 +5,7 @@ from calib.robot.calibrated import ROBOT as ROBOT_FILE
 from calib.robot.calibrated import CalibratedChain, Deflection, Term, evaluate, nominal_of
 from calib.robot.calibrated import read as read_calibrated
 from calib.robot.calibrated import write as write_calibrated
-from calib.robot.chain import AXES, Chain, Element, Joint, joint_kinds, random_joints
+from calib.robot.chain import AXES, POSE_JOINTS, Chain, Element, Joint, joint_kinds, random_joints
 from calib.robot.collision import find_mesh, urdf_meshes
 from calib.robot.formats.urdf_tree import UrdfTree, is_urdf
 from calib.robot.formats.urdf_tree import numbers as read_numbers
@@ -15,9 +15,12 @@ from calib.robot.formats.urdf_tree import text as description_text
 from calib.robot.kinematics import forward, joint_frames
 from calib.robot.library import load, load_calibrated, resolve
 from calib.robot.library import names as robot_names
+from calib.robot.tables import dumps as toml_text
+from calib.robot.tables import load as toml_table
 
 __all__ = [
     "AXES",
+    "POSE_JOINTS",
     "ROBOT_FILE",
     "CalibratedChain",
     "Chain",
@@ -48,6 +51,8 @@ __all__ = [
     "read_tree",
     "resolve",
     "robot_names",
+    "toml_table",
+    "toml_text",
     "urdf_meshes",
     "write_calibrated",
 ]

@@ -12,6 +12,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from calib.errors import CalibError, UsageError, refused_as
+from calib.workers.extras import needing
 from calib.workers.processes import Answer, Died, run_call
 
 if TYPE_CHECKING:
@@ -160,7 +161,7 @@ async def _answers(address: str) -> None:
 
 @contextmanager
 def dask(address: str) -> Iterator[_Cluster]:
-    with refused_as(UsageError, ImportError, "a Dask scheduler needs Dask: pip install 'armature-calib[cluster]'"):
+    with needing("distributed"):
         from distributed import Client  # pyright: ignore[reportMissingImports]
     with refused_as(UsageError, (OSError, ValueError), f"no Dask scheduler answers at {address}: {{}}; is it running?"):
         with ThreadPoolExecutor(1) as executor:  # a notebook has a loop of its own

@@ -260,21 +260,34 @@ def test_tab_offers_what_there_is(fitted, model):
     assert all(hasattr(calib.ExcitationDesign, name) for name in ("sampled", "plot", "save", "to_dict"))
 
 
-def test_residuals_are_a_frame_with_pandas(fitted, model, tmp_path, monkeypatch):
-    """Residuals are a data frame where pandas is there."""
+def test_residuals_are_columns_without_pandas(fitted, model, tmp_path, monkeypatch):
+    """Residuals are numpy columns; pandas is needed by those who ask for a data frame only."""
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(UsageError, match=r"need pandas: pip install 'armature-calib\[pandas\]'"):
-        _ = fitted.residuals
-    frame = SimpleNamespace(DataFrame=lambda rows, columns: [columns, *rows])
-    monkeypatch.setitem(sys.modules, "pandas", frame)
+    residuals = fitted.residuals
     with (fitted.save(tmp_path / "fit", plots=False) / "residuals.csv").open(newline="") as file:
         head, first, *rows = csv.reader(file)
-    assert fitted.residuals[0] == head and len(fitted.residuals) == len(rows) + 2
-    assert [float(first[5]), float(first[11])] == pytest.approx([fitted.residuals[1][5], fitted.residuals[1][11]])
-    head, *rows = model.residuals
-    assert head[:3] == ["file", "t [s]", "joint1 [N m]"] and {row[0] for row in rows} == {"train.npz", "other.npz"}
+    assert list(residuals.columns) == head and len(residuals) == len(rows) + 1
+    assert [residuals[head[5]][0], residuals[head[11]][0]] == pytest.approx([float(first[5]), float(first[11])])
+    assert set(residuals["set"]) <= {"fit", "held out", "validation"}
+    structured = np.asarray(residuals)
+    np.testing.assert_array_equal(structured["size [mm]"], residuals["size [mm]"])
+    assert next(iter(residuals))[:3] == tuple(residuals[name][0] for name in head[:3])
+    assert residuals.to_dict()["row"] == residuals["row"].tolist()
+    assert "dx [mm]" in str(residuals) and f"{len(residuals)} rows" in repr(residuals)
+    with pytest.raises(UsageError, match=r"column 'dx \[m\]'.*did you mean 'dx \[mm\]'"):
+        residuals["dx [m]"]
+
+    torques = model.residuals
+    assert torques.columns[:3] == ("file", "t [s]", "joint1 [N m]")
+    assert set(torques["file"]) == {"train.npz", "other.npz"}
     last = model.inputs.unseen[0].target[-1] - model.predictions["other.npz"][-1]
-    np.testing.assert_array_equal(rows[-1][2:], last)
+    np.testing.assert_array_equal(list(torques)[-1][2:], last)
+
+    with pytest.raises(UsageError, match=r"pandas, for data frames, .*: pip install 'armature-calib\[pandas\]'"):
+        residuals.to_dataframe()
+    frame = SimpleNamespace(DataFrame=lambda rows, columns: [columns, *rows])
+    monkeypatch.setitem(sys.modules, "pandas", frame)
+    assert residuals.to_dataframe()[0] == head
 
 
 def test_designed_motion_is_sampled_exactly(tmp_path):
@@ -349,9 +362,13 @@ def test_session_in_python_is_the_commands(logs, tmp_path, monkeypatch, capsys):
     """A session in Python is the command's session."""
     monkeypatch.chdir(tmp_path)
     robot = str(logs / "robot.toml")
-    made = calib.new_session("script", robot, "cmm", poses=8, validation=0, dynamics=False)
+    keys = {"poses": 8, "validation": 0, "holdout": 0.25, "dynamics": False}
+    made = calib.new_session("script", robot, "cmm", **keys)
     command = ["new", "command", "--robot", robot, "--instrument", "cmm", "--poses", "8", "--validation", "0"]
-    assert cli.run([*command, "--geometry-only"]) == 0
+    assert cli.run([*command, "--holdout", "0.25", "--geometry-only"]) == 0
+    assert cli.run(["new", "free", "--robot", robot, "--instrument", "cmm", "--no-plan"]) == 0
+    free = tomllib.loads((tmp_path / "free/session.toml").read_text())
+    assert not free["poses"]["plan"] and not free["dynamics"]["plan"]
     own, other = (tomllib.loads((tmp_path / name / "session.toml").read_text()) for name in ("script", "command"))
     assert made == Path("script") and own | {"created": ""} == other | {"created": ""}
     script, command = calib.run_sessions(["script", "command/session.toml"], plots=False)

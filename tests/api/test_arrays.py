@@ -23,7 +23,7 @@ def test_fit_of_arrays_restores_their_robot():
     block = PoseMeasurements.of(Q, pose[:, :3, 3], turns, joint_names=robot.chain.joint_names)
     assert isinstance(block, Poses) and type(PoseMeasurements.of(Q, pose[:, :3, 3])) is Positions
     fit = calib.fit_geometry(robot, block, OFFSETS)
-    np.testing.assert_allclose(fit.robot.forward(Q[0])[0, :3, 3], pose[0, :3, 3], atol=1e-6)
+    np.testing.assert_allclose(fit.robot.forward(Q[0])[:3, 3], pose[0, :3, 3], atol=1e-6)
     for targets in (Q[:3], pose[:3]):
         found = calib.compensate(fit, targets, frame="nominal").q
         np.testing.assert_allclose(robot.forward(found), pose[:3], atol=1e-5)
@@ -40,7 +40,10 @@ def test_fit_predicts_tool_and_its_error():
     error = np.linalg.norm(pose[:, :3, 3] - robot.forward(q)[:, :3, 3], axis=1)
     assert pose.shape == (200, 4, 4) and sigma.shape == (200, 2) and (sigma > 0.0).all()
     assert np.sqrt(np.mean(error**2)) < np.sqrt(np.mean(sigma[:, 0] ** 2)) < 5e-4
-    np.testing.assert_allclose(fit.predict(q[0]).pose, pose[:1])
+    single = fit.predict(q[0])
+    np.testing.assert_allclose(single.pose, pose[0])
+    np.testing.assert_allclose(single.sigma, sigma[0])
+    assert np.shape(fit.position_sigma(q[0])) == () and fit.position_sigma(q[:1]).shape == (1,)
     with pytest.raises(calib.CalibError, match="q: expected an array of shape"):
         fit.predict(q[:, :5])
 
@@ -52,6 +55,16 @@ def test_jacobian_is_slope_of_pose():
         away = step * np.eye(6)[j]
         slope = (robot.forward(Q + away) - robot.forward(Q - away))[:, :3, 3] / (2.0 * step)
         np.testing.assert_allclose(robot.jacobian(Q)[:, :3, j], slope, atol=1e-8)
+    np.testing.assert_array_equal(robot.jacobian(Q[0]), robot.jacobian(Q)[0])
+
+
+def test_joint_values_of_one_pose_give_one_pose():
+    """(n,) gives (4, 4), (m, n) gives (m, 4, 4), and a wrong number of joints is an error."""
+    robot = calib.load("ur5")
+    np.testing.assert_array_equal(robot.forward(Q[0].tolist()), robot.forward(Q)[0])
+    assert robot.forward(Q[:1]).shape == (1, 4, 4)
+    with pytest.raises(calib.CalibError, match="q: expected an array of shape"):
+        robot.forward(Q[0, :5])
 
 
 def test_a_recording_of_arrays_has_names():

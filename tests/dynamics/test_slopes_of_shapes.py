@@ -30,7 +30,16 @@ FLAT = ("one", "dead")
 GRID = np.linspace(-2.0, 2.0, 41) + 0.0123
 
 
+# place, value and slope of knots; the ends are off the grid
+KNOTS = {
+    "smooth": (-3.0, 0.5, 1.0, -0.5, -1.0, 2.0, 0.7, 1.5, -1.0, 3.0, 0.0, 0.5),
+    "rough": (-0.8, 0.0, 9.0, 0.9, 1.0, 0.0),
+}
+
+
 def term_of(shape, settings):
+    if SHAPES[shape].tabulated:
+        return drives.term("term", shape, 0, *KNOTS["smooth" if settings is SMOOTH else "rough"])
     numbers = {**BAND, **settings}
     return drives.term("term", shape, 0, *(numbers[name] for name in SHAPES[shape].settings))
 

@@ -2,8 +2,8 @@
 
 A controller that keeps its nominal geometry accepts a tool frame and the instrument's frame; those with which the
 nominal arm fits the measurements best are printed. A controller whose axes can be mastered anew accepts joint offsets,
-and the frames that were fitted together with them. These are taken from a fit with ``--model offsets``, since the joint
-offsets of a model with more parameters are not the best ones when used alone.
+and the frames that were fitted together with them. These are of a fit of offsets alone to the same measurements, since
+the joint offsets of a model with more parameters are not the best ones when used alone.
 
 Each frame is relative to the controller's base or flange (`calib.apps.controller_programs.frames`), which is printed
 too. Where the pose of that base or flange is not known, no numbers are printed.
@@ -16,9 +16,9 @@ import numpy as np
 
 from calib.apps.controller_programs.frames import ControllerFrame, Description, base_frame, flange_frame
 from calib.apps.controller_programs.targets import number, pose_values
-from calib.toolkit.chains import CalibratedChain, Controller, nominal_of
+from calib.toolkit.chains import Controller
 from calib.toolkit.installations import Installation, read_arms
-from calib.toolkit.result_folders import open_result, read_exported
+from calib.toolkit.result_folders import NoOffsets, open_result, read_exported, read_mastering
 from calib.transforms import invert
 
 # of frames, by the unit of lengths
@@ -44,7 +44,7 @@ def delivery_text(
     fit_folder = result.fit
     fit = folder if fit_folder is None else fit_folder.path
     robot = read_exported(fit, "deliver")
-    cell, nominal = read_arms(fit)
+    _, nominal = read_arms(fit)
     arm = Description.of_fit(fit, nominal.chain)
     frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)
     verdicts = open_result(fit, "deliver").verdicts
@@ -58,14 +58,8 @@ def delivery_text(
         ]
     if not controller.mastered:
         lines.append("Users cannot master the axes of this controller.")
-    elif fit_folder is not None and fit_folder.metrics().model == "offsets":
-        lines += [
-            "Mastering, with frames that belong to it:",
-            *_mastering(robot, controller),
-            *_frames(cell, controller, *frames),
-        ]
     else:
-        lines.append("Mastering offsets: fit with --model offsets, and deliver that fit.")
+        lines += _mastering(fit, controller, frames)
     lines.append("")
     for frame in frames:
         if frame.warning:
@@ -84,12 +78,12 @@ def _frames(arm: Installation, controller: Controller, base: ControllerFrame, fl
         base, flange: the controller's base and flange, located in the arm's base and tip.
     """
     for index, (name, pose) in enumerate(zip(arm.tool_names, arm.tools), 1):
-        yield from _stood(f"tool {name}", controller.tool_frame, controller, pose, flange, index)
+        yield from frame_lines(f"tool {name}", controller.tool_frame, controller, pose, flange, index)
     for index, (name, pose) in enumerate(zip(arm.station_names, invert(arm.stations)), 1):
-        yield from _stood(f"instrument {name}", controller.base_frame, controller, pose, base, index)
+        yield from frame_lines(f"instrument {name}", controller.base_frame, controller, pose, base, index)
 
 
-def _stood(
+def frame_lines(
     name: str, form: str, controller: Controller, pose: np.ndarray, frame: ControllerFrame, index: int
 ) -> Iterator[str]:
     """Yield the lines on one frame: its numbers relative to the controller's base or flange, and this reference's name.
@@ -115,18 +109,21 @@ def _written(form: str, controller: Controller, pose: np.ndarray, index: int) ->
     return form.format(*numbers, n=index)
 
 
-def _mastering(robot: CalibratedChain, controller: Controller) -> Iterator[str]:
-    """Yield one line per axis with the offset to add to the displayed angle, in the controller's unit.
+def _mastering(fit: Path, controller: Controller, frames: tuple[ControllerFrame, ControllerFrame]) -> Iterator[str]:
+    """Yield one line per axis with the offset to add to the displayed angle, in the controller's unit, and the frames.
 
     Args:
-        robot: the calibrated arm with its nominal description.
+        fit: folder of the fit.
         controller: the controller.
+        frames: the controller's base and flange, located in the arm's base and tip.
     """
-    chain, nominal = robot.chain, nominal_of(robot)
-    offsets = []
-    for k in chain.moving:
-        change = chain.elements[k].value - nominal.elements[k].value
-        offsets.append(change / chain.elements[k].ratio)
-    for axis, value in enumerate(controller.shown(np.array(offsets)), 1):
+    try:
+        mastering = read_mastering(fit)
+    except NoOffsets as reason:
+        yield f"Mastering offsets are left out: {reason}."
+        return
+    yield f"Mastering {mastering}, with frames that belong to it:"
+    for axis, value in enumerate(controller.shown(mastering.offset), 1):
         note = "" if value else " (kept at nominal)"
         yield f"  axis {axis}: true angle = shown angle {value:+.5f} {controller.unit}{note}"
+    yield from _frames(mastering.cell, controller, *frames)

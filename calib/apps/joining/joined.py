@@ -10,8 +10,13 @@ import numpy as np
 from calib import files
 from calib.toolkit.pose_data import Table
 
-NAMES = ("name", "point", "pointname", "pointid", "pose", "poseid", "id", "label", "target", "number", "no", "nr")
-CLOCKS = ("t", "time", "timestamp", "datetime")
+# in small letters, without punctuation; English, German, French, Italian, Spanish
+NAMES = (
+    *("name", "point", "pointname", "pointid", "pose", "poseid", "id", "label", "target", "number", "no", "nr"),
+    *("punkt", "punktname", "punktnummer", "punktnr", "messpunkt", "ziel", "nummer"),
+    *("nom", "numero", "nome", "punto", "nombre"),
+)
+CLOCKS = ("t", "time", "timestamp", "datetime", "zeit", "zeitstempel", "temps", "tempo", "tiempo")
 
 
 def column_of(table: Table, names: Sequence[str]) -> str:
@@ -43,6 +48,11 @@ class Joined:
     table: Table
     poses: np.ndarray
     notes: tuple[str, ...]
+
+    @property
+    def rows(self) -> str:
+        """What the rows are, for messages."""
+        return "measured poses"
 
     def write(self, path: Path) -> Path:
         """Write the table as CSV with the notes as comments above it, and return its path."""

@@ -4,17 +4,22 @@
 joints              ``joints.csv``: one row per pose, or a log over time: a column per joint; or what a program of
                     `calib program` left at the controller (`calib formats programs`)
 points              ``points.csv``: ``x y z``, with or without an orientation, sigmas, ``tool``
-by name             a column ``name``, ``point``, ``pose``, ``id``, ``label`` or ``target`` in both; ``P_007`` is ``p7``
+by name             a column ``name``, ``point``, ``pose``, ``id``, ``label`` or ``target`` (also in German, French,
+                    Italian, Spanish) in both; ``P_007`` is ``p7``
 by time             a column ``t``, ``time`` or ``timestamp`` in both (a number, or ISO 8601), of the same clock; points
                     measured while the arm moved are left out
 by row              as many rows in both
 by geometry         with a robot: the order in which the nominal arm explains the points
 by motion           with a robot: points measured while the arm moves, by a clock of their own, and a log over time
+logs                two logs of one motion (positions, torques): one recording for `calib identify`, by time or row
 ==================  ===================================================================================================
 
 Several readings of one pose are averaged; their pooled scatter becomes ``sigma_x``, ``_y``, ``_z`` of the mean where it
 has at least five degrees of freedom and the file states no sigma. A pose whose readings are further apart than
 1 mm, and than ten times what such readings usually are, is left out and named. Units are those of the two files.
+
+Columns of other names, units that the header does not state, joints as a controller shows them and the meaning of
+angles are stated in options (``--options``: [columns], [units], controller, euler); the result is read without them.
 
 By motion, both files have a column of times (seconds, or ``t [ms]``; 5 Hz or more), each by its own clock, and run
 while the arm moves slowly. Offset and drift of the clocks are found from the motion; rows that cannot be used are left
@@ -28,7 +33,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
-from datetime import datetime
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,20 +41,35 @@ from scipy.spatial.distance import pdist
 
 from calib.apps.controller_programs.program import joints_table
 from calib.apps.controller_programs.targets import is_program
-from calib.apps.joining.joined import CLOCKS, NAMES, Joined, column_of
+from calib.apps.joining.joined import NAMES, Joined, column_of
+from calib.apps.joining.logs import clock_of, is_log, join_logs, seconds
+from calib.apps.joining.mapping import JoinOptions, mapped, read_mapping, with_options
 from calib.apps.joining.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_order
+from calib.apps.joining.stated import check_columns, stated
 from calib.apps.joining.streams import join_streams
 from calib.arguments import checked
 from calib.errors import MeasurementError, UsageError, counted, finding, listing, one_of, refuse_data
-from calib.toolkit.chains import CalibratedChain, Chain, load_calibrated
+from calib.toolkit.chains import CalibratedChain, Chain, controllers, load_calibrated
 from calib.toolkit.installations import check_scale
-from calib.toolkit.pose_data import POSITION, SIGMA, PoseMeasurements, Sheet, Table, read_table
+from calib.toolkit.pose_data import (
+    POSITION,
+    SIGMA,
+    FitOptions,
+    PoseMeasurements,
+    Sheet,
+    Table,
+    positions_by_shape,
+    read_fit_options,
+    read_table,
+)
 from calib.toolkit.result_folders import lines_of
-from calib.units import TIMES
 
 METHODS = ("name", "time", "row", "geometry", "motion")
 # requirements of each method except motion, for messages
 REQUIREMENTS = ("both files need names (a column name, pose, id …)", "times (column t)", "as many rows", "give --robot")
+
+# remark on a join by row without a robot
+UNCHECKED = "order not checked: give --robot, whose nominal arm shows whether the rows belong together"
 
 # Thresholds are our choice.
 # largest distance of two readings of one pose [m], where their scatter is not known
@@ -74,6 +94,7 @@ def join(
     robot: str | Path | CalibratedChain | None = None,
     base: str | None = None,
     tip: str | None = None,
+    options: str | Path | FitOptions | None = None,
 ) -> Joined:
     """Join a controller's joint values and an instrument's points to one table of measured poses.
 
@@ -86,6 +107,8 @@ def join(
         robot: the nominal robot, by whose geometry the order is checked or found: library name, file, folder of a fit,
             or in memory; None: not checked.
         base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
+        options: options whose [columns], [units], ``controller`` and ``euler`` say how the two files are read: in
+            memory, or as a TOML file (``calib formats options``); None: their headers say it. The result needs none.
 
     Returns:
         The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` reads. By
@@ -102,18 +125,55 @@ def join(
     if by == "motion":
         if robot is None:
             raise UsageError("joining by motion needs the nominal arm's path: give --robot")
-        return join_streams(joints_file, points_file, robot.complete)
+        return join_streams(joints_file, points_file, robot.complete, _pose_options(options))
+    chain = None if robot is None else robot.complete
+    point_table = read_table(points)
     if is_program(joints_file):
         joint_table = joints_table(joints_file)
+        options = _pose_options(options)
+        check_columns(options, [joint_table, point_table], chain)
     else:
         joint_table = read_table(joints)
-    chain = None if robot is None else robot.complete
-    return _joined(joint_table, read_table(points), by, chain)
+        tables = (joint_table, point_table)
+        mapping = _mapping(options)
+        if _are_logs(*(with_options(table, mapping) for table in tables)):
+            (first, second), notes = mapped(tables, mapping)
+            joined: Joined = join_logs(first, second, by)
+            return replace(joined, notes=(*notes, *joined.notes))
+        options = _pose_options(options)
+        check_columns(options, [joint_table, point_table], chain)
+        joint_table = stated(joint_table, options.for_file(joints_file), chain, holds_joints=True)
+    point_table = stated(point_table, options.for_file(points_file), chain, holds_points=True)
+    return _joined(joint_table, point_table, by, chain)
+
+
+def _pose_options(options: str | Path | FitOptions | None) -> FitOptions:
+    """Return the options by which joint values and points are read."""
+    return options if isinstance(options, FitOptions) else read_fit_options(options)
+
+
+def _mapping(options: str | Path | FitOptions | None) -> JoinOptions:
+    """Return names and units of columns, as the options state them for two logs."""
+    if isinstance(options, FitOptions):
+        return JoinOptions(options.columns, options.units)
+    return read_mapping(None if options is None else Path(options))
+
+
+def _are_logs(first: Table, second: Table) -> bool:
+    """Return whether two tables are logs of one motion, the second without measured points."""
+    return not _has_points(second) and is_log(first) and is_log(second)
+
+
+def _has_points(table: Table) -> bool:
+    """Return whether a table has columns of measured positions, by their names or the shape of these."""
+    first_target = [f"{name}1" for name in POSITION.names]
+    is_named = not {*POSITION.names, *first_target}.isdisjoint(table.header)
+    return is_named or bool(positions_by_shape(table.header))
 
 
 def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joined:
     name_columns = [column_of(joints, NAMES), column_of(points, NAMES)]
-    time_columns = [column_of(joints, CLOCKS), column_of(points, CLOCKS)]
+    time_columns = [clock_of(joints), clock_of(points)]
     possible = {
         "name": all(name_columns),
         "time": all(time_columns),
@@ -144,6 +204,8 @@ def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joine
         pose, notes = ordered(chain, q, points, candidates)
     else:
         notes = (f"{counts}, joined by {by}", *notes)
+        if by == "row":
+            notes = (*notes, UNCHECKED)
     keys = {*name_columns, *time_columns} - {""}
     return merged(joints, points, pose, (*joints.notes, *points.notes, *notes), keys)
 
@@ -180,6 +242,7 @@ def ordered(
     measured_candidates = {origin: pose[measured] for origin, pose in candidates.items()}
     order = find_order(chain, q, position[measured], measured_candidates)
     if order is None:
+        _refuse_shown(chain, q, points, position, measured_candidates)
         searched, advice = "any order", ""
         if len(measured) < MIN_FOUND:
             searched = "their order"
@@ -201,6 +264,30 @@ def ordered(
         pose[doubtful] = -1
         notes.append(f"left out, since several poses are equally near: rows {listing(points.rows[doubtful])}")
     return pose, tuple(notes)
+
+
+def _refuse_shown(
+    chain: Chain, q: np.ndarray, points: Table, position: np.ndarray, candidates: dict[str, np.ndarray]
+) -> None:
+    """Raise MeasurementError if the joint values explain the points as a controller shows them (a FANUC's J3).
+
+    Args:
+        chain: the nominal arm.
+        q: (n, joints) joint values [rad or m].
+        points: table of the measured points.
+        position: (m, 3) measured positions [m]; NaN where none was measured.
+        candidates: orders that are tried first.
+    """
+    measured = position[np.isfinite(position).all(axis=1)]
+    for name, controller in controllers().items():
+        if not controller.coupled:
+            continue
+        if find_order(chain, controller.described(q), measured, candidates) is not None:
+            refuse_data(
+                points.file,
+                f"its points fit the joints as {controller.title} shows them, not as the description counts them: "
+                f'state controller = "{name}" in the options (--options)',
+            )
 
 
 def merged(
@@ -384,8 +471,8 @@ def _at_times(
         joints, points: tables of joint values and of points, with times of one clock.
         joint_column, point_column: names of the columns of times.
     """
-    t = _seconds(joints, joint_column)
-    point_times = _seconds(points, point_column)
+    t = seconds(joints, joint_column)
+    point_times = seconds(points, point_column)
     not_after = np.flatnonzero(np.diff(t) <= 0.0)
     if len(not_after):
         joints.fail("the times do not increase", joint_column, int(not_after[0]) + 1)
@@ -431,17 +518,3 @@ def _interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.nd
         values: (N, k) the series.
     """
     return np.column_stack([np.interp(times, t, column) for column in values.T])
-
-
-def _seconds(table: Table, name: str) -> np.ndarray:
-    """Return the column `name` of a table as times (m,) [s].
-
-    The column contains numbers in the header's unit, or ISO 8601 dates and times.
-    """
-    column = table.index(name)
-    if table.cells[column].dtype == float:
-        return table.numbers(name, None) * table.factor(column, TIMES, "")
-    try:
-        return np.array([datetime.fromisoformat(text).timestamp() for text in table.texts(name)])
-    except ValueError as error:
-        table.fail(f"{error}: expected seconds, or a date and time as 2026-11-27T08:15:30.250", name)

@@ -102,7 +102,7 @@ def find_order(chain: Chain, q: np.ndarray, points: np.ndarray, candidates: dict
     if not orders:
         return None
     best = max(orders, key=lambda order: (int((order.pose >= 0).sum()), -order.rms))
-    return Order(best.pose, best.error, best.rivals, "found from the nominal geometry")
+    return Order(best.pose, best.error, best.rivals, "joined by geometry, which found their order")
 
 
 def _orders_from(

@@ -19,6 +19,7 @@ import numpy as np
 from calib.apps.joining.clock_steps import Step, find_step
 from calib.apps.joining.clocks import Clock, Run, begin, fitted, residuals, velocities
 from calib.apps.joining.joined import Joined
+from calib.apps.joining.mapping import clock_names
 from calib.apps.joining.stream_files import Kind, Stream, read_stream
 from calib.errors import Finding, finding, refuse_data
 from calib.records import evenly
@@ -29,6 +30,8 @@ from calib.toolkit.pose_data import (
     LATE,
     POSITION,
     QUATERNION,
+    FileOptions,
+    FitOptions,
     PoseMeasurements,
     Sheet,
     Table,
@@ -80,7 +83,7 @@ class Streamed(Joined):
     left: float
 
 
-def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
+def join_streams(log_file: Path, file: Path, chain: Chain, options: FitOptions) -> Streamed:
     """Return the points of an instrument's stream with the joint values of a controller's log, thinned.
 
     Thinning keeps rows whose errors are independent.
@@ -89,12 +92,14 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
         log_file: file with times and joint values, by the controller's clock.
         file: file with times and positions, with or without quaternions, by the instrument's clock.
         chain: the nominal arm.
+        options: how the files are read, where their headers do not say it.
 
     Raises:
         MeasurementError: the files are no streams, the arm moves too little, or the files are not of the same motion.
     """
-    log = read_stream(log_file, _joints(chain))
-    stream = _fresh(read_stream(file, _target()))
+    clocks = clock_names(options.columns)
+    log = read_stream(log_file, _joints(chain, options.for_file(log_file)), clocks)
+    stream = _fresh(read_stream(file, _target(options.for_file(file)), clocks))
     _check_motion(log, chain.n, "")
     _check_motion(stream, 3, " m")
     positions = stream.values[:, :3]
@@ -256,11 +261,12 @@ def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.
     return usable[slow], errors[:, slow], velocity[:, slow], findings
 
 
-def _joints(chain: Chain) -> Kind:
+def _joints(chain: Chain, options: FileOptions) -> Kind:
     """Return how a log's joint values are read and checked for an arm: columns, units and joint limits.
 
     Args:
         chain: the arm.
+        options: how the log is read.
     """
     robot = joints_of(chain)
     # limits, and for a joint without any a bound of the right unit
@@ -269,33 +275,39 @@ def _joints(chain: Chain) -> Kind:
     high = np.where(np.isfinite(robot.upper), robot.upper, travel)
 
     def names(table: Table) -> tuple[str, ...]:
-        return Sheet(table).find_joints(robot.names)
+        return Sheet(table, options).find_joints(robot)
 
     def values(table: Table) -> np.ndarray:
-        q, *_ = Sheet(table).joints(robot.names)
+        q, *_ = Sheet(table, options).joints(robot)
         return q
 
     def sound(q: np.ndarray) -> np.ndarray:
         return np.all(~outside(q, low, high), axis=1)
 
     def refuse(table: Table, q: np.ndarray) -> None:
-        check_joints(q, Sheet(table), names(table), robot)
+        check_joints(q, Sheet(table, options), names(table), robot)
 
     return Kind(names, values, sound, refuse, LOG_RESOLUTION)
 
 
-def _target() -> Kind:
-    """Return how an instrument's positions [m] are read and checked, with quaternions where the file has them."""
+def _target(options: FileOptions) -> Kind:
+    """Return how an instrument's positions [m] are read and checked, with quaternions where the file has them.
+
+    Args:
+        options: how the file is read.
+    """
 
     def names(table: Table) -> tuple[str, ...]:
-        sheet = Sheet(table)
+        sheet = Sheet(table, options)
         position_columns = sheet.family(POSITION.names)
         if not position_columns:
             refuse_data(table.file, f"has no x, y, z; found {', '.join(table.header)}")
         return (*position_columns, *sheet.family(QUATERNION.names))
 
     def values(table: Table) -> np.ndarray:
-        columns = [table.numbers(name, "length") for name in names(table)[:3]]
+        sheet = Sheet(table, options)
+        position_columns = names(table)[:3]
+        columns = [table.numbers(name, "length", sheet.unit(name, POSITION.family)) for name in position_columns]
         columns += [table.numbers(name, "") for name in names(table)[3:]]
         return np.column_stack(columns)
 

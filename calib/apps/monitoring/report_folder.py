@@ -62,13 +62,14 @@ def save(
 
 
 def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[ResultPart], numbers: object) -> None:
-    from calib.toolkit.report_charts import picture
     from calib.toolkit.report_pages import Entry, as_html, report_page
 
     sections = []
     for part in parts:
         drawings = []
         for (name, chart), caption in zip(part.charts.items(), part.captions):
+            from calib.toolkit.report_charts import picture
+
             drawing = picture(chart, caption)
             files.write(folder / PICTURE.format(name), drawing.image)
             drawings.append(drawing)

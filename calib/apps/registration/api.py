@@ -7,53 +7,32 @@ geometry is not changed. The three differ in the frames that are printed.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, cast
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from calib.apps.controller_programs.frames import stated_frame
+from calib.apps.registration.frames import Placed, description_of, in_controller, urdf_with
+from calib.apps.registration.pairs import measured_pairs
 from calib.apps.registration.settings import DEFAULT_PLACEMENT, PlacementSettings
+from calib.errors import UsageError
 from calib.records import as_subclass
-from calib.toolkit.chains import CalibratedChain
+from calib.toolkit.chains import CalibratedChain, controller_named, load_calibrated, resolve
 from calib.toolkit.installations import FRAME_AXES
-from calib.toolkit.pose_data import FitOptions
+from calib.toolkit.pose_data import FitOptions, PoseMeasurements, read_fit_options
+from calib.toolkit.pose_pairs import IN_HAND, TO_HAND, PosePairs, read_pairs
 from calib.toolkit.result_folders import FitSettings, GeometryFit, Progress, Several, fit_geometry
 from calib.toolkit.statistics import Estimate
 from calib.transforms import invert
-from calib.units import DEG
 
 Arm = str | Path | CalibratedChain
 # of a quick calibration (our choice)
 USUAL_POSES = 12
 # what stands beside an arm that carries the camera, or the board
-STANDING = {"camera": "board", "board": "camera"}
-
-
-class Placed(NamedTuple):
-    """A placed frame.
-
-    Attributes:
-        name: names of the frame and of its reference frame.
-        pose: (4, 4) pose in the reference frame [m].
-        sigma: (6,) σ of the position [m] and of small rotations [rad] along the axes of the reference frame; NaN where
-            the measurements do not identify a component.
-    """
-
-    name: str
-    pose: np.ndarray
-    sigma: np.ndarray
-
-    def __str__(self) -> str:
-        turn = Rotation.from_matrix(self.pose[:3, :3])
-        position_mm = 1e3 * self.pose[:3, 3]
-        sigma_mm = 1e3 * self.sigma[:3]
-        position = _stated(position_mm, sigma_mm)
-        if np.isnan(self.sigma[3:]).all():
-            return f"{self.name}: x y z {position} mm; orientation not identifiable"
-        angles = _stated(turn.as_euler("xyz") / DEG, self.sigma[3:] / DEG)
-        quaternion = ", ".join(f"{value:.6f}" for value in turn.as_quat(canonical=True))
-        return f"{self.name}: x y z {position} mm; roll pitch yaw {angles} deg; quaternion x y z w {quaternion}"
+STANDING = {"camera": "board", "board": "camera", "camera or board": "board or camera"}
+CARRIED = {IN_HAND: "camera", TO_HAND: "board"}
 
 
 class Placements(GeometryFit):
@@ -74,24 +53,41 @@ class Placements(GeometryFit):
         chain = self.robot.chain
         cell = fit.cell
         block = self.inputs.fit[0]
-        carried = block.carried[0]
+        carried = self.carried
         standing = STANDING.get(carried, "instrument")
         frames = list[Placed]()
         for name, pose in zip(cell.tool_names, cell.tools):
             sigma = _sigma(fit.estimate, name, _turned(pose))
-            frames.append(Placed(f"{carried} '{name}' in {chain.tip}", pose, sigma))
+            title = self._title(carried, name, cell.tool_names)
+            frames.append(Placed(f"{title} in {chain.tip}", pose, sigma, carried, chain.tip))
         if not block.has_instrument:
             return tuple(frames)
         for name, pose in zip(cell.station_names, cell.stations):
             sigma = _sigma(fit.estimate, name, _turned(pose))
-            frames.append(Placed(f"base in {standing} '{name}'", pose, sigma))
+            title = self._title(standing, name, cell.station_names)
+            frames.append(Placed(f"base in {title}", pose, sigma, chain.base, standing))
             # small motions of the inverse: -dp - dr × t, and -dr
             inverse = invert(pose)
             jacobian = -np.eye(6)
             jacobian[:3, 3:] = np.cross(inverse[:3, 3], np.eye(3)).T
             sigma = _sigma(fit.estimate, name, jacobian)
-            frames.append(Placed(f"{standing} '{name}' in {chain.base}", inverse, sigma))
+            frames.append(Placed(f"{title} in {chain.base}", inverse, sigma, standing, chain.base))
         return tuple(frames)
+
+    @property
+    def carried(self) -> str:
+        """What the arm carries: tool, camera or board."""
+        return self.inputs.fit[0].carried[0]
+
+    def _title(self, frame: str, name: str, names: tuple[str, ...]) -> str:
+        """Return how a frame is called in a line: with its own name.
+
+        Args:
+            frame: what it is: tool, camera, board, instrument.
+            name: its name.
+            names: names of all frames of its kind.
+        """
+        return f"{frame} '{name}'"
 
     def lines(self, *first: str) -> Iterator[str]:
         """Yield the console lines: verdict, residual, and frames.
@@ -99,11 +95,15 @@ class Placements(GeometryFit):
         Args:
             *first: beginnings of the names of the frames to print.
         """
-        poses = self.fit.poses
         yield str(self.verdict)
         for frame in self.placed:
             if frame.name.startswith(first):
                 yield str(frame)
+        yield from self._on_residual()
+
+    def _on_residual(self) -> Iterator[str]:
+        """Yield the lines on the residual, from which σ is computed, on warnings, and on a small number of poses."""
+        poses = self.fit.poses
         rms_mm = 1e3 * self.fit.errors[1].rms
         yield f"{poses} poses, {rms_mm:.3g} mm rms residual (with the arm's random errors), from which σ is computed"
         yield from map(str, self.warnings)
@@ -112,6 +112,111 @@ class Placements(GeometryFit):
 
     def __str__(self) -> str:
         return "\n".join(self.lines(""))
+
+
+class HandEye(Placements):
+    """A fit of the placements of camera and board, one carried by the arm and the other beside it.
+
+    ``print`` shows both frames with σ, as the origin of a URDF's joint and as the command for a ROS transform.
+    """
+
+    @property
+    def carried(self) -> str:
+        """What the arm carries: camera or board; ``camera or board`` if neither names nor options say it."""
+        block = self.inputs.fit[0]
+        carried = block.carried[0]
+        if carried in STANDING:
+            return carried
+        mounting = getattr(block, "mounting", "")
+        if not mounting and getattr(block, "lever", None) is not None:
+            mounting = IN_HAND
+        return CARRIED.get(mounting, "camera or board")
+
+    @property
+    def transforms(self) -> tuple[Placed, ...]:
+        """Camera and board: the carried one in the arm's tip, the standing one in its base."""
+        standing = STANDING[self.carried]
+        frames = [frame for frame in self.placed if frame.frame in (self.carried, standing)]
+        is_open = any(bool(np.isnan(frame.sigma).any()) for frame in frames)
+        if is_open:
+            # what is not identifiable of one position moves the other
+            unknown = np.array([*np.full(3, np.nan), *np.zeros(3)])
+            frames = [replace(frame, sigma=frame.sigma + unknown) for frame in frames]
+        return tuple(frames)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a component of a placement is not identifiable, so that numbers of both frames depend on a choice."""
+        return any(bool(np.isnan(frame.sigma).any()) for frame in self.transforms)
+
+    @property
+    def is_of_pairs(self) -> bool:
+        """Whether it was fitted to pairs of poses, whose robot's joints are coordinates of its poses."""
+        return self.inputs.chain.is_free_flyer
+
+    def for_controller(
+        self, name: str, source: Path | None = None, world: str | None = None, flange: str | None = None
+    ) -> Iterator[str]:
+        """Yield both transforms as frames of a robot controller.
+
+        Args:
+            name: the controller (``calib program --list``).
+            source: the robot's description, for pairs of poses; None: that of the fit.
+            world, flange: poses of the controller's base in the arm's base, and of its flange in the arm's tip, as in
+                `calib deliver`; None where the description says them.
+        """
+        arm = None
+        if not self.is_of_pairs:
+            arm = description_of(source or self.inputs.source, self.robot.chain)
+        statements = stated_frame(world, "--world"), stated_frame(flange, "--flange")
+        controller = controller_named(name)
+        yield f"{controller.title}:"
+        yield from in_controller(self.transforms, controller, self.robot.chain.base, arm, *statements)
+
+    def urdf(self, source: Path | None = None) -> tuple[str, list[str]]:
+        """Return the robot's URDF with a link for camera and board each, and the names of these links.
+
+        Args:
+            source: the robot's description, for pairs of poses; None: that of the fit.
+
+        Raises:
+            UsageError: it is not known what the arm carries, or the robot has no URDF.
+        """
+        if "or" in self.carried.split():
+            raise UsageError(
+                "it is not known whether the arm carries the camera or the board: state [camera] mounting = "
+                f"'{IN_HAND}' (camera) or '{TO_HAND}' (board) in the options, then write the URDF"
+            )
+        if self.is_open:
+            raise UsageError("a placement is not identifiable: turn the wrist about a second axis, then write the URDF")
+        if self.is_of_pairs and source is None:
+            raise UsageError("pairs of poses have no URDF: give the robot's before the file")
+        return urdf_with(resolve(source or self.inputs.source), self.transforms)
+
+    def _title(self, frame: str, name: str, names: tuple[str, ...]) -> str:
+        return frame if len(names) == 1 else f"{frame} '{name}'"
+
+    def lines(self, *first: str) -> Iterator[str]:
+        """Yield the console lines: verdict, both transforms in the words of their users, residual, remarks."""
+        yield str(self.verdict)
+        for frame in self.transforms:
+            yield str(frame)
+            if not self.is_open:
+                yield f"URDF: {frame.urdf_origin}"
+                yield f"ROS: {frame.ros_command}"
+        if self.is_open:
+            yield (
+                "the poses turn about one axis only: positions of camera and board along it are not identifiable, only "
+                "their sum, so no frames are printed for use; turn the wrist by 90° and more about a second axis"
+            )
+        if "or" in self.carried.split():
+            tip = self.robot.chain.tip
+            yield (
+                f"the poses do not say what {tip} carries: the board if they are poses of the board in the camera, as "
+                "detectors give them; the camera if they are poses of the camera in the board. State [camera] mounting "
+                f"= '{TO_HAND}' (board) or '{IN_HAND}' (camera) in the options"
+            )
+        yield from self._on_residual()
 
 
 def _turned(pose: np.ndarray) -> np.ndarray:
@@ -146,21 +251,6 @@ def _sigma(estimate: Estimate, name: str, jacobian: np.ndarray) -> np.ndarray:
         nonzero = row != 0.0
         variances.append(row[nonzero] @ covariance[np.ix_(nonzero, nonzero)] @ row[nonzero])
     return np.sqrt(np.array(variances))
-
-
-def _stated(values: np.ndarray, sigmas: np.ndarray) -> str:
-    """Return as text values with three decimals and their standard deviations.
-
-    Args:
-        values, sigmas: values and standard deviations, in one unit.
-    """
-    texts = []
-    for value, sigma in zip(values, sigmas):
-        if np.isnan(sigma):
-            texts.append(f"{value:.3f} (not identifiable)")
-        else:
-            texts.append(f"{value:.3f} ± {sigma:.2g}")
-    return ", ".join(texts)
 
 
 def tool(
@@ -203,10 +293,95 @@ def base(
 
 
 def hand_eye(
-    robot: Arm, measured: Several, settings: PlacementSettings = DEFAULT_PLACEMENT, **arguments: Any
-) -> Placements:
-    """Calibrate camera and board, one carried by the arm and the other fixed beside it, from a dozen images.
+    robot: Arm | None,
+    measured: Several = (),
+    settings: PlacementSettings = DEFAULT_PLACEMENT,
+    *,
+    options: FitOptions | str | Path | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    progress: Progress | None = None,
+) -> HandEye:
+    """Calibrate camera and board, one carried by the arm and the other fixed beside it, from a dozen poses.
 
-    The arguments (robot, measured, settings, and further ones by name) and the fit are those of `tool`.
+    Poses of the board in the camera, and of the camera in the board, are told apart by what agrees with the robot.
+
+    Args:
+        robot: the arm, as for `tool`; None for pairs of poses, in which case it names base and tip only.
+        measured: folders of images; tables of joints and poses; or pairs of poses without joints (robot and board): CSV
+            tables, files of easy_handeye, MoveIt or OpenCV (``calib formats pairs``). Empty: `robot` is such a file.
+        settings: tolerance, and share of the poses to hold out.
+        options: options for reading the files; ``[camera] mounting`` states what the arm carries.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
+        progress: called with a text on each step; None: no report.
+
+    Returns:
+        The fit: ``transforms`` has both frames with σ, ``verdict`` the verdict.
+
+    Raises:
+        MeasurementError: a file is invalid; the message names row and column.
+        UsageError: a robot is missing.
     """
-    return tool(robot, measured, settings, **arguments)
+    file_options = options if isinstance(options, FitOptions) else read_fit_options(options)
+    sources = _listed(measured)
+    if not sources and isinstance(robot, (str, Path)):
+        sources = [Path(robot)]
+        robot = None
+    pairs = _read_pairs(sources, file_options)
+    if pairs:
+        return _of_pairs(robot, pairs, settings, file_options, base, tip, progress)
+    if robot is None or not sources:
+        raise UsageError(
+            "a robot and measured poses are needed; only pairs of poses (robot and board) do without robot"
+        )
+    fit = tool(robot, sources, settings, options=file_options, base=base, tip=tip, progress=progress)
+    return as_subclass(fit, HandEye)
+
+
+def _listed(measured: Several) -> list[Path | PoseMeasurements]:
+    """Return measurements as a list: files as paths, blocks as they are."""
+    if isinstance(measured, (str, Path)):
+        return [Path(measured)]
+    if isinstance(measured, PoseMeasurements):
+        return [measured]
+    return [Path(source) if isinstance(source, str) else source for source in measured]
+
+
+def _read_pairs(sources: list[Path | PoseMeasurements], options: FitOptions) -> list[PosePairs]:
+    """Return the pairs of poses of files; none if the files have other measurements.
+
+    Raises:
+        UsageError: some files have pairs of poses, others do not.
+    """
+    pairs = []
+    for source in sources:
+        if isinstance(source, Path):
+            of_file = read_pairs(source, options.for_file(source))
+            if of_file is not None:
+                pairs.append(of_file)
+    if pairs and len(pairs) < len(sources):
+        raise UsageError(f"{pairs[0].file} has pairs of poses without joints, other files have not: fit them apart")
+    if len(pairs) > 1:
+        raise UsageError(f"{pairs[0].file} and {pairs[1].file} have pairs of poses: give one file at a time")
+    return pairs
+
+
+def _of_pairs(
+    robot: Arm | None,
+    pairs: list[PosePairs],
+    settings: PlacementSettings,
+    options: FitOptions,
+    base: str | None,
+    tip: str | None,
+    progress: Progress | None,
+) -> HandEye:
+    """Return camera and board placed by pairs of poses; the robot, if any, names base and tip."""
+    chain = None
+    if robot is not None:
+        chain = robot.chain if isinstance(robot, CalibratedChain) else load_calibrated(robot, base, tip).chain
+    mounting = options.for_file(pairs[0].file).camera.mounting
+    if mounting == "auto":
+        mounting = ""
+    free_flyer, block = measured_pairs(pairs[0], mounting, chain)
+    fit = tool(free_flyer, cast(Several, [block]), settings, options=options, progress=progress)
+    return as_subclass(fit, HandEye)

@@ -7,6 +7,7 @@ import typer
 
 from calib.cli.shared import command, say
 from calib.errors import UsageError, refused_as
+from calib.workers.extras import needing
 
 app = typer.Typer()
 LOCAL = "127.0.0.1"
@@ -16,12 +17,13 @@ LOCAL = "127.0.0.1"
 def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min=0)] = 8000) -> None:
     """Serve a session as a web page: what to do now, upload of files with their check, progress, results.
 
-    It stops with Ctrl-C; the session goes on from there.
+    A new or empty folder becomes a session on the page. Joint values and points that are uploaded apart are joined
+    there. It stops with Ctrl-C; the session goes on from there.
 
     Example: calib serve cell
 
     Args:
-        folder: of the session
+        folder: of the session; a new one is made on the page
         host: address to listen on. For a tablet 0.0.0.0: whoever has the address with the token that is then printed
             may read and change this session; the connection is not encrypted
         port: 0 for any that is free
@@ -31,14 +33,15 @@ def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min
 
     from calib.toolkit.sessions import open_session
 
-    message = "calib serve needs starlette, uvicorn and python-multipart: pip install 'armature-calib[serve]'"
-    with refused_as(UsageError, ImportError, message):
+    with needing("starlette"):
         import uvicorn
 
         from calib.apps.serve.pages import application
     from calib.apps.serve.work import Work
 
-    open_session(folder)
+    is_new = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+    if not is_new:
+        open_session(folder)
     token = query = ""
     if host not in (LOCAL, "localhost"):
         token = secrets.token_urlsafe(16)

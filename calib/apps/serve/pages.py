@@ -1,112 +1,53 @@
-"""The web pages of a served session, and the check of who may request them."""
+"""The web pages of a served session: what to do now, files, steps, results."""
 
 import atexit
-import hmac
-import ipaddress
+import io
 import re
-import socket
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from urllib.parse import urlsplit
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import ClientDisconnect, Request
-from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route
-from starlette.types import ASGIApp, Receive, Scope, Send
 
-from calib.apps.serve import uploads
+from calib.apps.joining.joining import METHODS
+from calib.apps.serve import brought, creation, editing, received
+from calib.apps.serve.answers import MEASURED_KINDS, back, kind_of, kinds_of, name_of, page_of, refused, session_of
+from calib.apps.serve.columns_wanted import Example, example_of
+from calib.apps.serve.guard import Guard
 from calib.apps.serve.web_viewer import LOCAL, WebViewer
-from calib.apps.serve.work import CHECK, NEXT, REDO, Work
+from calib.apps.serve.work import NEXT, REDO, Work
 from calib.apps.viewer.viewer import FILE as RECORDING
-from calib.errors import CalibError, complaint
+from calib.errors import CalibError
 from calib.folders import PAGES
-from calib.toolkit.report_pages import filled
+from calib.toolkit.chains import controllers
+from calib.toolkit.pose_data import EULER
 from calib.toolkit.sessions import (
-    BROUGHT,
     DONE,
     KEPT,
+    SETTINGS,
     WAITING,
     Session,
     asks,
+    chain_of,
     clear_staging,
     find_step,
     open_session,
     read_state,
     step_states,
-    steps_of,
 )
+from calib.units import ANGLES, LENGTHS
 
-TEMPLATES = "calib.apps.serve"
-DRIFT = "the first poses measured again at the end, to check for drift (optional)"
 PICTURES = (".png", ".svg")
-OURS = "default-src 'none'; style-src 'unsafe-inline'; script-src 'self'; connect-src 'self'; img-src 'self' data:"
-POLICY = f"{OURS}; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
 # of files, whoever wrote them
 SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
-
-
-class Guard:
-    """Middleware that refuses requests without the token.
-
-    It also refuses requests for another host name (DNS rebinding), and POST requests from other sites' pages.
-
-    Args:
-        app: the web application.
-        token: the token; empty: none is required.
-        host: host name that is accepted besides numeric addresses and this computer's names.
-    """
-
-    def __init__(self, app: ASGIApp, token: str, host: str) -> None:
-        self.app = app
-        self.token = token
-        name = socket.gethostname()
-        names = ("localhost", host, name, f"{name}.local", socket.getfqdn())
-        self.names = {name.lower() for name in names}
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        responder = self.app
-        if scope["type"] == "http":
-            responder = self._answer(Request(scope)) or self.app
-        await responder(scope, receive, send)
-
-    def _answer(self, request: Request) -> Response | None:
-        """Return the response to a refused request, or to one that sets the token's cookie; None for other requests."""
-        requested_host = request.headers.get("host", "")
-        if not self._is_ours(requested_host):
-            return PlainTextResponse(
-                "This page is not served under this host name: open the address that calib serve printed.", 403
-            )
-        if request.method != "GET":
-            origin = request.headers.get("origin")
-            other_origin = origin is not None and urlsplit(origin).netloc != requested_host
-            site = request.headers.get("sec-fetch-site", "same-origin")
-            if other_origin or site not in ("same-origin", "none"):
-                return PlainTextResponse("Another site's page asked for this; nothing was changed.", 403)
-        cookie = f"calib-{urlsplit(f'//{requested_host}').port or 80}"
-        if self.token and not self._knows(request.cookies.get(cookie, "")):
-            if request.method != "GET" or not self._knows(request.query_params.get("token", "")):
-                message = "This page needs its token: open the whole address that calib serve printed."
-                return PlainTextResponse(message, 403)
-            answer = RedirectResponse(request.url.path, 303)
-            answer.set_cookie(cookie, self.token, httponly=True, samesite="strict")
-            return answer
-        return None
-
-    def _is_ours(self, requested_host: str) -> bool:
-        try:
-            name = urlsplit(f"//{requested_host}").hostname or ""
-        except ValueError:
-            return False
-        try:
-            # Nobody can rebind a number.
-            ipaddress.ip_address(name)
-            return True
-        except ValueError:
-            return name in self.names
-
-    def _knows(self, token: str) -> bool:
-        return hmac.compare_digest(token.encode(), self.token.encode())
+# folders to take along as a whole: what they hold
+BUNDLES = {"2-poses": "planned poses and their programs", "6-excitation": "motions to play"}
+RESULTS = "the calibrated robot, for other programs"
 
 
 def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlette:
@@ -117,7 +58,8 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
         token: token required in every request; empty: none.
         host: host name accepted besides numeric addresses and this computer's names.
     """
-    clear_staging(open_session(work.folder))
+    if (work.folder / SETTINGS).exists():
+        clear_staging(open_session(work.folder))
     routes = [
         Route("/", page),
         Route("/page.js", script),
@@ -125,8 +67,18 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
         Route("/view", view),
         Route("/next", go_on, methods=["POST"]),
         Route("/redo/{step}", go_on, methods=["POST"]),
-        Route("/bring/{kind}", bring, methods=["POST"]),
-        Route("/aside/{name:path}", set_aside, methods=["POST"]),
+        Route("/new", creation.create, methods=["POST"]),
+        Route("/bring/{kind}", brought.bring, methods=["POST"]),
+        Route("/columns/{kind}/{name}", brought.columns, methods=["POST"]),
+        Route("/join/{kind}", brought.join, methods=["POST"]),
+        Route("/take/{kind}", brought.take, methods=["POST"]),
+        Route("/take/{kind}/{name}", brought.take_points, methods=["POST"]),
+        Route("/aside/{name:path}", brought.set_aside, methods=["POST"]),
+        Route("/example/{kind}", example),
+        Route("/bundle/{name}.zip", bundle),
+        Route("/settings", editing.settings_page),
+        Route("/settings/{name}", editing.save, methods=["POST"]),
+        Route("/options", editing.new_options, methods=["POST"]),
     ]
     guard = Middleware(Guard, token=token, host=host)  # type: ignore[arg-type]
     errors = {CalibError: refused, OSError: refused}
@@ -137,20 +89,12 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
     return app
 
 
-def refused(request: Request, error: Exception) -> Response:
-    """Return a page that shows the message of the error that a request caused."""
-    message = str(error)
-    foreseen = complaint(error)
-    if foreseen:
-        message = foreseen[0]
-    html = filled(TEMPLATES, "refused.html", message=message)
-    return HTMLResponse(html, 400, {"Content-Security-Policy": POLICY})
-
-
 def page(request: Request) -> Response:
-    """Return the page with the current state of the session."""
+    """Return the page with the current state of the session, or the questions of a new one."""
     work: Work = request.app.state.work
-    session = open_session(work.folder)
+    if not (work.folder / SETTINGS).exists():
+        return creation.creation_page()
+    session = session_of(request)
     states = step_states(session)
     ahead = None
     for state in states:
@@ -166,27 +110,36 @@ def page(request: Request) -> Response:
     recording = ""
     if session.path(RECORDING).exists():
         recording = RECORDING
-    paths = _files(session)
+    kinds = []
+    for kind, description in kinds_of(session).items():
+        kinds.append(_brought(session, kind, description))
+    # what the page does itself is no command
+    to_bring, _, _ = to_bring.partition("; then: ")
     tasks = [re.sub(r"^\d+ ", "", line) for line in task.splitlines()]
-    pictures = [_name(session, path) for path in paths if path.suffix in PICTURES]
-    file_names = [_name(session, path) for path in paths]
-    values = {
-        "session": session,
-        "states": states,
-        "ahead": ahead,
-        "work": work,
-        "to_bring": to_bring,
-        "tasks": tasks,
-        "verdicts": verdicts,
-        "kinds": _kinds(session),
-        "notes": _notes(session),
-        "pages": _pages(session),
-        "recording": recording,
-        "pictures": pictures,
-        "files": file_names,
-    }
-    headers = {"Content-Security-Policy": POLICY, "Cache-Control": "no-store"}
-    return HTMLResponse(filled(TEMPLATES, "page.html", **values), headers=headers)
+    file_names = [name_of(session, path) for path in _files(session)]
+    pictures = [name for name in file_names if name.endswith(PICTURES)]
+    return page_of(
+        "page.html",
+        session=session,
+        states=states,
+        ahead=ahead,
+        work=work,
+        to_bring=to_bring,
+        tasks=tasks,
+        verdicts=verdicts,
+        kinds=kinds,
+        joints=chain_of(session).joint_names,
+        controllers=list(controllers()),
+        eulers=EULER,
+        units=(tuple(ANGLES), tuple(LENGTHS)),
+        methods=METHODS,
+        notes=_notes(session),
+        pages=_pages(session),
+        bundles=_bundles(session),
+        recording=recording,
+        pictures=pictures,
+        files=file_names,
+    )
 
 
 def _pages(session: Session) -> list[str]:
@@ -197,21 +150,50 @@ def _notes(session: Session) -> dict[str, tuple[str, ...]]:
     return {name: record.notes for name, record in read_state(session).steps.items()}
 
 
-def _kinds(session: Session) -> list[tuple[str, str, list[str]]]:
-    """Return the kinds of files that can be uploaded to the session: name, description, and paths of existing files."""
-    labels = dict(step.brings for step in steps_of(session))
-    if session.geometric:
-        labels["drift"] = DRIFT
-    kinds = []
-    for kind in BROUGHT:
-        if kind in labels:
-            paths = [_name(session, path) for path in session.brought(kind)]
-            kinds.append((kind, labels[kind], paths))
-    return kinds
+@dataclass(frozen=True)
+class Brought:
+    """A kind of files on the page.
+
+    Attributes:
+        kind, description: its name, and what it is.
+        names: paths of the files that the session reads.
+        example: the columns that it wants.
+        parts: received files that are no measurement yet.
+        preview: joined joint values and points that can be taken; None if nothing is joined.
+        planned: whether points alone can be taken with the planned joint values.
+        answers: what was stated of the parts' columns: name of the part -> field of the form -> answer.
+    """
+
+    kind: str
+    description: str
+    names: tuple[str, ...]
+    example: Example
+    parts: tuple[received.Received, ...] = ()
+    preview: received.Preview | None = None
+    planned: bool = False
+    answers: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+
+    def of_role(self, role: str) -> list[str]:
+        """Return the names of the received files that were recognised as `role`."""
+        return [part.name for part in self.parts if part.role == role]
 
 
-def _name(session: Session, path: Path) -> str:
-    return str(path.relative_to(session.folder))
+def _brought(session: Session, kind: str, description: str) -> Brought:
+    """Return what the page shows of a kind of files (a key of `BROUGHT`)."""
+    names = tuple(name_of(session, path) for path in session.brought(kind))
+    example = example_of(session, kind)
+    if kind not in MEASURED_KINDS:
+        return Brought(kind, description, names, example)
+    parts = tuple(received.received(session, kind))
+    planned = received.planned_poses(session, kind) is not None
+    answers = received.stated_answers(session, kind)
+    return Brought(kind, description, names, example, parts, received.preview(session, kind), planned, answers)
+
+
+def _bundles(session: Session) -> dict[str, str]:
+    """Return the folders that can be downloaded as a whole, with what each holds."""
+    bundles = {**BUNDLES, session.export: RESULTS}
+    return {name: content for name, content in bundles.items() if any(session.path(name).glob("*"))}
 
 
 def _files(session: Session) -> list[Path]:
@@ -232,15 +214,43 @@ def script(request: Request) -> Response:
 
 def file(request: Request) -> Response:
     """Return the file of the session's folder that the request's path names."""
-    session = open_session(request.app.state.work.folder)
+    session = session_of(request)
     path = session.folder / request.path_params["name"]
-    if path not in _files(session) or not path.resolve().is_relative_to(session.folder.resolve()):
+    if path not in _files(session) or not _is_inside(session, path):
         return PlainTextResponse("no such file in this session", 404)
     headers = {"X-Content-Type-Options": "nosniff", "Cache-Control": "no-cache"}
-    # Viewers of PDF are scripts, which a sandbox would stop.
-    if path.suffix != ".pdf":
+    # Viewers of PDF are scripts, which a sandbox would stop; what was received may be of anybody.
+    if path.suffix != ".pdf" or received.FOLDER in path.parts:
         headers["Content-Security-Policy"] = SANDBOX
     return FileResponse(path, headers=headers)
+
+
+def _is_inside(session: Session, path: Path) -> bool:
+    """Return whether a path is in the session's folder, links followed."""
+    return path.resolve().is_relative_to(session.folder.resolve())
+
+
+def example(request: Request) -> Response:
+    """Return an example of a kind of files as a CSV file."""
+    session = session_of(request)
+    kind = kind_of(request, session)
+    headers = {"Content-Disposition": f'attachment; filename="example_{kind}.csv"'}
+    return PlainTextResponse(example_of(session, kind).text, headers=headers, media_type="text/csv")
+
+
+def bundle(request: Request) -> Response:
+    """Return a folder of the session as a ZIP archive."""
+    session = session_of(request)
+    name = request.path_params["name"]
+    if name not in _bundles(session):
+        return PlainTextResponse("no such folder in this session", 404)
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as content:
+        for path in _files(session):
+            if path.is_relative_to(session.path(name)) and _is_inside(session, path):
+                content.write(path, name_of(session, path))
+    headers = {"Content-Disposition": f'attachment; filename="{session.folder.resolve().name}_{name}.zip"'}
+    return Response(archive.getvalue(), headers=headers, media_type="application/zip")
 
 
 def view(request: Request) -> Response:
@@ -248,7 +258,7 @@ def view(request: Request) -> Response:
 
     This works only for browsers on this computer, since Rerun's server listens only there.
     """
-    recording = open_session(request.app.state.work.folder).path(RECORDING)
+    recording = session_of(request).path(RECORDING)
     if not recording.exists():
         return PlainTextResponse("no recording yet", 404)
     if request.client is None or request.client.host not in LOCAL:
@@ -268,34 +278,4 @@ def go_on(request: Request) -> Response:
         find_step(open_session(work.folder), step)
         task = REDO
     work.ask(task, step)
-    return RedirectResponse("/", 303)
-
-
-async def bring(request: Request) -> Response:
-    """Store the files of an uploaded form in the session's folder, and queue their check."""
-    work = request.app.state.work
-    kind = request.path_params["kind"]
-    session = open_session(work.folder)
-    if kind not in [name for name, _, _ in _kinds(session)]:
-        return PlainTextResponse("this session does not accept such files", 404)
-    try:
-        await uploads.receive(session, kind, request.headers.get("content-type", ""), request.stream())
-    except ClientDisconnect:
-        return PlainTextResponse("interrupted; nothing was stored", 400)
-    work.ask(CHECK, kind)
-    return RedirectResponse("/", 303)
-
-
-def set_aside(request: Request) -> Response:
-    """Move the uploaded file of the request into the subfolder ``aside``, where the session does not read it."""
-    work = request.app.state.work
-    name = request.path_params["name"]
-    session = open_session(work.folder)
-    for kind, _, names in _kinds(session):
-        if name in names:
-            path = session.path(name)
-            aside = path.parent / "aside"
-            aside.mkdir(exist_ok=True)
-            path.replace(aside / f"{len(list(aside.iterdir())) + 1}_{path.name}")
-            work.ask(CHECK, kind)
-    return RedirectResponse("/", 303)
+    return back()

@@ -10,10 +10,12 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import File
 
 from calib import files
+from calib.apps.serve.received import FILES, place
 from calib.errors import UsageError, require
 from calib.toolkit.pose_data import IMAGES
 from calib.toolkit.sessions import BROUGHT, LOGS, Session
 
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 # in the folder that is a ROS bag
 BAG = "metadata.yaml"
 
@@ -33,12 +35,10 @@ def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
     require(distinct, "two uploaded files have the same name, or one has no name: rename them", UsageError)
 
     subject = "log"
-    suffixes: tuple[str, ...] = (".csv",)
-    if folder == "3-measured":
+    is_measured = folder == "3-measured"
+    if is_measured:
         subject = "measured"
-    elif folder == "7-recorded":
-        suffixes = LOGS
-    takes_images = folder == "3-measured" and session.settings.instrument.measures == IMAGES
+    takes_images = is_measured and session.settings.instrument.measures == IMAGES
     if BAG in plain or takes_images:
         # these stay together in a folder of their own
         default = subject
@@ -52,16 +52,41 @@ def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
             other_prefixes.append(other_prefix)
     paths = []
     for name in plain:
-        message = f"{name}: expected {' or '.join(suffixes)}; nothing was stored"
-        require(name.lower().endswith(suffixes), message, UsageError)
+        _check_suffix(session, name, is_measured)
         for start in other_prefixes:
             message = f"{name}: files named '{start}…' have another upload on this page; use that, or rename it"
             require(not name.lower().startswith(start), message, UsageError)
+        if is_measured:
+            # what it holds is found out before the session reads it
+            paths.append(place(session, kind, FILES) / name)
+            continue
         stored_name = name
         if not name.lower().startswith(prefix):
             stored_name = f"{prefix}_{name}"
         paths.append(session.path(folder) / stored_name)
     return paths
+
+
+def _check_suffix(session: Session, name: str, is_measured: bool) -> None:
+    """Raise UsageError for a file that a session cannot read, by the ending of its name.
+
+    Args:
+        session: the session.
+        name: name of the file.
+        is_measured: whether it comes as a measurement; otherwise as a recording. Measurements may be of any format, by
+            whose content they are read.
+    """
+    ending = Path(name).suffix.lower()
+    if not is_measured:
+        message = f"{name}: expected {' or '.join(LOGS)}; nothing was stored"
+        require(ending in LOGS, message, UsageError)
+        return
+    instrument = session.settings.instrument.name
+    message = (
+        f"{name}: is an image, and this session's instrument is a {instrument}: for images make a session with "
+        "instrument = camera; nothing was stored"
+    )
+    require(ending not in PICTURES, message, UsageError)
 
 
 async def receive(session: Session, kind: str, content_type: str, chunks: AsyncIterator[bytes]) -> list[Path]:
@@ -92,15 +117,18 @@ async def receive(session: Session, kind: str, content_type: str, chunks: AsyncI
         finally:
             for upload in arrived:
                 upload.close()
-        uploaded = [upload for upload in arrived if upload.size]
-        require(uploaded, "no file was chosen, or it is empty", UsageError)
+        uploaded = [upload for upload in arrived if upload.file_name]
+        require(uploaded, "no file was chosen", UsageError)
         names = []
         for upload in uploaded:
             file_name = upload.file_name or b""
-            names.append(file_name.decode(errors="replace"))
+            name = file_name.decode(errors="replace")
+            message = f"{name} is empty (0 bytes): was it still being written? Nothing was stored"
+            require(upload.size, message, UsageError)
+            names.append(name)
         paths = targets(session, kind, names)
         for upload, path in zip(uploaded, paths):
-            path.parent.mkdir(exist_ok=True)
+            path.parent.mkdir(parents=True, exist_ok=True)
             staged = Path(os.fsdecode(upload.actual_file_name or b""))
             staged.chmod(0o666 & ~files.umask())
             os.replace(staged, path)

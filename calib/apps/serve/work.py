@@ -1,11 +1,12 @@
 """The worker of a served session: jobs run one at a time, each in a separate process.
 
-A job is a run of `calib next` or `calib redo`, or a check of uploaded files. Its messages are stored here, so that
-every page, reloaded or in another tab, shows the same progress.
+A job is a run of `calib next` or `calib redo`, or a check or join of uploaded files. Its messages are stored here, so
+that every page, reloaded or in another tab, shows the same progress.
 """
 
 import os
 import signal
+import sys
 import time
 from collections import deque
 from contextlib import suppress
@@ -18,11 +19,14 @@ from threading import Lock, Thread
 from typing import Any
 
 from calib import bug_reports
+from calib.apps.serve.received import Pairing, join_received
 from calib.errors import command_line, complaint
 from calib.toolkit.sessions import POSES, UNSEEN, Session, open_session
 from calib.workers.processes import end_with_parent
 
-CHECK, NEXT, REDO = "check", "next", "redo"
+CHECK, JOIN, NEXT, REDO = "check", "join", "next", "redo"
+# jobs on uploaded files, beside runs of the session
+OF_FILES = (CHECK, JOIN)
 INTERRUPTED = "it was interrupted; nothing is lost, continue from here"
 # a forked process has threads of libraries that are not there
 _spawned = get_context("spawn")
@@ -30,11 +34,12 @@ _spawned = get_context("spawn")
 
 @dataclass
 class Job:
-    """A run or a check, and its messages until now.
+    """A run, a check or a join, and its messages until now.
 
     Attributes:
-        task: `CHECK`, `NEXT` or `REDO`.
-        subject: the kind of files to check, or the step to repeat; empty for `NEXT`.
+        task: `CHECK`, `JOIN`, `NEXT` or `REDO`.
+        subject: the kind of files to check or join, or the step to repeat; empty for `NEXT`.
+        pairing: what is joined; None for other tasks.
         lines: permanent messages.
         words: the last transient message.
         problem: why the job failed; empty otherwise.
@@ -43,6 +48,7 @@ class Job:
 
     task: str
     subject: str = ""
+    pairing: Pairing | None = None
     lines: list[str] = field(default_factory=list)
     words: str = ""
     problem: str = ""
@@ -60,7 +66,7 @@ class Work:
     Attributes:
         current: the job in progress; None if there is none.
         last: the last run of `calib next` or `calib redo`; None if there was none.
-        checks: kind of files to their last check.
+        checks, joins: kind of files to their last check, and their last join.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -68,29 +74,31 @@ class Work:
         self.current: Job | None = None
         self.last: Job | None = None
         self.checks: dict[str, Job] = {}
+        self.joins: dict[str, Job] = {}
         self._waiting: deque[Job] = deque()
         self._lock = Lock()
         self._process: Any = None
 
-    def ask(self, task: str, subject: str = "") -> bool:
+    def ask(self, task: str, subject: str = "", pairing: Pairing | None = None) -> bool:
         """Queue a job and return whether it was queued.
 
         A job is not queued if an equal one is already queued, or if it is a run and another run is queued or in
         progress.
 
         Args:
-            task: `CHECK`, `NEXT` or `REDO`.
-            subject: the kind of files to check, or the step to repeat; empty for `NEXT`.
+            task: `CHECK`, `JOIN`, `NEXT` or `REDO`.
+            subject: the kind of files to check or join, or the step to repeat; empty for `NEXT`.
+            pairing: what is to be joined; None for other tasks.
         """
         with self._lock:
             jobs = list(self._waiting)
-            if self.current and task != CHECK:
+            if self.current and task not in OF_FILES:
                 jobs.append(self.current)
             for job in jobs:
-                is_run = task != CHECK and job.task != CHECK
-                if is_run or (job.task, job.subject) == (task, subject):
+                is_run = task not in OF_FILES and job.task not in OF_FILES
+                if is_run or (job.task, job.subject, job.pairing) == (task, subject, pairing):
                     return False
-            self._waiting.append(Job(task, subject))
+            self._waiting.append(Job(task, subject, pairing))
             if self.current is None:
                 self._begin()
             return True
@@ -99,7 +107,7 @@ class Work:
         self.current = job = self._waiting.popleft()
         job.began = time.monotonic()
         receiver, sender = _spawned.Pipe(duplex=False)
-        self._process = _spawned.Process(target=_run, args=(sender, self.folder, job.task, job.subject))
+        self._process = _spawned.Process(target=_run, args=(sender, self.folder, job))
         self._process.start()
         sender.close()
         Thread(target=self._listen, args=(job, receiver, self._process), daemon=True).start()
@@ -118,6 +126,8 @@ class Work:
         with self._lock:
             if job.task == CHECK:
                 self.checks[job.subject] = job
+            elif job.task == JOIN:
+                self.joins[job.subject] = job
             else:
                 self.last = job
             self.current = None
@@ -128,20 +138,21 @@ class Work:
         """Interrupt the job in progress, as Ctrl-C does, and discard queued ones; the session can be resumed."""
         self._waiting.clear()
         if self._process is not None and self._process.is_alive():
-            with suppress(ProcessLookupError):
-                os.kill(self._process.pid, signal.SIGINT)
-            self._process.join(10.0)
+            # Windows has no Ctrl-C for one process: what it wrote is whole all the same
+            if sys.platform != "win32":
+                with suppress(ProcessLookupError):
+                    os.kill(self._process.pid, signal.SIGINT)
+                self._process.join(10.0)
             self._process.kill()
 
 
-def _run(sender: Connection, folder: Path, task: str, subject: str) -> None:
+def _run(sender: Connection, folder: Path, job: Job) -> None:
     """Run a job in this (separate) process, and send its messages through a pipe.
 
     Args:
         sender: the pipe.
         folder: the session's folder.
-        task: `CHECK`, `NEXT` or `REDO`.
-        subject: the kind of files to check, or the step to repeat; empty for `NEXT`.
+        job: the job.
     """
     from calib.toolkit.sessions import go_on
 
@@ -152,11 +163,14 @@ def _run(sender: Connection, folder: Path, task: str, subject: str) -> None:
     say = partial(send, "line")
     command = command_line("serve", folder)
     try:
-        if task == CHECK:
-            for line in checked(open_session(folder), subject):
+        if job.task == CHECK:
+            for line in checked(open_session(folder), job.subject):
                 say(line)
-        elif task == REDO:
-            go_on(folder, say, partial(send, "words"), command, subject)
+        elif job.task == JOIN and job.pairing is not None:
+            for line in join_received(open_session(folder), job.subject, job.pairing):
+                say(line)
+        elif job.task == REDO:
+            go_on(folder, say, partial(send, "words"), command, job.subject)
         else:
             go_on(folder, say, partial(send, "words"), command)
     except KeyboardInterrupt:

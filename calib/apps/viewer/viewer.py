@@ -22,6 +22,7 @@ from calib.toolkit.chains import Chain, Joint, joint_frames
 from calib.toolkit.result_folders import DrawnRobot as Drawn
 from calib.toolkit.result_folders import ErrorSizes, Measured, Played, Scene, Torques, TradeOffs, drawn, strips, thinned
 from calib.transforms import to_quaternion
+from calib.workers.extras import needing
 
 if TYPE_CHECKING:
     from rerun import RecordingStream, TimeColumn
@@ -46,8 +47,7 @@ class _Rerun:
     """The package rerun, loaded when one of its names is first used."""
 
     def __getattr__(self, name: str) -> Any:
-        message = "Rerun is not installed here (no version for Macs with Intel processors): pip install rerun-sdk"
-        with refused_as(UsageError, ImportError, message):
+        with needing("rerun", " (no version for Macs with Intel processors)"):
             import rerun
         return getattr(rerun, name)
 

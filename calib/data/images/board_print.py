@@ -4,7 +4,6 @@ from contextlib import suppress
 from itertools import product
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from calib import files
@@ -13,6 +12,10 @@ from calib.data.images.board import KINDS, MIN_CORNERS, Board, corners, read_boa
 from calib.data.images.images import quiet
 from calib.data.poses import BOARD
 from calib.errors import CalibError, UsageError, require
+from calib.workers.extras import needing
+
+with needing("cv2"):
+    import cv2
 
 # Formats of paper: short and long side [m].
 PAPERS = {"a4": (0.210, 0.297), "a3": (0.297, 0.420), "a2": (0.420, 0.594), "a1": (0.594, 0.841), "a0": (0.841, 1.189)}
@@ -44,7 +47,9 @@ def charuco(board: Board) -> cv2.aruco.CharucoBoard:
     """Return a board as OpenCV's ChArUco board object, with lengths in metres."""
     size = board.columns, board.rows
     with quiet():
-        return cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary(board.dictionary))
+        result = cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary(board.dictionary))
+        result.setLegacyPattern(board.legacy)
+        return result
 
 
 def dictionary(name: str) -> cv2.aruco.Dictionary:
@@ -60,12 +65,13 @@ def _black(board: Board) -> np.ndarray:
     margin = 0.5 * (side - board.marker)
     rectangles = []
     markers = []
+    first_black = int(board.legacy and board.kind == "charuco" and board.rows % 2 == 0)
     for row, column in product(range(board.rows), range(board.columns)):
         x = column * side
         y = row * side
         if board.kind == "apriltag":
             markers.append((column * pitch, row * pitch, side))
-        elif (row + column) % 2 == 0:
+        elif (row + column) % 2 == first_black:
             rectangles.append(np.array([[x, y, side, side]]))
         elif board.kind == "charuco":
             markers.append((x + margin, y + margin, board.marker))

@@ -4,7 +4,8 @@
 ``*.png`` …         the images (png, jpg, tif, bmp, pgm, webp), as the sensor gave them
 ``joints.csv``      ``image`` (the file's name), then the joints as in every measurement file: ``q1 [deg]`` …
 ``board.toml``      the board (`calib board` writes it)
-``camera.yaml``     the lens as ROS ``camera_info``; without it, it is found from the images
+``camera.yaml``     the lens as ROS ``camera_info``; files of OpenCV, kalibr and RealSense are read too, under any name
+                    (``.yaml .yml .xml .json``); without one, the lens is found from the images
 ``corners.csv``     the corners found; written at the first reading, read instead of the images afterwards; remove it
                     to have the images looked at again
 ==================  ===================================================================================================
@@ -25,7 +26,8 @@ import numpy as np
 from calib.data.csv_table import Table, read_table
 from calib.data.images.board import Board, corners, read_board
 from calib.data.images.coverage import coverage_words
-from calib.data.images.lens import LENS, Lens, read_lens
+from calib.data.images.lens import LENS, Lens
+from calib.data.images.lens_files import read_lens
 from calib.data.images.pixels import Detections, Pixels, read_corners, write_corners
 from calib.data.poses import BOARD, CORNERS, JOINTS, plausible
 from calib.data.poses.columns import Sheet
@@ -35,6 +37,8 @@ from calib.errors import CalibError, MeasurementError, UsageError, counted, list
 
 # A number that is not part of a name.
 MEASURED = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*_)")
+# Files of a folder that may have the lens, where there is no ``camera.yaml``.
+LENS_SUFFIXES = (".yaml", ".yml", ".xml", ".json")
 # Usable images below which a folder is refused.
 MIN_IMAGES = 3
 Progress = Callable[[int, int, str], None]
@@ -64,13 +68,14 @@ def read_images(
     board = read_own_board(path)
     table = joint_table(path)
     sheet = Sheet(table, options)
-    q, columns = sheet.joints(robot.names)
+    q, columns = sheet.joints(robot)
     notes = list(plausible.check_joints(q, sheet, columns, robot))
     names = table.texts("image")
     detection = find_corners(path, board, names, progress)
     rows, detection_notes = _usable(names, detection, path)
-    notes += detection_notes
-    lens, lens_stated = _lens_of_folder(path, detection.size, options)
+    notes += [*detection.notes, *detection_notes]
+    lens, lens_stated, lens_notes = _lens_of_folder(path, detection.size, options)
+    notes += lens_notes
     pixels = []
     sigmas = []
     for row in rows:
@@ -223,8 +228,8 @@ def problem_words(problems: Mapping[str, str]) -> list[str]:
     return result
 
 
-def _lens_of_folder(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[Lens | None, bool]:
-    """Return the lens of a folder's ``camera.yaml``, and whether there is this file.
+def _lens_of_folder(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[Lens | None, bool, list[str]]:
+    """Return the lens of a folder's ``camera.yaml`` or other file with a lens, and whether there is such a file.
 
     Args:
         path: the folder.
@@ -232,20 +237,51 @@ def _lens_of_folder(path: Path, size: tuple[int, int], options: FileOptions) -> 
         options: options for reading.
 
     Returns:
-        Lens and True; None and False without a file: then the lens has to be estimated from the images.
+        Lens, True and remarks; None, False and remarks without a file: then the lens has to be estimated from the
+        images.
     """
     file = path / LENS
+    notes = []
     if not file.is_file():
-        if options.camera.intrinsics == "given":
-            raise MeasurementError(f"has no {LENS}, required by intrinsics = 'given'", path)
-        return None, False
-    lens = read_lens(file)
+        other, notes = _other_lens_file(path, size)
+        if other is None:
+            if options.camera.intrinsics == "given":
+                raise MeasurementError(f"has no {LENS}, required by intrinsics = 'given'", path)
+            return None, False, notes
+        file = other
+    lens = read_lens(file, size)
     if size[0] and lens.size != size:
         raise MeasurementError(
             f"is for images of {lens.size[0]} x {lens.size[1]} pixels, but the images here have {size[0]} x {size[1]}",
             file,
         )
-    return lens, True
+    return lens, True, notes
+
+
+def _other_lens_file(path: Path, size: tuple[int, int]) -> tuple[Path | None, list[str]]:
+    """Return the only file of a folder with a lens, whatever its name, and remarks on what was read and what was not.
+
+    Args:
+        path: the folder.
+        size: width and height of the images [px]; 0, 0: unknown.
+    """
+    lenses = []
+    notes = []
+    for file in sorted(path.iterdir()):
+        if file.suffix.lower() not in LENS_SUFFIXES:
+            continue
+        try:
+            read_lens(file, size)
+        except MeasurementError as error:
+            notes.append(f"{file.name} is not read as a lens: {str(error).removeprefix(f'{file}: ')}")
+        else:
+            lenses.append(file)
+    if len(lenses) > 1:
+        names = listing([file.name for file in lenses], 5)
+        raise MeasurementError(f"has several files with a lens ({names}): name that of these images {LENS}", path)
+    if not lenses:
+        return None, notes
+    return lenses[0], [*notes, f"the lens is read from {lenses[0].name}"]
 
 
 def _free(options: FileOptions, lens_stated: bool) -> tuple[str, ...]:
@@ -321,4 +357,4 @@ def detection_summary(detection: Detections, board: Board, names: Iterable[str])
     if detection.size[0]:
         all_pixels = np.concatenate(pixels)
         lines.append(coverage_words(all_pixels, detection.size))
-    return [*lines, *problems]
+    return [*lines, *detection.notes, *problems]

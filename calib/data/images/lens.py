@@ -7,11 +7,8 @@ A point (X, Y, Z) [m] in the camera's frame (x right, y down, z forward) has a =
     fisheye   θ = atan r,  x = a θ(1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸) / r   (Kannala & Brandt 2006; OpenCV's)
     pixel     u = fx x + cx,  v = fy y + cy; the centre of the first pixel is (0, 0)
 
-Reading and writing a lens as ROS ``camera_info`` YAML (camera_calibration_parsers).
-
-``image_width``, ``image_height``, ``camera_matrix: {data: [9]}``, ``distortion_model`` (``plumb_bob``,
-``rational_polynomial``, ``equidistant``) and ``distortion_coefficients: {data: [...]}``; the flat keys of the message
-(``width height K D``) are read, too.
+A lens is written as ROS ``camera_info`` YAML (camera_calibration_parsers), and read from more files
+(`calib.data.images.lens_files`).
 """
 
 from __future__ import annotations
@@ -22,8 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.config_types import shown
-from calib.errors import CalibError, MeasurementError, refused_as, suggestion
+from calib.errors import CalibError
 from calib.records import frozen
 
 # Names of a lens's values, by model.
@@ -39,10 +35,6 @@ ITERATIONS = 20
 MIN_DEPTH = 1e-6
 # Name of a lens's file in a folder of images.
 LENS = "camera.yaml"
-# Distortion models of camera_info, and the models of this module.
-MODELS = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
-# Numbers of coefficients that a distortion model may have, the usual number last; other models have 4.
-COEFFICIENTS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,75 +215,6 @@ def rays(lens: Lens, pixels: np.ndarray) -> np.ndarray:
         if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
             break
     return plane
-
-
-def read_lens(path: str | Path) -> Lens:
-    """Return the lens of a ``camera_info`` file.
-
-    Raises:
-        MeasurementError: for a key that is missing or invalid, named in the message.
-    """
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-        table = YAML(typ="safe", pure=True).load(text)
-    except (OSError, UnicodeDecodeError, YAMLError) as error:
-        raise MeasurementError(f"cannot be read as YAML ({str(error).splitlines()[0]})", path) from error
-    if not isinstance(table, dict):
-        raise MeasurementError("is not a camera_info file: expected image_width, camera_matrix, distortion_model", path)
-    width = _pixel_count(table, ("image_width", "width"), path)
-    height = _pixel_count(table, ("image_height", "height"), path)
-    matrix = _numbers(table, ("camera_matrix", "K", "k"), path)
-    if len(matrix) != 9 or matrix[8] != 1.0 or abs(matrix[1]) > 1e-6 * abs(matrix[0]):
-        raise MeasurementError(f"camera_matrix: expected [fx 0 cx 0 fy cy 0 0 1], found {matrix.tolist()}", path)
-    coefficients = _numbers(table, ("distortion_coefficients", "D", "d"), path)
-    name = str(table.get("distortion_model") or "plumb_bob").lower()
-    if name not in MODELS:
-        message = f"distortion_model '{name}'{suggestion(name, MODELS)} is unknown; expected one of {', '.join(MODELS)}"
-        raise MeasurementError(message, path)
-    allowed = COEFFICIENTS.get(name, (4,))
-    if len(coefficients) not in allowed:
-        message = f"distortion_model {name} has {allowed[-1]} coefficients, found {len(coefficients)}"
-        raise MeasurementError(message, path)
-    if name == "plumb_bob":
-        missing = np.zeros(5 - len(coefficients))
-        coefficients = np.concatenate([coefficients, missing])
-    intrinsics = matrix[[0, 4, 2, 5]]
-    values = np.concatenate([intrinsics, coefficients])
-    with refused_as(MeasurementError, CalibError, "{}", path):
-        return Lens(MODELS[name], values, (width, height))
-
-
-def _entry(table: dict[str, object], keys: tuple[str, ...]) -> object:
-    """Return the value of the first key that a table contains; None if it contains none of the keys."""
-    for key in keys:
-        if key in table:
-            return table[key]
-    return None
-
-
-def _pixel_count(table: dict[str, object], keys: tuple[str, ...], path: str | Path) -> int:
-    """Return the number of pixels that a table states under one of the keys; raise MeasurementError for others."""
-    value = _entry(table, keys)
-    if not isinstance(value, int) or not 0 < value < 100_000:
-        raise MeasurementError(f"{keys[0]}: expected a number of pixels, found {shown(value)}", path)
-    return value
-
-
-def _numbers(table: dict[str, object], keys: tuple[str, ...], path: str | Path) -> np.ndarray:
-    """Return the numbers (N,) that a table states under one of the keys; raise MeasurementError for others."""
-    value = _entry(table, keys)
-    if isinstance(value, dict):
-        value = value.get("data")
-    try:
-        numbers = np.array(value, dtype=float).ravel()
-    except (TypeError, ValueError, OverflowError):
-        numbers = np.array([np.nan])
-    if value is None or not np.isfinite(numbers).all():
-        raise MeasurementError(f"{keys[0]}: expected data: [numbers], found {shown(value)}", path)
-    return numbers
 
 
 def write_lens(lens: Lens, path: str | Path, name: str = "camera") -> Path:

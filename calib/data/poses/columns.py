@@ -1,7 +1,7 @@
 """Columns of a measurement file: which quantity each column contains, by the column's name and the options."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
@@ -9,11 +9,28 @@ import numpy as np
 
 from calib.controllers.table import as_described
 from calib.data.csv_table import Table
+from calib.data.joint_columns import (
+    described,
+    joint_series,
+    mapping_line,
+    position_series,
+    proposed_line,
+    series_named_in_cells,
+)
 from calib.data.poses import IGNORED, MEASURED
-from calib.data.poses.fit_options import FileOptions
+from calib.data.poses.fit_options import CONVENTIONS, FileOptions
 from calib.data.poses.measurements import KINDS
-from calib.data.schema import BOUNDS, Column
+from calib.data.poses.name_shapes import (
+    Shape,
+    matrices_by_shape,
+    numbered_quaternions,
+    orientations_by_shape,
+    positions_by_shape,
+    with_shape,
+)
+from calib.data.schema import BOUNDS, Column, Joints
 from calib.errors import MeasurementError, one_of, suggestion
+from calib.units import ANGLES as ANGLE_UNITS
 
 SUFFIXES = ("", "_meas", "_measured")
 POSITION = Column(("x", "y", "z"), "length", "position", BOUNDS.max_length, "mm")
@@ -48,6 +65,19 @@ OURS = (
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
 _NUMBERED_JOINT = re.compile(r"q\d+")
+
+
+class Undecided(MeasurementError):
+    """Raised where a table can be read in several ways, and its names do not tell which is meant.
+
+    Attributes:
+        table: the table.
+        choices: options for reading it, by the line of an options file that states them.
+    """
+
+    def __init__(self, table: Table, message: str, choices: Mapping[str, FileOptions], column: str | None = None):
+        self.table, self.choices = table, choices
+        super().__init__(message, table.file, None, column)
 
 
 @dataclass(frozen=True)
@@ -109,14 +139,14 @@ class Sheet:
             values.append(self.table.numbers(name, column.dimension, unit, gaps))
         return column.check(np.stack(values, axis=1), self.table, names)
 
-    def joints(self, joints: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    def joints(self, joints: Joints | Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return joint values (m, n) [rad or m], and the file's names of the joint columns.
 
         Args:
-            joints: names of the robot's n joints, in the robot's order.
+            joints: names of the robot's n joints, in the robot's order, or the joints with their types.
         """
         names = self.find_joints(joints)
-        q = self.numbers(names, Column(tuple(joints), "joint", "joints"))
+        q = self.numbers(names, Column(Joints.of(joints).names, "joint", "joints"))
         if self.options.controller:
             q = as_described(self.options.controller, q)
         return q, names
@@ -141,21 +171,24 @@ class Sheet:
                 message = f"the options state unit {unit} for '{name}', which is not a column: correct [units]"
                 self.fail(message + suggestion(name, (*names, *UNIT_GROUPS)), name)
 
-    def find_joints(self, joints: Sequence[str]) -> tuple[str, ...]:
+    def find_joints(self, joints: Joints | Sequence[str]) -> tuple[str, ...]:
         """Return the file's names of the joint columns, in the robot's order.
 
         Accepted are the robot's joint names, ``q_<joint name>``, or ``q1`` to ``qn``; the first of these forms that
-        occurs in the file is used.
+        occurs in the file is used. Without them: the only series of `calib.data.joint_columns` that may be positions.
 
         Args:
-            joints: names of the robot's joints.
+            joints: names of the robot's joints, or the joints with their types.
         """
+        robot = Joints.of(joints)
+        joints = robot.names
         n, table, mapping = len(joints), self.table, self.options.columns
+        message, missing = "", []
         numbered = tuple(f"q{i + 1}" for i in range(n))
         mapped = [mapping.get(joint) or mapping.get(q) for joint, q in zip(joints, numbered)]
         for form in (tuple(joints), tuple(f"q_{joint}" for joint in joints), numbered):
             columns: list[str] = []
-            missing: list[str] = []
+            missing = []
             for name, heading in zip(form, mapped):
                 if heading or name in table:
                     columns.append(heading or name)
@@ -167,9 +200,46 @@ class Sheet:
             if any(name in table for name in form):
                 near = suggestion(missing[0], table.header)
                 message = f"missing{near}: the robot has {n} joints, the header has only {', '.join(columns)}"
-                self.fail(message, missing[0])
-        message = f"no joint columns: expected q1 to q{n}, or {', '.join(joints)}; found {', '.join(table.header)}"
-        self.fail(f"{message}. Map them in the options' [columns]")
+                break
+        return self._joints_by_words(robot, message, missing[0] if message else None)
+
+    def has_our_names(self, columns: Sequence[str], joints: Sequence[str]) -> bool:
+        """Return whether joint columns have the names of the robot's joints or of this toolkit, or the options map them.
+
+        Args:
+            columns: the file's names of the joint columns.
+            joints: names of the robot's joints.
+        """
+        mapped = self.options.columns.values()
+        for number, (column, joint) in enumerate(zip(columns, joints), 1):
+            if column not in (joint, f"q_{joint}", f"q{number}", *mapped):
+                return False
+        return True
+
+    def _joints_by_words(self, robot: Joints, message: str, column: str | None) -> tuple[str, ...]:
+        """Return the columns of the only series of joint columns in the header that may be positions.
+
+        Args:
+            robot: the robot's joints.
+            message: what is wrong with columns that have the names of this toolkit; "" without such columns.
+            column: the name of the missing column, for the message.
+
+        Raises:
+            MeasurementError: no series, or several; the message ends with a line for the options, where it can.
+        """
+        table, n = self.table, len(robot.names)
+        series = series_named_in_cells(table, robot.names) or joint_series(table.header, robot.names, robot.kinds)
+        positions = position_series(series)
+        if len(positions) == 1:
+            return positions[0].columns
+        if len(positions) > 1:
+            choices = " or ".join(described(entry) for entry in positions)
+            self.fail(f"joints may be {choices}: choose by one line in the options: {mapping_line(positions[0])}")
+        if not message:
+            expected = f"expected q1 to q{n}, or {', '.join(robot.names)}"
+            message = f"no joint columns: {expected}; found {', '.join(table.header)}"
+        line = proposed_line(table.header, series, n)
+        self.fail(f"{message}. If they have other names, map them by one line in the options, as in {line}", column)
 
     def _refuse_more_joints(self, columns: Sequence[str], n: int) -> None:
         """Raise MeasurementError for a table with more numbered joint columns than the robot has joints.
@@ -299,19 +369,23 @@ class Layout:
         return self.base, self.base_sigma, self.base_sigma_rotation
 
 
-def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
+def find_layout(sheet: Sheet, joints: Joints | Sequence[str]) -> Layout:
     """Return which columns of a table are read, for a robot with joints of the given names.
 
     Args:
         sheet: the table with its options.
-        joints: names of the robot's joints.
+        joints: the robot's joints, or their names.
 
     Raises:
         MeasurementError: a column is missing, or the options map it to one that the file does not have; the header
             allows several kinds or position triples, and the options select none.
     """
-    sheet.check_names(joints)
-    layout = _layout(sheet, joints)
+    robot = Joints.of(joints)
+    sheet.check_names(robot.names)
+    layout = _layout(sheet, robot)
+    if not sheet.has_our_names(layout.joints, robot.names):
+        note = f"the joints are read from {', '.join(layout.joints)}"
+        layout = replace(layout, notes=(note, *layout.notes))
     numbers = list(layout.joints)
     for names in layout.positions:
         numbers += names
@@ -331,9 +405,8 @@ def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     return layout
 
 
-def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
-    _refuse_base_alone(sheet)
-    columns = sheet.find_joints(joints)
+def _layout(sheet: Sheet, robot: Joints) -> Layout:
+    columns = sheet.find_joints(robot)
     kind = _find_kind(sheet, columns)
     if kind in LABEL_OF:
         return _grouped_layout(sheet, kind, columns)
@@ -360,6 +433,70 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}{meaning}")
     rotation = sheet.family(SIGMA_ROTATION.names)
     return replace(layout, orientation=orientation, sigma_rotation=rotation, notes=notes)
+
+
+def with_shapes(sheet: Sheet, robot: Joints) -> Sheet:
+    """Return the sheet with the columns mapped that are a position or an orientation by the shape of their names.
+
+    Args:
+        sheet: the table with its options.
+        robot: the robot's joints.
+
+    Raises:
+        Undecided: a quaternion whose components are numbered.
+        MeasurementError: several positions or orientations have such names.
+    """
+    _refuse_base_alone(sheet)
+    joints = sheet.find_joints(robot)
+    if any(sheet.find(label) for label in LABEL_OF.values()):
+        return sheet
+    unread = {*joints, *sheet.options.columns.values()}
+    names = [name for name in sheet.table.header if name not in unread]
+    targets, *_ = _find_targets(sheet)
+    matrices = matrices_by_shape(sheet.table, names)
+    if not targets:
+        poses = [shape for shape in matrices if len(shape.columns) > len(MATRIX.names)]
+        sheet = _with_only_shape(sheet, poses or positions_by_shape(names))
+        targets, *_ = _find_targets(sheet)
+    if len(targets) != 1 or sheet.options.kind not in ("", "pose"):
+        return sheet
+    if sheet.family(QUATERNION.names) or sheet.family(MATRIX.names) or _angles(sheet, joints):
+        return sheet
+    shapes = matrices or orientations_by_shape(names)
+    if shapes:
+        return _with_only_shape(sheet, shapes)
+    for pair in numbered_quaternions(names):
+        columns = ", ".join(pair[0].columns.values())
+        choices = {_mapping(shape.columns): with_shape(sheet.options, shape) for shape in pair}
+        lines = " or ".join(choices)
+        message = f"{columns} look like a quaternion: is w first or last? One line in the options says it: {lines}"
+        raise Undecided(sheet.table, message, choices)
+    return sheet
+
+
+def _with_only_shape(sheet: Sheet, shapes: Sequence[Shape]) -> Sheet:
+    """Return the sheet with the columns of the only shape mapped; unchanged without a shape.
+
+    Args:
+        sheet: the table with its options.
+        shapes: columns that by their names are the quantity.
+
+    Raises:
+        MeasurementError: there are several.
+    """
+    if len(shapes) > 1:
+        first, second = (", ".join(shape.columns.values()) for shape in shapes[:2])
+        line = _mapping(shapes[0].columns)
+        sheet.fail(f"{first} or {second} may be meant: choose by one line in the options, as in {line}")
+    if not shapes:
+        return sheet
+    return replace(sheet, options=with_shape(sheet.options, shapes[0]))
+
+
+def _mapping(columns: Mapping[str, str]) -> str:
+    """Return the line of an options file that maps columns."""
+    entries = [f'{name} = "{heading}"' for name, heading in columns.items()]
+    return f"columns = {{ {', '.join(entries)} }}"
 
 
 def _of_base(column: Column) -> list[str]:
@@ -472,23 +609,25 @@ def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
         joints: names of the joint columns, which are not angles of an orientation.
 
     Raises:
-        MeasurementError: three angles whose convention the options do not define.
+        Undecided: three angles whose convention the options do not define.
     """
     columns = sheet.family(QUATERNION.names) or sheet.family(MATRIX.names) or _angles(sheet, joints)
     if len(columns) == 3 and not sheet.options.euler:
-        sheet.fail(
-            f"{', '.join(columns)} look like an orientation. State their meaning in the options: euler = 'vector' "
-            "(rotation vector, as in Universal Robots), 'xyz fixed' (roll, pitch, yaw), 'zyx moving' (KUKA's A, "
-            "B, C) ...; or ignore them by kind = 'position'",
-            columns[0],
+        message = (
+            f"{', '.join(columns)} look like an orientation. State their meaning by one line in the options: euler = "
+            "'vector' (rotation vector, as in Universal Robots), 'xyz fixed' (roll, pitch, yaw), 'zyx moving' (KUKA's "
+            "A, B, C) ...; or ignore them by kind = 'position'"
         )
+        choices = {f"euler = '{euler}'": replace(sheet.options, euler=euler) for euler in CONVENTIONS}
+        raise Undecided(sheet.table, message, choices, columns[0])
     return columns
 
 
 def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of three angle columns, in upper or lower case, that are not joints; () without such columns.
 
-    Names of one small letter (a, b, c) count as angles only if the options define the convention of the angles.
+    Names of one small letter (a, b, c) count as angles only if the header states a unit of angles, or the options the
+    convention.
 
     Args:
         sheet: the table with its options.
@@ -498,8 +637,8 @@ def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     if any(name in sheet.options.columns for name in standard_names):
         return sheet.family(standard_names)
     headings: dict[str, str] = {}
-    for name in sheet.table.header:
-        may_be_angle = sheet.options.euler or len(name) > 1 or name.isupper()
+    for name, unit in zip(sheet.table.header, sheet.table.units):
+        may_be_angle = sheet.options.euler or len(name) > 1 or name.isupper() or unit.lower() in ANGLE_UNITS
         if name not in joints and may_be_angle:
             headings[name.lower()] = name
     complete: list[tuple[str, ...]] = []

@@ -19,12 +19,16 @@ import io
 import re
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
+from calib.data.csv_table import Table, as_column, encoding_of
 from calib.data.poses.columns import SUFFIXES
 from calib.data.poses.robodk import recognises
+from calib.records import frozen
 
 # Letters of a file in which its numbers begin (our choice).
 HEAD = 1 << 16
@@ -100,8 +104,7 @@ def translated(path: str | Path) -> InstrumentExport | None:
     """
     with open(path, "rb") as file:
         beginning = file.read(HEAD)
-        is_utf16 = beginning[:2] in (b"\xff\xfe", b"\xfe\xff")
-        encoding = "utf-16" if is_utf16 else "utf-8-sig"
+        encoding = encoding_of(beginning)
         head = beginning.decode(encoding, errors="replace")
         lines = head.splitlines()
         grid = _grid(lines)
@@ -111,7 +114,7 @@ def translated(path: str | Path) -> InstrumentExport | None:
         if not recognises(names) and not _is_ours(names):
             return None
         preset = _preset(lines)
-        is_plain = not preset and grid.mark == "." and not is_utf16 and not differs
+        is_plain = not preset and grid.mark == "." and encoding != "utf-16" and not differs
         if is_plain and _first_content(lines) == grid.first - 1:
             return None
         text = (beginning + file.read()).decode(encoding, errors="replace")
@@ -138,6 +141,30 @@ def translated(path: str | Path) -> InstrumentExport | None:
         note += f", lengths in {length_unit}"
     export.notes = (f"{note}: columns {', '.join(filter(None, names))}",)
     return export
+
+
+def unnamed_table(path: str | Path) -> Table | None:
+    """Return a file of numbers without a row of names as a table with columns ``column 1``, ``column 2`` ….
+
+    None for a file with names.
+
+    Args:
+        path: the file.
+    """
+    with open(path, "rb") as file:
+        content = file.read(HEAD)
+        encoding = encoding_of(content)
+        lines = content.decode(encoding, errors="replace").splitlines()
+        grid = _grid(lines)
+        if grid is None or _headings(grid) or _named_by_comment(lines[: grid.first], grid):
+            return None
+        content += file.read()
+    lines = content.decode(encoding, errors="replace").splitlines()
+    rows = [row for row in _rows(lines[grid.first :], grid) if len(row) == len(grid.cells)]
+    header = tuple(f"column {number + 1}" for number in range(len(grid.cells)))
+    cells = [as_column(column) for column in zip(*rows)]
+    numbers = frozen(np.arange(1, len(rows) + 1), int)
+    return Table(str(path), header, ("",) * len(header), tuple(cells), numbers)
 
 
 def _preset(lines: Sequence[str]) -> dict[str, str]:
@@ -265,8 +292,8 @@ def _columns(grid: Grid) -> tuple[list[str], list[str], bool]:
     units = [""] * width
     if above and any(above[-1]) and all(cell.lower() in UNITS for cell in above[-1] if cell):
         units = [UNITS[cell.lower()] if cell else "" for cell in above.pop()]
-    headings = above[-1] if above and sum(map(bool, above[-1])) > width / 2 else ()
-    if not headings or sum(_numeric(headings, grid.mark)) > width / 2:
+    headings = _headings(replace(grid, above=tuple(above)))
+    if not headings:
         names, units = _unnamed(grid)
         return names, units, True
     file_names, file_units = [], []
@@ -281,6 +308,34 @@ def _columns(grid: Grid) -> tuple[list[str], list[str], bool]:
     if not recognises(file_names) and not _is_ours(file_names):
         names = _ours(file_names, above[:-1])
     return names, units, names != file_names or units != file_units
+
+
+def _headings(grid: Grid) -> tuple[str, ...]:
+    """Return the row of names above the numbers; () if there is none, or if it is numbers, too.
+
+    Args:
+        grid: position of the numbers in the text, with the cells above them but for a row of units.
+    """
+    if not grid.above:
+        return ()
+    headings = grid.above[-1]
+    width = len(grid.cells)
+    is_named = sum(map(bool, headings)) > width / 2 and sum(_numeric(headings, grid.mark)) <= width / 2
+    return headings if is_named else ()
+
+
+def _named_by_comment(lines: Sequence[str], grid: Grid) -> bool:
+    """Return whether a comment above the numbers has as many words as there are columns (numpy's savetxt).
+
+    Args:
+        lines: lines above the numbers.
+        grid: position of the numbers in the text.
+    """
+    for line in lines:
+        text = line.strip().lstrip("#/%! ")
+        if text and len(_split(text, grid.separator)) == len(grid.cells):
+            return True
+    return False
 
 
 def _is_ours(names: Sequence[str]) -> bool:

@@ -63,7 +63,8 @@ from calib.units import ANGLES, LENGTHS
 
 FORMATS = ("csv", "robodk", "three_smr")
 AXES = ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "zyz", "zxz")
-EULER = ("vector", "wpr", "xyz", *(f"{axes} {frame}" for axes in AXES for frame in ("fixed", "moving")))
+CONVENTIONS = ("vector", *(f"{axes} {frame}" for axes in AXES for frame in ("fixed", "moving")))
+EULER = ("vector", "wpr", "xyz", *CONVENTIONS[1:])
 
 Metres = Annotated[float, Real(above=0, least=MIN_SIGMA, most=0.1, unit="m")]
 Radians = Annotated[float, Real(above=0, least=MIN_SIGMA, most=1.0, unit="rad")]

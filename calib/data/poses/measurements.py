@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from calib.errors import MeasurementError, require
 from calib.records import frozen
+from calib.transforms import from_quaternion, invert, to_quaternion
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,12 +184,18 @@ class Poses(Positions):
             known.
         euler: convention of the three angles from which `quaternion` was computed, as in the options; empty for other
             columns.
+        lever: (m, 3) point in the tool frame whose position was measured [m], and to which `sigma` refers; None: the
+            frame's origin. Of poses read as their inverse it is the origin of the station's frame as the tool saw it.
+        mounting: ``in hand`` (the arm carries the camera) or ``to hand`` (the arm carries the board); empty where not
+            known, or without a camera.
     """
 
     quaternion: np.ndarray
     _: KW_ONLY
     sigma_rotation: np.ndarray | None = None
     euler: str = ""
+    lever: np.ndarray | None = None
+    mounting: str = ""
 
     kind: ClassVar[str] = "pose"
     placing: ClassVar[int] = 0
@@ -196,6 +203,30 @@ class Poses(Positions):
     @property
     def measured(self) -> np.ndarray:
         return np.hstack([self.position, self.quaternion])
+
+    def inverted(self) -> Poses:
+        """Return the poses of the tool frame in the station's frame, if these are those of the station in the tool.
+
+        A camera on the arm measures the pose of the board (the station) in its own frame (the tool).
+        """
+        inverse = invert(from_quaternion(self.position, self.quaternion))
+        return replace(
+            self,
+            position=inverse[:, :3, 3],
+            quaternion=to_quaternion(inverse),
+            sigma=_about_other_axes(self.sigma, inverse),
+            sigma_rotation=_about_other_axes(self.sigma_rotation, inverse),
+            euler="",
+            lever=self.position,
+        )
+
+
+def _about_other_axes(sigma: np.ndarray | None, frames: np.ndarray) -> np.ndarray | None:
+    """Return standard deviations (m, 3) along the axes of the frames' (m, 4, 4) reference, of those along their own."""
+    if sigma is None:
+        return None
+    variance = np.einsum("mij,mj->mi", frames[:, :3, :3] ** 2, sigma**2)
+    return np.sqrt(variance)
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,14 +29,14 @@ target, so that it is of no use where nothing moves.
 Rows that belong together: sockets, planes, pairs and bars.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 
-from calib.data.csv_table import Table, read_header, read_table
+from calib.data.csv_table import Table, read_header, read_table, split_units
 from calib.data.poses import plausible
 from calib.data.poses.base_frame import rows_with_base, seen_from_base
 from calib.data.poses.columns import (
@@ -51,7 +51,9 @@ from calib.data.poses.columns import (
     TIME,
     Layout,
     Sheet,
+    Undecided,
     find_layout,
+    with_shapes,
 )
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import (
@@ -65,6 +67,8 @@ from calib.data.poses.measurements import (
     Sockets,
 )
 from calib.data.poses.robodk import FORMS
+from calib.data.poses.silent_units import with_silent_units
+from calib.data.poses.unnamed import arrangements
 from calib.data.schema import Joints, refuse
 from calib.records import FieldValues
 
@@ -226,6 +230,8 @@ def read_measurements(
     path = source.file if isinstance(source, Table) else source
     notes: tuple[str, ...] = ()
     form = options.format
+    if table is None and not form:
+        _ask_for_names(path, robot, options)
     if not form:
         header = read_header(path)[0] if table is None else ()
         matching = [name for name, (matches, _) in FORMS.items() if matches(header)]
@@ -234,13 +240,15 @@ def read_measurements(
         reader: Callable[..., tuple[Table, FileOptions, tuple[str, ...]]] = FORMS[form][1]
         table, options, notes = reader(path, len(robot.names), options)
     table = table or read_table(path)
+    options = replace(options, columns=_without_units(options.columns, table))
     # Names that the reader of the form has understood need no map.
     if table.notes:
         mapped = options.columns.items()
         columns = {name: heading for name, heading in mapped if heading in table or name not in table}
         options = replace(options, columns=columns)
-    sheet = _select_rows(Sheet(table, options))
-    layout = find_layout(sheet, robot.names)
+    sheet = with_shapes(_select_rows(Sheet(table, options)), robot)
+    layout = find_layout(sheet, robot)
+    sheet, unit_notes = with_silent_units(sheet, layout, robot)
     sheet, base_notes = rows_with_base(sheet, layout)
     number_columns = layout.used.difference(layout.group, [layout.tool])
     # Where a file has several targets, one that was not seen is a gap.
@@ -248,8 +256,8 @@ def read_measurements(
     if len(layout.positions) > 1:
         columns_with_gaps.update(*layout.positions, *layout.sigmas)
     sheet.table.check([name for name in sheet.table.header if name in number_columns], columns_with_gaps)
-    q, _ = sheet.joints(robot.names)
-    notes = (*sheet.table.notes, *notes, *layout.notes, *base_notes)
+    q, _ = sheet.joints(robot)
+    notes = (*sheet.table.notes, *notes, *layout.notes, *unit_notes, *base_notes)
     notes = (*notes, *plausible.check_joints(q, sheet, layout.joints, robot))
     if layout.positions:
         block: PoseMeasurements = _read_targets(sheet, layout, q)
@@ -258,6 +266,40 @@ def read_measurements(
     ignored = tuple(name for name in sheet.table.header if name not in layout.used)
     station = options.station or Path(path).stem
     return [replace(block, station=station, ignored=ignored, notes=(*notes, *block.notes))]
+
+
+def _ask_for_names(path: str | Path, robot: Joints, options: FileOptions) -> None:
+    """Raise `Undecided` for a file without names whose number of columns suits the robot.
+
+    Args:
+        path: the file.
+        robot: the robot's joints.
+        options: options for reading the file.
+    """
+    possible = arrangements(path, len(robot.names), options)
+    if possible is None:
+        return
+    table, choices = possible
+    lines = " or ".join(list(choices)[:2])
+    message = (
+        f"has no header: put a line of names and units (q1 [deg], x [mm]) above the numbers, as in {lines}, or state "
+        "`format` in the options for a known headerless format"
+    )
+    raise Undecided(table, message, choices)
+
+
+def _without_units(columns: Mapping[str, str], table: Table) -> dict[str, str]:
+    """Return the columns that the options map, with the table's names where the options have headings with units.
+
+    Args:
+        columns: the toolkit's name of a column → the file's name, or its heading (``X / mm``).
+        table: the table.
+    """
+    names, _ = split_units(list(columns.values()))
+    result = {}
+    for (ours, heading), name in zip(columns.items(), names):
+        result[ours] = heading if heading in table or name not in table else name
+    return result
 
 
 def joint_columns(path: str | Path) -> tuple[str, ...]:
@@ -333,6 +375,8 @@ def _read_targets(sheet: Sheet, layout: Layout, q: np.ndarray) -> Positions:
         quaternion = plausible.orientation(sheet, layout.orientation)
         common["sigma_rotation"] = _sigma_rotation(sheet, layout)
         common["euler"] = sheet.options.euler if len(layout.orientation) == 3 else ""
+        if sheet.options.camera.mounting != "auto":
+            common["mounting"] = sheet.options.camera.mounting
         block = Poses(q[row], layout.joints, block.position, quaternion, **common)
     if not layout.base:
         return block

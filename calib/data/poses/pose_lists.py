@@ -132,7 +132,7 @@ def read_poses(
         return shaped(q, (None, len(robot.names)), "joint values")
     sheet = Sheet(read_table(source), options or FileOptions())
     sheet.check_names(robot.names)
-    q, columns = sheet.joints(robot.names)
+    q, columns = sheet.joints(robot)
     if len(q) > 1:
         check_planned(q, sheet, columns, robot)
     return q
@@ -339,7 +339,7 @@ def read_targets(path: str | Path, joints: Joints | Sequence[str]) -> Targets:
     rotation_columns = sheet.family(QUATERNION.names) or sheet.family(MATRIX.names)
     q, joint_headings, notes = None, (), ()
     if any(name in table for name in joint_forms):
-        q, joint_headings = sheet.joints(joints)
+        q, joint_headings = sheet.joints(robot)
         # Limits count where most rows are outside of them: it is the file then, not the row.
         outside_share = plausible.outside(q, robot.lower, robot.upper).any(axis=1).mean()
         if outside_share <= HALF:

@@ -26,6 +26,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.csv_table import Table, read_header, read_table, row_width
+from calib.data.joint_columns import COMMANDED_WORDS, words_of
 from calib.data.poses.fit_options import FileOptions
 from calib.errors import MeasurementError, refuse_data, require
 from calib.records import frozen
@@ -34,6 +35,8 @@ from calib.units import DEG
 _POSE_MARKS = ("w", "rx", "r", "a")
 JOINT_NUMBERS = ["j1", "j2", "j3", "j4", "j5", "j6"]
 JOINT_NAMES = ["joint 1", "joint 2", "joint 3", "joint 4", "joint 5", "joint 6"]
+# Numbers of columns of points, of points with TCP or poses, of poses with TCP.
+WIDTHS = (9, 12, 18)
 # Meaning of w, p, r by the options' `euler`.
 MEANINGS = {"wpr": "Rz(r) Ry(p) Rx(w)", "xyz": "Rx(w) Ry(p) Rz(r)", "vector": "a rotation vector"}
 # Largest angle [rad] read as degrees that would fit radians, with rounding.
@@ -54,6 +57,22 @@ def recognises(header: Sequence[str]) -> bool:
     return not has_seventh
 
 
+def _is_robodk(header: Sequence[str]) -> bool:
+    """Return whether a header begins as RoboDK's and goes on with x y z, then with angles or with the x y z of a TCP.
+
+    Args:
+        header: names of the columns; fewer than those of a point count, too.
+    """
+    if not recognises(header) or len(header) > WIDTHS[0] and len(header) not in WIDTHS:
+        return False
+    words = [words_of(name) for name in header[6:]]
+    if any(not COMMANDED_WORDS.isdisjoint(name) for name in words):
+        return False
+    is_pose = len(header) == WIDTHS[-1] or _plain("".join(header[9:10])) in _POSE_MARKS
+    axes = "xyz" if is_pose else "xyzxyz"
+    return all(axis in (name[-1][-1], name[-1][0]) for name, axis in zip(words, axes))
+
+
 def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
     """Return RoboDK's CSV as a table for the standard reader, the options for reading this table, and notes.
 
@@ -67,7 +86,7 @@ def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:
         refuse_data(path, f"is not a RoboDK file: its header begins with {', '.join(header[:7])}, not J1 to J6")
     require(joints == 6, f"RoboDK's format has 6 joints, the robot has {joints}", MeasurementError, path)
     is_pose = len(header) == 18 or (len(header) == 12 and _plain(header[9]) in _POSE_MARKS)
-    if len(header) not in (9, 12, 18):
+    if len(header) not in WIDTHS:
         refuse_data(path, f"has {len(header)} columns; RoboDK's points have 9 or 12, its poses 12 or 18")
     raw = read_table(path, doubles=True)
     measured_count = 12 if is_pose else 9
@@ -154,7 +173,7 @@ def _with_tools(table: Table, tcp: Sequence[str], options: FileOptions) -> tuple
 
 
 FORMS: dict[str, tuple[Callable[[Sequence[str]], bool], Callable[[str | Path, int, FileOptions], Read]]] = {
-    "robodk": (recognises, read_robodk),
+    "robodk": (_is_robodk, read_robodk),
     "three_smr": (lambda header: False, read_three_smr),
 }
 """By the options' ``format``: whether a header is of that form, and the reader."""

@@ -33,6 +33,7 @@ from calib.data.recordings.recording_options import (
     joint_order,
     one_effort,
 )
+from calib.data.recordings.stamps import in_seconds, likely_unit
 from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, refused_as, require
 from calib.records import read_only
@@ -74,7 +75,7 @@ def read_archived_positions(path: Path, joints: Joints, options: RecordingOption
         if q.ndim != 2:
             archive.fail(f"has shape {q.shape}, expected (samples, joints)", names[series])
         order = joint_order(_joint_names(archive), joints, q.shape[1], path)[0]
-        t = _stamps(archive, names, options, len(q))
+        t, _ = _stamps(archive, names, options, len(q))
         return t, _arrange(q, order, options.factor(series))
 
 
@@ -185,13 +186,14 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
     stream, shape, _, _ = archive.header(names["q"])
     stream.close()
     sample_count = shape[0] if shape else 0
-    t = _stamps(archive, names, options, sample_count)
+    t, time_notes = _stamps(archive, names, options, sample_count)
     rows, notes = _used(archive, t, options, ends)
     q = archive.read(names["q"], rows)
     if q.ndim != 2:
         archive.fail(f"has shape {q.shape}, expected (samples, joints)", names["q"])
     kind = "current" if "current" in names else "torque"
     order, joint_names = joint_order(_joint_names(archive), joints, q.shape[1], path)
+    notes = [*time_notes, *notes]
     series = {}
     for name, member in names.items():
         if name in ("t", "q"):
@@ -252,8 +254,10 @@ def _variance(archive: _Archive, name: str, shape: tuple[int, ...], rows: np.nda
     return np.asarray(values.mean(axis=0) / periods[0])
 
 
-def _stamps(archive: _Archive, names: Mapping[str, str], options: RecordingOptions, count: int) -> np.ndarray:
-    """Return the times (N,) [s] of all samples since the first one, from time stamps or a sampling rate.
+def _stamps(
+    archive: _Archive, names: Mapping[str, str], options: RecordingOptions, count: int
+) -> tuple[np.ndarray, list[str]]:
+    """Return the times (N,) [s] of all samples since the first one, from time stamps or a sampling rate, and notes.
 
     Args:
         archive: the archive.
@@ -266,13 +270,15 @@ def _stamps(archive: _Archive, names: Mapping[str, str], options: RecordingOptio
         if not rate > 0:
             expected = f"{', '.join(SYNONYMS['t'])}, or {', '.join(RATES)}"
             archive.fail(f"has neither stamps nor a rate ({expected}); found: {', '.join(archive.members)}")
-        return np.arange(count) / rate
+        return np.arange(count) / rate, []
     t = archive.read(names["t"], exact=True, kinds="fiu").ravel()
     if len(t) != count:
         archive.fail(f"has {len(t)} stamps, q has {count} samples", names["t"])
-    if len(t):
-        t = t - t[0]
-    return t.astype(float) * options.factor("t")
+    if not len(t):
+        return t.astype(float), []
+    if not options.units.get("t") and likely_unit(t.astype(float)):
+        return in_seconds(t)
+    return (t - t[0]).astype(float) * options.factor("t"), []
 
 
 def _rate(archive: _Archive) -> float:

@@ -23,6 +23,7 @@ from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, refused_as, require, suggestion
+from calib.workers.extras import needing
 
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
@@ -71,8 +72,9 @@ def opened(path: Path) -> Iterator[AnyReader]:
     Args:
         path: the bag, a file or a folder.
     """
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
+    with needing("rosbags"):
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
 
     damaged = "cannot be read as a ROS bag ({}): was it closed properly?"
     with (

@@ -54,6 +54,11 @@ class RecordingBounds:
 
 
 LIMITS = RecordingBounds()
+# Ratio of velocities to the slope of positions in degrees: factor, cause, and the line for the options.
+DEGREES = (
+    (1 / DEG, "the velocities look like deg/s", "recording.units.v = 'deg/s'"),
+    (DEG, "the positions look like deg", "recording.units.q = 'deg'"),
+)
 NEEDED = ("t", "q", "effort", "v", "tau_link", "tau_motor")
 
 
@@ -271,7 +276,9 @@ def _check_time(recording: Recording) -> None:
         hint = "check the stamps"
         for unit, factor in (("ns", 1e9), ("us", 1e6), ("ms", 1e3)):
             if LIMITS.min_rate <= rate * factor <= LIMITS.max_rate:
-                hint = f"stamps look like {unit}; if so, state units: t = '{unit}'"
+                hint = (
+                    f"stamps look like {unit}; if so, state it in the options (--options): recording.units.t = '{unit}'"
+                )
         refuse_data(recording.file, f"the median step is {np.median(step):.4g} s, {rate:.3g} Hz: {hint}", "t")
 
 
@@ -312,7 +319,8 @@ def _likely_unit(recording: Recording, joint: int, unit: str) -> str:
         return (
             "too large for deg, too: encoder counts? Convert them to rad or deg, zero and counts per turn allowed for"
         )
-    return f"looks like {unit}; if so, state the unit (header 'q{joint + 1} [{unit}]', or units)"
+    stated = f"header 'q{joint + 1} [{unit}]', or in the options (--options): recording.units.q = '{unit}'"
+    return f"looks like {unit}; if so, state the unit ({stated})"
 
 
 def _check_speed(recording: Recording) -> None:
@@ -329,9 +337,10 @@ def _check_speed(recording: Recording) -> None:
     ratio = product / np.maximum(power, 1e-300)
     proportional = product > 0.9 * np.sqrt(power * mean_power)  # a joint that hardly moves shows noise alone
     for j in np.flatnonzero(proportional & (np.ptp(recording.q, axis=0) > LIMITS.min_travel)):
-        for factor, cause in ((1 / DEG, "the velocities look like deg/s"), (DEG, "the positions look like deg")):
+        for factor, cause, line in DEGREES:
             if abs(ratio[j] / factor - 1) < 0.1:
                 message = f"v is {ratio[j]:.3g} times the slope of q: {cause}; if so, state the unit in the header"
+                message += f", or in the options (--options): {line}"
                 refuse_data(recording.file, message, _columns(recording, "v")[j])
 
 
@@ -430,7 +439,8 @@ def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
         message = (
             f"|torque| reaches {usual_torque[j]:.4g}, the joint's limit is {limit[j]:g}; every joint exceeds "
             f"{LIMITS.max_effort:g} times its limit: N mm, or another robot? If N mm, state the unit (a header "
-            "'tau_1 [Nmm]', or units: torque = 'Nmm'); if N m, correct the limits in the robot's file"
+            "'tau_1 [Nmm]', or in the options: recording.units.torque = 'Nmm'); if N m, correct the limits in the "
+            "robot's file"
         )
         refuse_data(recording.file, message, _columns(recording, "effort")[j])
     notes = []
@@ -439,8 +449,8 @@ def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
         notes.append(f"{name}: |torque| reaches {peak[j]:.3g}, its limit is {limit[j]:g}: is it in another unit?")
     if (peak < 0.03 * limit)[is_limited].all():
         notes.append(
-            "no torque reaches 3 % of its joint's limit. If these are currents, set kind = 'current': their gains are "
-            "then identified. If they are torques before the gear, multiply them by the gear ratio"
+            "no torque reaches 3 % of its joint's limit. If these are currents, set recording.kind = 'current': their "
+            "gains are then identified. If they are torques before the gear, multiply them by the gear ratio"
         )
     return notes
 

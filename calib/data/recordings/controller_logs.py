@@ -5,7 +5,7 @@ They are known by the names of their columns, and the notes say which was recogn
 * UR: RTDE recordings, of UR's own recorder (parted by blanks) and of ur_rtde
 * Franka: libfranka's ``logToCSV``, its time in ms; a time that is not in whole numbers has been converted, to seconds
 * ABB: EGM as abb_libegm logs it: positions only, no torques
-* KUKA: Sunrise's DataRecorder; the name of the torques' columns has to be stated
+* KUKA: Sunrise's DataRecorder; the torques' columns are told by a word (tau, torque) in their names, else stated
 
 Sources stand in ``logs.toml``. ROS bags, of ros2_control and franka_ros too, are read by their joint states, those of
 franka_ros2 by ``FrankaRobotState``, too. No published description of the text was found for KUKA's RSI monitor and KRC
@@ -26,6 +26,7 @@ from calib.files import shipped_text
 
 # Letters of a line of names (our choice).
 LONGEST = 1 << 16
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 # Rows in which a time is looked at (our choice).
 TIME_ROWS = 50
 
@@ -67,6 +68,28 @@ def translated(path: str | Path) -> Log | None:
     log.write(f"{header}\n{body}")
     log.seek(0)
     log.notes = tuple(notes)
+    return log
+
+
+def with_decimal_points(path: str | Path) -> Log | None:
+    """Return a table with decimal commas, parted by another mark, with points instead; None if it has no such commas."""
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        head = file.readline(LONGEST)
+        while head.startswith("#") or (head and not head.strip()):
+            head = file.readline(LONGEST)
+        marks = [mark for mark in "\t;|" if mark in head]
+        first_row = file.readline(LONGEST)
+        if not marks or not first_row.strip():
+            return None
+        cells = first_row.strip().split(marks[0])
+        with_comma = [cell for cell in cells if DECIMAL_COMMA.fullmatch(cell.strip().strip('"'))]
+        if 2 * len(with_comma) <= len(cells):
+            return None
+        body = first_row + file.read()
+    log = Log()
+    log.write(head.rstrip("\r\n") + "\n" + body.replace(",", "."))
+    log.seek(0)
+    log.notes = ("decimal commas are read as points",)
     return log
 
 

@@ -6,6 +6,7 @@ A CSV table has one column of stamps, one per joint and quantity (``q1 [deg]``, 
 bags hold: ``calib formats logs``.
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -15,6 +16,8 @@ import numpy as np
 
 from calib.controllers.table import as_described, motors_as_described
 from calib.data.csv_table import Table, read_table
+from calib.data.joint_columns import words_of
+from calib.data.recordings import log_columns
 from calib.data.recordings.archives import read_archive
 from calib.data.recordings.checks import check_recording
 from calib.data.recordings.recording import Ends, Recording, earlier, in_pieces, named, parse_cut, rows_used
@@ -28,10 +31,18 @@ from calib.data.recordings.recording_options import (
     plain_stems,
     stem_of,
 )
+from calib.data.recordings.stamps import in_seconds
+from calib.data.recordings.topics import of_one_topic
 from calib.data.schema import Joints
-from calib.errors import MeasurementError, refuse_data, suggestion
+from calib.errors import MeasurementError, refuse_data
 from calib.files import check_regular
 from calib.records import FieldValues
+from calib.units import TIMES
+
+_LOG = logging.getLogger(__name__)
+NO_JOINTS = Joints(())
+# What a note says of columns without any number.
+ABSENT = "not provided, NaN or empty in every row"
 
 
 def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
@@ -46,8 +57,11 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
         ends: begin and end of the part to read; None: no bound.
     """
     table = _numbered_brackets(read_table(path, doubles=True))
-    columns_of = _find_columns(table, options, joints.names if joints else ())
-    renamed = one_effort({name: name for name in columns_of}, options, table.header, path)
+    robot_joints = joints or NO_JOINTS
+    joint_names = robot_joints.names
+    columns_of, column_notes = _find_columns(table, options, robot_joints)
+    advice = _advice(table, columns_of, robot_joints)
+    renamed = one_effort({name: name for name in columns_of}, options, table.header, path, advice)
     columns_of = {name: columns_of[file_name] for name, file_name in renamed.items()}
     n = len(columns_of["q"])
     for name, columns in columns_of.items():
@@ -58,7 +72,8 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
             )
         check_units(name, [table.units[column] for column in columns], joints, path)
 
-    t = _stamps(table, columns_of, options)
+    t, time_notes = _stamps(table, columns_of, options)
+    table, t, row_notes = of_one_topic(table, columns_of, t)
     rows, notes = rows_used(t, ends, options.samples, path)
     table = table.where(rows)
     read_columns: set[int] = set()
@@ -74,20 +89,19 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
             values = [_values(table, column, name, options) for column in columns]
             series["effort" if name == kind else name] = np.column_stack(values)
 
-    unused = [heading for column, heading in enumerate(table.header) if column not in read_columns]
-    notes = [*table.notes, *notes]
+    unused = [column for column in range(len(table.header)) if column not in read_columns]
+    notes = [*table.notes, *column_notes, *time_notes, *row_notes, *notes]
     if unused:
-        notes.append(f"not read: {', '.join(unused)}")
+        notes.append(f"not read: {', '.join(log_columns.condensed(table.header, robot_joints, unused))}")
+    by_words = any(note.startswith("read as columns") for note in column_notes)
     for name, columns in columns_of.items():
-        if stem_of(table.header[columns[0]])[0].startswith(MEASURED):
+        if not by_words and stem_of(table.header[columns[0]])[0].startswith(MEASURED):
             notes.append(f"{name} is read from {', '.join(_headings(table, columns))}")
         units = dict.fromkeys(table.units[column] or "no unit" for column in columns)
         if len(units) > 1:
             notes.append(f"the columns of {name} have different units ({', '.join(units)}): is this intended?")
-    if joints is not None and len(joints.names) == n:
-        joint_names: Sequence[str] = joints.names
-    else:
-        joint_names = _joint_names(table, columns_of["q"])
+    if len(joint_names) != n:
+        joint_names = tuple(_joint_names(table, columns_of["q"]))
     return Recording(
         t[rows],
         kind=kind,
@@ -109,14 +123,15 @@ def read_positions(path: Path, joints: Joints, options: RecordingOptions) -> tup
     """
     table = _numbered_brackets(read_table(path, doubles=True))
     names = {key: name for key, name in options.names.items() if key in ("t", "q", "q_ref")}
-    columns_of = _find_columns(table, replace(options, names=names), joints.names)
+    columns_of, _ = _find_columns(table, replace(options, names=names), joints)
     name = "q_ref" if "q_ref" in columns_of else "q"
     if name not in columns_of:
         expected = ", ".join((*SYNONYMS["q_ref"], *SYNONYMS["q"]))
         message = f"has no reference positions ({expected}, with the joints' numbers or names)"
         refuse_data(path, f"{message}; found: {', '.join(table.header)}")
     q = np.column_stack([_values(table, column, name, options) for column in columns_of[name]])
-    return _stamps(table, columns_of, options), q
+    t, _ = _stamps(table, columns_of, options)
+    return t, q
 
 
 def _numbered_brackets(table: Table) -> Table:
@@ -130,24 +145,129 @@ def _numbered_brackets(table: Table) -> Table:
     return replace(table, header=tuple(header), units=tuple(units))
 
 
-def _find_columns(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dict[str, list[int]]:
-    """Return the column indices of each series, in the robot's joint order, by the toolkit's name of the series.
+def _find_columns(table: Table, options: RecordingOptions, joints: Joints) -> tuple[dict[str, list[int]], list[str]]:
+    """Return the column indices of each series, in the robot's joint order, by the toolkit's name, and notes.
+
+    Columns that are NaN in every row count as not provided.
 
     Args:
         table: the table.
         options: options for reading the file, which may name columns.
         joints: names of the robot's joints.
     """
-    columns_of: dict[str, list[int]] = {}
+    columns_of = _stated_columns(table, options, joints)
+    header = list(table.header)
+    notes: list[str] = []
     for name, synonyms in SYNONYMS.items():
-        stems = (options.names[name],) if name in options.names else synonyms
-        columns = _stamp_column(table, stems) if name == "t" else _joint_columns(table, stems, joints)
-        if columns:
-            columns_of[name] = columns
-        elif name in options.names:
-            message = f"no column begins with '{options.names[name]}'{suggestion(options.names[name], table.header)}"
-            table.fail(f"{message}; found: {', '.join(table.header)}")
+        while name not in columns_of:
+            provided = replace(table, header=tuple(header))
+            columns = (
+                _stamp_column(provided, synonyms) if name == "t" else _joint_columns(provided, synonyms, joints.names)
+            )
+            if not columns:
+                break
+            if name == "t" or not _all_nan(table, columns):
+                columns_of[name] = columns
+                break
+            notes.append(_hide(header, columns))
+    absent = [family for family in log_columns.families(header, joints) if _all_nan(table, family.columns)]
+    notes += [_hide(header, family.columns) for family in absent if family.series]
+    candidates = log_columns.families(header, joints)
+    by_series, rivals = log_columns.chosen(candidates)
+    by_words = {name: family for name, family in by_series.items() if name not in columns_of}
+    columns_of |= {name: list(family.columns) for name, family in by_words.items()}
+    for family in candidates:
+        # names of joints alone: what the file's name says, else positions
+        series = log_columns.series_of(words_of(Path(table.file).stem)) or "q"
+        if family.plain and series not in columns_of:
+            columns_of[series] = list(family.columns)
+            by_words[series] = family
+    if "t" not in columns_of:
+        timed = log_columns.time_column(header)
+        if timed is not None:
+            columns_of["t"] = [timed[0]]
+    if by_words or options.columns or options.names:
+        notes.append(f"read as {log_columns.mapping_line(table.header, joints, columns_of)}")
+        by_topic = [family.pattern for family in by_words.values() if family.pattern.startswith("/")]
+        if any(log_columns.NUMBER in pattern for pattern in by_topic):
+            notes.append(
+                f"numbers are taken for {', '.join(joints.names)} in this order: is it the order of the message?"
+            )
+    if by_words and rivals:
+        notes.append(f"also there, not read: {', '.join(rivals)}")
+    return columns_of, notes
+
+
+def _all_nan(table: Table, columns: Sequence[int]) -> bool:
+    """Return whether columns contain no number in any row."""
+    for column in columns:
+        cells = table.cells[column]
+        if cells.dtype != float or not np.isnan(cells).all():
+            return False
+    return True
+
+
+def _hide(header: list[str], columns: Sequence[int]) -> str:
+    """Replace the headings of columns that the logger did not provide by unique blanks; return a note on them."""
+    headings = ", ".join(header[column] for column in columns)
+    for column in columns:
+        header[column] = "\0" * (column + 1)
+    return f"{ABSENT}: {headings}"
+
+
+def _stated_columns(table: Table, options: RecordingOptions, joints: Joints) -> dict[str, list[int]]:
+    """Return the column indices of the series that the options name.
+
+    Args:
+        table: the table.
+        options: options for reading the file.
+        joints: names of the robot's joints.
+    """
+    columns_of: dict[str, list[int]] = {}
+    of_series = {key: heading for key, heading in options.columns.items() if key in SYNONYMS}
+    for name, heading in {**options.names, **of_series}.items():
+        columns: list[int] = []
+        if name == "t":
+            columns = _stamp_column(table, [heading])
+        elif "{" not in heading:
+            columns = _joint_columns(table, [heading], joints.names)
+        columns = columns or list(log_columns.stated(heading, table.header, joints))
+        if not columns:
+            near = log_columns.near_names(heading, table.header, joints)
+            table.fail(f"no columns are named '{heading}' ({name}){near}; found: {', '.join(table.header)}")
+        columns_of[name] = columns
+    of_joints = {key: heading for key, heading in options.columns.items() if key not in SYNONYMS}
+    for name, by_joint in log_columns.joint_keys(of_joints, joints, table).items():
+        columns_of[name] = [table.index(by_joint[joint]) for joint in range(len(by_joint))]
     return columns_of
+
+
+def _advice(table: Table, columns_of: dict[str, list[int]], joints: Joints) -> str:
+    """Return advice for a table without positions or without torques: a line to paste, or to join two files.
+
+    Args:
+        table: the table.
+        columns_of: the columns of each series that were found.
+        joints: names of the robot's joints.
+    """
+    efforts = {"torque", "current", "tau_link", "tau_motor"} & columns_of.keys()
+    needed = [] if "q" in columns_of else ["q"]
+    if not efforts:
+        needed.append("torque")
+    read_columns: set[int] = set()
+    for columns in columns_of.values():
+        read_columns.update(columns)
+    header = ["\0" * (column + 1) if column in read_columns else name for column, name in enumerate(table.header)]
+    line = log_columns.paste(header, joints, needed)
+    if line:
+        return f". If these are meant, state them in the options (--options FILE), joints in this order: {line}"
+    if columns_of.keys() - {"t"}:
+        other = " and ".join("positions" if name == "q" else "torques" for name in needed)
+        return (
+            f". Are the {other} in another file? If its times are of the same clock, join them first: "
+            f"calib join {table.file} OTHER.csv --out log.csv"
+        )
+    return ""
 
 
 def _stamp_column(table: Table, names: Sequence[str]) -> list[int]:
@@ -235,15 +355,30 @@ def _values(table: Table, column: int, series: str, options: RecordingOptions) -
     return table.numbers(table.header[column], None, gaps=True) * factor
 
 
-def _stamps(table: Table, columns_of: dict[str, list[int]], options: RecordingOptions) -> np.ndarray:
-    if "t" in columns_of:
-        t = _values(table, columns_of["t"][0], "t", options)
-        return t - t[0]
-    if options.rate:
-        return np.arange(len(table)) / options.rate
-    expected = ", ".join(SYNONYMS["t"])
-    message = f"has no column of stamps ({expected}), and the options state no rate; found: {', '.join(table.header)}"
-    table.fail(message)
+def _stamps(table: Table, columns_of: dict[str, list[int]], options: RecordingOptions) -> tuple[np.ndarray, list[str]]:
+    """Return the times (N,) [s] since the first row, and notes on their unit.
+
+    Args:
+        table: the table.
+        columns_of: the columns of each series.
+        options: options for reading the file, which may state a unit or a rate.
+    """
+    if "t" not in columns_of:
+        if options.rate:
+            return np.arange(len(table)) / options.rate, []
+        expected = ", ".join(SYNONYMS["t"])
+        message = f"has no column of stamps ({expected}), and the options state no rate"
+        table.fail(f"{message}; found: {', '.join(table.header)}")
+    (column,) = columns_of["t"]
+    t = _values(table, column, "t", options)
+    if table.units[column] or options.units.get("t"):
+        return t - t[0], []
+    named_column = log_columns.time_column([table.header[column]])
+    if named_column is not None and named_column[1]:
+        return (t - t[0]) * TIMES[named_column[1]], [
+            f"its times are in {named_column[1]}, as '{table.header[column]}' says"
+        ]
+    return in_seconds(t)
 
 
 Reader = Callable[[Path, Joints | None, RecordingOptions], Recording]
@@ -269,6 +404,9 @@ def read_recording(
         check_units(name, [unit] * len(joints.names if joints else ()), joints, file)
     reader = _reader(Path(file), (start, stop))
     recording = _described(reader(Path(file), joints, options), options.controller)
+    for note in recording.notes:
+        if note.startswith("read as"):
+            _LOG.info("%s: %s", Path(file).name, note)
     if (start, stop) != (None, None):
         recording = recording.cut(start, stop)
     recording = in_pieces(recording, options.samples)

@@ -5,7 +5,7 @@ Accepted names (the first name of a row found in the file is used; case and blan
 ========== =============================================================================================
 ours       in an archive, and in a table before the joint's number or name
 ========== =============================================================================================
-t          t, time, times, timestamp, timestamps, stamp; or a rate: frequency, rate, sample_rate, fs [Hz]
+t          t, time, times, timestamp, timestamps, stamp, __time; or a rate: frequency, rate, sample_rate, fs [Hz]
 q          q, positions, position, pos, joint_positions, qpos
 v          v, dq, qd, dot_q, velocities, velocity, vel, joint_velocities, qvel
 effort     torque: tau, torque, torques, effort, efforts, joint_torques, measured_torque
@@ -36,7 +36,7 @@ from calib.errors import UsageError, refuse_data, refused_as, require, suggestio
 from calib.units import CURRENTS, EFFORTS, POSITIONS, TIMES, TURNED, VELOCITIES
 
 SYNONYMS: Mapping[str, tuple[str, ...]] = {
-    "t": ("t", "time", "times", "timestamp", "timestamps", "stamp"),
+    "t": ("t", "time", "times", "timestamp", "timestamps", "stamp", "__time", "%time"),
     "q": ("q", "positions", "position", "pos", "joint_positions", "qpos"),
     "v": ("v", "dq", "qd", "dot_q", "velocities", "velocity", "vel", "joint_velocities", "qvel"),
     "torque": ("tau", "torque", "torques", "effort", "efforts", "joint_torques", "measured_torque"),
@@ -111,6 +111,8 @@ class RecordingOptions:
     Attributes:
         kind: what the efforts are: needed if a file has torques and currents, or currents under a torque's name.
         names: the toolkit's name of a series → the file's name.
+        columns: the same, joint by joint too (``q1``, ``tau_2``, a joint's name); ``{joint}`` in a heading stands for
+            each joint's name.
         units: the toolkit's name of a series → its unit, if the file states none; SI by default.
         rate: sampling rate of a file without stamps [Hz].
         topic: name of the topic to read, for a ROS bag with several topics of joint states.
@@ -125,6 +127,7 @@ class RecordingOptions:
 
     kind: Annotated[str, OneOf(("torque", "current"))] = ""
     names: Annotated[Mapping[str, Name], Checked(_ours)] = field(default_factory=dict)
+    columns: Mapping[str, Name] = field(default_factory=dict)
     units: Annotated[Mapping[str, Text], Checked(_known)] = field(default_factory=dict)
     rate: Positive | None = None
     topic: Name = ""
@@ -228,7 +231,7 @@ def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) 
 
 
 def one_effort(
-    names: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path
+    names: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path, advice: str = ""
 ) -> dict[str, str]:
     """Return `names` with either ``torque`` or ``current``; ``tau_link`` becomes the torque if the file has neither.
 
@@ -237,11 +240,12 @@ def one_effort(
         options: options for reading the file.
         members: all names in the file, for messages.
         path: the file, for messages.
+        advice: what to do where positions or torques are missing; empty: names that share a word with them.
     """
     if "q" not in names:
         expected = ", ".join(SYNONYMS["q"])
         message = f"has no joint positions ({expected}); found: {', '.join(members)}"
-        refuse_data(path, message + _advice(names, members))
+        refuse_data(path, message + (advice or _advice(names, members)))
     kinds = [kind for kind in ("torque", "current") if kind in names]
     if not kinds and options.sensors:
         kinds = _two_torques(names, options, members, path)
@@ -251,7 +255,7 @@ def one_effort(
     if not kinds:
         expected = ", ".join((*SYNONYMS["torque"], *SYNONYMS["current"]))
         message = f"has no torques and no currents ({expected}); found: {', '.join(members)}"
-        refuse_data(path, message + _advice(names, members))
+        refuse_data(path, message + (advice or _advice(names, members)))
     kind = options.kind or kinds[0]
     # The options may say that what the file calls a torque is a current.
     if kind not in names:
@@ -289,7 +293,7 @@ def _advice(names: Mapping[str, str], members: Sequence[str]) -> str:
         candidates = repeated or stems or ["..."]
         likely = {"q": candidates[0], "torque": candidates[-1]}
     example = ", ".join(f'{series} = "{stem}"' for series, stem in likely.items())
-    return f". State their names in the options, as in [recording] names = {{ {example} }}"
+    return f". State their names in the options (--options): recording.names = {{ {example} }}"
 
 
 def _two_torques(names: dict[str, str], options: RecordingOptions, members: tuple[str, ...], path: Path) -> list[str]:

@@ -115,7 +115,9 @@ class FreePoses:
     spare: np.ndarray
 
 
-def estimate_noise(fits: FreePoses, unknowns: int, loss: str = "none", scale: float | None = None) -> ImageNoise:
+def estimate_noise(
+    fits: FreePoses, unknowns: int, loss: str | robust.Loss = "none", scale: float | None = None
+) -> ImageNoise:
     """Return the noise of the images, estimated from the residuals of a fit.
 
     Args:
@@ -302,7 +304,9 @@ class PixelPart(ResidualPart):
         spare = np.maximum(2 * counts - 6, 0)
         return FreePoses(residual, information, remainder**2, spare)
 
-    def common_noise(self, sigma: np.ndarray, unknowns: int, loss: str, scale: float | None, start: bool) -> ImageNoise:
+    def common_noise(
+        self, sigma: np.ndarray, unknowns: int, loss: str | robust.Loss, scale: float | None, start: bool
+    ) -> ImageNoise:
         fits = self.free_poses(sigma)
         noise = estimate_noise(fits, unknowns, loss, scale)
         if start:

@@ -265,7 +265,8 @@ def _subjects(fit: GeometricFit, rows: WhitenedRows) -> list[Subject]:
         # a point has no orientation
         visible = np.linalg.norm(columns, axis=(0, 1)) > 0.0
         subjects.append(Subject(code, name, columns[:, :, visible]))
-    for joint, element in zip(cell.chain.joint_names, cell.chain.moving):
+    joints = [] if cell.chain.is_free_flyer else zip(cell.chain.joint_names, cell.chain.moving)
+    for joint, element in joints:
         number = column[cell.chain.names[element]]
         subjects.append(Subject("zero", joint, rows.matrix[:, :, [number]]))
     measured = rows.block.measured

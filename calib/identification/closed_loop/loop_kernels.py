@@ -16,7 +16,7 @@ of arrays passed between functions would take half of the time. For B bodies, n 
             in such a frame, scale; row B, columns 0 to 2: minus the gravity vector
     linear  (n, 2 n + 1): added inertia (n columns), viscous friction (n), offset
     kinds   (T, 2): torque row and shape code of each act
-    acts    (T, 8 + n): parameter value, up to seven settings, weights of the joints' motions
+    acts    (T, 8 + n + k): parameter value, up to seven settings, weights of the joints' motions, knots of tables
     memory  (T, 2), for friction with hysteresis: state of the stop operator, and the position at which it had
             this state
     loads   (n,) torques that the gears transmitted at the last call, for load-dependent friction

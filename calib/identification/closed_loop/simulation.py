@@ -371,13 +371,15 @@ def packed(plant: Plant) -> Packed:
     linear, acts = _drives(plant.terms, plant.parameters[10 * bodies :], n)
     kinds = []
     values = []
-    for row, code, amount, settings, weights in acts:
+    longest = max((len(table) for *_, table in acts), default=0)
+    for row, code, amount, settings, weights, table in acts:
         kinds.append([row, code])
-        values.append([amount, *settings, *weights])
+        padding = [0.0] * (longest - len(table))
+        values.append([amount, *settings, *weights, *table, *padding])
     parameters = plant.parameters[: 10 * bodies]
     body = body_rows(plant.bodies, parameters)
     kind_rows = np.array(kinds, dtype=np.int64).reshape(-1, 2)
-    value_rows = np.array(values).reshape(-1, 8 + n)
+    value_rows = np.array(values).reshape(-1, 8 + n + longest)
     return np.ascontiguousarray(links), body, linear, kind_rows, value_rows
 
 
@@ -410,7 +412,8 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
 def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float = 0.1) -> tuple[np.ndarray, list]:
     """Return the linear drive terms (n, 2 n + 1), and a list of the other friction terms.
 
-    An entry of the list is a tuple of torque row, shape code, parameter value, seven settings, and joint weights (n,).
+    An entry of the list is a tuple of torque row, shape code, parameter value, seven settings, joint weights (n,), and
+    the knots of a table.
 
     `ramp`: width over which the sign with a dead zone is smoothed, relative to its dead zone (a jump cannot be
     integrated).
@@ -433,13 +436,11 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float 
             for joint, weight in motion:
                 weights[joint] += weight
             if term.shape not in LINEAR:
+                settings, table = term.packed(8 + n)
                 if term.shape == "dead":
-                    settings = [*term.settings, ramp * term.settings[0]]
-                else:
-                    settings = [*term.settings]
+                    settings[1] = ramp * term.settings[0]
                 code = getattr(shape_kernels, term.shape.upper())
-                padding = [0.0] * (7 - len(settings))
-                acts.append((row, code, value, [*settings, *padding], weights))
+                acts.append((row, code, value, settings, weights, table))
             else:
                 first = 0 if term.shape == "acceleration" else n
                 linear[row, first : first + n] += value * weights

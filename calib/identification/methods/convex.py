@@ -25,6 +25,7 @@ import numpy as np
 from calib.errors import CalibError, NotConverged, refuse_option, suggestion
 from calib.estimation.cone_program import minimise
 from calib.estimation.convex_sets import ConvexSet
+from calib.workers.extras import needing
 
 if TYPE_CHECKING:
     import cvxpy
@@ -75,7 +76,8 @@ class Parameters:
         Raises:
             UsageError: for a name that is no parameter of the model, or one that the torques do not identify.
         """
-        import cvxpy
+        with needing("cvxpy"):
+            import cvxpy
 
         if isinstance(names, list):
             names = tuple(names)
@@ -175,7 +177,8 @@ def _name(constraint: "cvxpy.Constraint") -> str:
 
 def _checked(constraints: object) -> "list[cvxpy.Constraint]":
     """Return a list of CVXPY constraints that are convex, or refuse what is none."""
-    import cvxpy
+    with needing("cvxpy"):
+        import cvxpy
 
     if not isinstance(constraints, (list, tuple)):
         kind = type(constraints).__name__

@@ -8,9 +8,11 @@ from typing import TypeVar
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, NotConverged, finding
+from calib.estimation.robust import Loss, loss_name
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.joint_errors import joint_factors, joint_scatter, scatter_finding
 from calib.geometry.checks.joint_range import joint_range
+from calib.geometry.checks.pose_direction import parted_set_up
 from calib.geometry.checks.row_changes import row_changes
 from calib.geometry.diagnosis import diagnose
 from calib.geometry.error_model import ErrorModel, learn_errors
@@ -59,6 +61,7 @@ class Outcome:
         assessment: errors of both arms on fitted and on held-out rows, and the verdict.
         settings, options: settings and options of fit and verdict.
         expected: error model of the calibrated arm at any pose; None if no positions were measured.
+        loss: the loss as a function; None for a loss by name.
     """
 
     inputs: Inputs
@@ -71,6 +74,7 @@ class Outcome:
     settings: FitSettings = field(default_factory=FitSettings)
     options: FitOptions = field(default_factory=FitOptions)
     expected: ErrorModel | None = None
+    loss: Loss | None = None
 
     @property
     def robot(self) -> CalibratedChain:
@@ -93,9 +97,9 @@ class Outcome:
         nominal = self.inputs.nominal
         if nominal is self.inputs.chain:
             return self.selection.nominal.cell
-        settings = weighing_settings(self.options, self.settings)
+        settings = weighing_settings(self.options, self.settings, self.loss)
         if self.findings.loss:
-            settings = replace(settings, loss=self.findings.loss)
+            settings = settings.with_loss(self.findings.loss)
         return polish_frames(install(nominal, self.inputs.fit), self.inputs.fit, settings).cell
 
     @property
@@ -122,15 +126,18 @@ class Outcome:
 T = TypeVar("T", bound=Outcome)
 
 
-def weighing_settings(options: FitOptions, settings: FitSettings) -> Settings:
+def weighing_settings(options: FitOptions, settings: FitSettings, loss: Loss | None = None) -> Settings:
     """Return the settings of the residuals' loss function.
 
-    The loss in the fit's settings has precedence over the loss in the options file.
+    The loss in the fit's settings has precedence over the loss in the options file, and a function over both.
 
     Args:
         options: content of the options file.
         settings: settings of the fit.
+        loss: the loss as a function; None for a loss by name.
     """
+    if loss is not None:
+        return Settings(loss_name(loss), options.loss_scale, function=loss)
     return Settings(settings.loss or options.loss, options.loss_scale)
 
 
@@ -144,6 +151,7 @@ def run(
     settings: FitSettings | None = None,
     progress: Progress | None = None,
     prediction: SelectionPrediction | None = None,
+    loss: Loss | None = None,
 ) -> Outcome:
     """Fit the geometry, and return the chosen model, errors on all rows, and the verdict.
 
@@ -154,6 +162,7 @@ def run(
         progress: called with a text on each stage; None: silent.
         prediction: accuracy predicted at pose selection, to be compared with the accuracy of the fit; None: no
             comparison.
+        loss: the loss as a function; None: as in the settings.
 
     Raises:
         NotConverged: if the fit of the chosen model did not converge.
@@ -161,7 +170,7 @@ def run(
     options = options or FitOptions()
     settings = settings or FitSettings()
     progress = progress or _silent
-    weighing = weighing_settings(options, settings)
+    weighing = weighing_settings(options, settings, loss)
     model = settings.model or options.model
     if prediction is not None:
         prediction.check_robot(inputs.chain.joint_names)
@@ -186,10 +195,13 @@ def run(
     rigid_misfit = _rigid_misfit(selection, changes, climb, weighing)
 
     progress("comparing on unseen poses")
-    weighing = replace(weighing, loss=selection.loss)
+    weighing = weighing.with_loss(selection.loss)
     rigid = selection.rigid_fit(inputs.fit, weighing, inputs.bare)
     outliers = named_outliers(selection.fit)
     notes = _residual_findings(selection, inputs, changes, rigid_misfit, weighing)
+    if not changes:
+        for block in inputs.fit:
+            notes += parted_set_up(inputs.chain, block)
     if prediction is not None:
         ratio = compared_with_fit(prediction, selection.fit)
         if ratio is not None:
@@ -219,6 +231,7 @@ def run(
         settings=settings,
         options=options,
         expected=expected,
+        loss=loss,
     )
 
 
@@ -240,7 +253,7 @@ def _rigid_misfit(
         return None
     rigid_misfit = misfit(selection, reach)
     if rigid_misfit and weighing.loss in HEEDS_ALL:
-        robust = climb("geometry", settings=replace(weighing, loss="cauchy"))
+        robust = climb("geometry", settings=weighing.with_loss("cauchy"))
         return gross_rows(selection, robust, reach) or rigid_misfit
     return rigid_misfit
 
@@ -274,6 +287,10 @@ def _residual_findings(
         notes.append(rigid_misfit)
     notes += _moved_between(selection.nominal.cell, inputs.fit, weighing)
     notes += diagnose(selection.fit, with_changes=not changes)
+    with_factor = [change.values.get("joint") for change in changes]
+    for scale in plausibility.joint_scales(selection.fit):
+        if scale.values["joint"] not in with_factor:
+            notes.append(scale)
     notes += image_notes(selection.fit)
     return notes
 
@@ -305,7 +322,7 @@ def assessed(outcome: T, inputs: Inputs) -> T:
     nominal = selection.nominal.cell
     plain = plain_reference(nominal, outcome.inputs)
     arms = Arms(nominal, selection.fit.cell, outcome.rigid.cell.chain, outcome.expected, plain)
-    weighing = weighing_settings(options, settings)
+    weighing = weighing_settings(options, settings, outcome.loss)
     settings = replace(settings, model=settings.model or options.model)
     assessment = assess(arms, inputs, outcome.findings, weighing, settings)
     return replace(outcome, inputs=inputs, assessment=assessment)

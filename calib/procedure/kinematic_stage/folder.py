@@ -15,6 +15,7 @@ import numpy as np
 from calib import files, folders
 from calib.config_types import ParsedTable
 from calib.errors import UsageError, refused_as
+from calib.estimation.robust import LOSSES
 from calib.folders import COVARIANCE, ESTIMATE, METRICS, PAGES, REPORT, InFolder
 from calib.geometry import installation
 from calib.geometry.error_model import ErrorModel
@@ -22,7 +23,7 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import lines_of
-from calib.procedure.kinematic_stage import fit_tables
+from calib.procedure.kinematic_stage import fit_tables, mastering
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import Inputs, plain_reference
 from calib.procedure.kinematic_stage.metrics import SCHEMA, Findings, FitMetrics, ValidationMetrics
@@ -62,6 +63,7 @@ OURS = (
     RESIDUALS,
     TERMS,
     FORMULA,
+    mastering.MASTERING,
     REPORT,
     *PAGES,
     METRICS,
@@ -118,7 +120,9 @@ class FitFolder:
             free, covariance = fit_tables.read_covariance(self.path, calibrated_cell)
             expected = ErrorModel(calibrated_cell, free, covariance, fitted_q, findings.discrepancy)
         start = install(inputs.chain, inputs.fit, inputs.known)
-        weighing = replace(settings, loss=findings.loss or settings.loss)
+        # of a loss that was a function, only the name is stored
+        loss = findings.loss if findings.loss in LOSSES else settings.loss
+        weighing = replace(settings, loss=loss)
         nominal = polish_frames(start, inputs.fit, weighing).cell
         rigid = calibrated.read(self.path).chain
         return Arms(nominal, calibrated_cell, rigid, expected, plain_reference(nominal, inputs))
@@ -242,6 +246,7 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
     robot = outcome.robot
     frames = installation.frame_tables(fit.cell)
     calibrated.write(folder, robot, frames, _record(outcome), f"calibrated from {source}")
+    mastering.write(folder, outcome)
     urdfs = {URDF: robot.chain}
     if robot.corrections is not None:
         urdfs[CORRECTED_URDF] = robot.corrections.chain

@@ -8,16 +8,19 @@ import numpy as np
 
 from calib.data.images.pixels import Pixels
 from calib.data.poses import JOINTS, is_image_folder
+from calib.data.poses.columns import Undecided
 from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, MeasurementError, UsageError, require
 from calib.extensions import Point
+from calib.geometry.checks.pose_direction import as_seen_by_instrument
 from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
 from calib.geometry.repeatability import repeated, repeated_rows, without_copies
+from calib.procedure.kinematic_stage.readings import decided
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import joints_of
 from calib.robot import calibrated, description
@@ -349,7 +352,10 @@ def read_file(
             for planned_poses in PLANNED_POSES.all():
                 blocks += planned_poses(path, chain, file_options)
         if not blocks:
-            blocks = read_measurements(path, joints, file_options)
+            try:
+                blocks = read_measurements(path, joints, file_options)
+            except Undecided as undecided:
+                blocks = decided(chain, undecided, joints)
 
     result = []
     for block in blocks:
@@ -358,6 +364,7 @@ def read_file(
 
             block = complete_camera(chain, block, like)
         result.append(block)
+    result = [as_seen_by_instrument(chain, block) for block in result]
     for block in result:
         # of unseen files, too: the fit checks the rows that it fits only
         check_scale(block, chain)

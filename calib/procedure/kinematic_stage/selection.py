@@ -5,7 +5,7 @@ This module supplies a robot's observation Jacobian and limits to the optimisati
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
@@ -19,7 +19,7 @@ from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pose_lists import read_poses, write_poses
-from calib.errors import UsageError, require
+from calib.errors import CalibError, UsageError, refused_as, require
 from calib.geometry.observability import Observation, observation, targets_of
 from calib.poses.candidates import draw_candidates
 from calib.poses.errors import NothingFeasible
@@ -41,6 +41,10 @@ if TYPE_CHECKING:
     from calib.procedure.measuring.camera_view import CameraView
 
 Progress = Callable[[int, int, str], None]
+Candidates = str | Path | np.ndarray | Sequence[Sequence[float]] | Callable[[int], np.ndarray]
+"""Poses to choose from: a CSV, joint values (N, n) [rad or m], or a function of a count that returns joint values."""
+METHODS_BY_CANDIDATES = ("detmax",)
+"""Methods whose poses are among the candidates."""
 # postures that see a camera's board, to choose from (our choice)
 VIEWS = 600
 # sigma of the tool over the workspace, and by the number of poses
@@ -132,6 +136,7 @@ def choose(
     existing: Path | PoseMeasurements | np.ndarray | None = None,
     base: str | None = None,
     tip: str | None = None,
+    candidates: Candidates | None = None,
     map: Callable = map,
     progress: Progress | None = None,
 ) -> Chosen:
@@ -144,6 +149,7 @@ def choose(
         constraints: constraints file (`calib formats constraints`), or its content as tables; None: defaults.
         existing: poses measured earlier, which the selection complements: a CSV, or in memory; None: none.
         base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
+        candidates: poses to choose from, a CSV, joint values (N, n) or a function of a count; None: drawn at random.
         map: function that runs parallel work (`calib.workers`).
         progress: called with (done, total, text); None: silent.
 
@@ -162,16 +168,24 @@ def choose(
         jacobian = view.observation(limits.lower, limits.upper, settings.seed)
     space = limits.space(jacobian)
 
-    candidates = None
-    if view is not None:
+    notes = list(limits.notes)
+    numbers = None
+    if candidates is not None:
+        require(view is None, "candidates: with a [camera], views of the board are drawn; leave them out", UsageError)
+        offered, numbers = _feasible_candidates(candidates, space, chain, settings, m)
+        possible = offered[numbers]
+        if len(possible) < len(offered):
+            notes.append(f"{len(offered) - len(possible)} of the {len(offered)} candidates break the constraints")
+    elif view is not None:
         if progress:
             progress(0, 1, "views of the board")
-        candidates = _draw_views(view, space, limits, settings, m)
+        possible = _draw_views(view, space, limits, settings, m)
+    else:
+        possible = _draw_feasible(space, limits, settings)
 
     # `select_poses` checks it
     index = cast(Any, settings.index)
     existing_jacobian = existing_value = None
-    notes = list(limits.notes)
     if existing is not None:
         existing_q = read_poses(existing, joints_of(chain))
         existing_jacobian = jacobian(existing_q)
@@ -180,10 +194,8 @@ def choose(
         if infeasible:
             notes.append(f"{infeasible} of the {len(existing_q)} existing poses break the constraints")
     search = _search_settings(settings)
-    if candidates is None:
-        candidates = _draw_feasible(space, limits, settings)
     selection = select_poses(
-        None, m, search, q=candidates, space=space, existing=existing_jacobian, map=map, progress=progress
+        None, m, search, q=possible, space=space, existing=existing_jacobian, map=map, progress=progress
     )
     # the selection without sight limits is not polished: the start of a polished one compares with it
     comparable = selection.value
@@ -196,23 +208,59 @@ def choose(
         if progress:
             progress(0, 1, stage)
 
-    exchange = Exchange(space.jacobian, candidates, existing_jacobian, index)
+    exchange = Exchange(space.jacobian, possible, existing_jacobian, index)
     driven = drivable(chain, selection.joints, exchange, limits, settings.run, settings.seed, progress_of_run)
     if driven.replaced:
         notes.append(driven.words)
+    selection = _in_driving_order(selection, driven)
+    if numbers is not None and selection.indices is not None:
+        selection = replace(selection, indices=numbers[selection.indices])
     return Chosen(
         chain=chain,
-        selection=_in_driving_order(selection, driven),
+        selection=selection,
         parameters=len(jacobian.free),
         existing=existing_value,
         checked=limits.checked,
         unchecked=limits.unchecked,
         notes=tuple(notes),
-        outlook=_outlook(jacobian, limits, search, driven.q, exchange, comparable),
+        outlook=_outlook(jacobian, limits, search, driven.q, exchange, comparable, numbers is None),
         run=driven.run,
         driven=settings.run,
         by_images=view is not None,
     )
+
+
+def _feasible_candidates(
+    candidates: Candidates, space: SearchSpace, chain: Chain, settings: SelectionSettings, m: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the user's candidates (N, n) [rad or m], and the numbers, from 0, of those that keep the constraints.
+
+    Args:
+        candidates: a CSV, joint values, or a function of a count.
+        space: search space with all constraints.
+        chain: the arm.
+        settings: settings of the selection.
+        m: number of poses to select.
+
+    Raises:
+        UsageError: a method whose poses are not candidates; wrong joint values; too few feasible candidates.
+    """
+    if settings.method not in METHODS_BY_CANDIDATES:
+        raise UsageError(
+            f"candidates: the method '{settings.method}' moves poses away from the candidates: give method = "
+            f"{' or '.join(METHODS_BY_CANDIDATES)}"
+        )
+    source = candidates(settings.candidates) if callable(candidates) else candidates
+    with refused_as(UsageError, CalibError, "candidates: {}"):
+        q = read_poses(source, joints_of(chain))
+    numbers = np.flatnonzero(is_feasible(space, q))
+    if len(numbers) < m:
+        outside = int(((q < space.lower) | (q > space.upper)).any(axis=1).sum())
+        raise UsageError(
+            f"candidates: {len(numbers)} of {len(q)} keep the constraints, and {m} are to be chosen: {outside} exceed "
+            "the joint limits [rad or m]; give more candidates, or loosen the constraints"
+        )
+    return q, numbers
 
 
 def _draw_views(
@@ -315,7 +363,13 @@ def _draw_feasible(space: SearchSpace, limits: Limits, settings: SelectionSettin
 
 
 def _outlook(
-    jacobian: Observation, limits: Limits, search: SearchSettings, q: np.ndarray, exchange: Exchange, comparable: float
+    jacobian: Observation,
+    limits: Limits,
+    search: SearchSettings,
+    q: np.ndarray,
+    exchange: Exchange,
+    comparable: float,
+    drawn: bool,
 ) -> PoseOutlook:
     """Return the predicted accuracy with the selected poses and in other cases.
 
@@ -328,6 +382,7 @@ def _outlook(
         q: (m, n) selected poses [rad or m].
         exchange: candidate poses, and Jacobians of poses measured earlier.
         comparable: observability index of poses selected with line-of-sight constraints.
+        drawn: whether the candidates were drawn at random, so that they can be drawn without line of sight, too.
     """
     space = limits.space(jacobian, sight=False)
     existing = exchange.before
@@ -341,7 +396,7 @@ def _outlook(
         return forecast.predicted(jacobian, jacobians, typical, len(q))
 
     blind = None
-    if limits.sight is not None:
+    if limits.sight is not None and drawn:
         search = replace(search, method="detmax", climbs=0)
         selection = select_poses(None, len(q), search, space=space, existing=existing)
         blind = selection.value, predicted(selection.joints)

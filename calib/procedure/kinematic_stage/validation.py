@@ -413,7 +413,7 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
         weighing: requested settings of the loss function; the loss that the fit chose replaces the requested one.
         settings: the requested model, tolerance, deliverable, and the seed of the pairs whose distances are compared.
     """
-    weighing = replace(weighing, loss=findings.loss or weighing.loss)
+    weighing = weighing.with_loss(findings.loss or weighing.loss)
     cells = [arms.nominal, arms.calibrated]
     urdf_cell = without_corrections(arms.calibrated, arms.rigid, inputs.fit, weighing)
     if urdf_cell is not None:

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.data.images.board import Board, corners, read_board
-from calib.data.images.lens import Lens, read_lens
+from calib.data.images.lens import Lens
+from calib.data.images.lens_files import read_lens
 from calib.data.images.optics import BoardShape, Optics
 from calib.data.images.pixels import Pixels
 from calib.data.poses import IN_HAND

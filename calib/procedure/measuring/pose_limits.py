@@ -36,6 +36,7 @@ from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.obstacles import Obstacle, Wall, signed_distance
 from calib.robot.tables import load as load_table
 from calib.robot.tables import placement
+from calib.workers.extras import installed, lacking
 
 if TYPE_CHECKING:
     from calib.robot.collision import DistanceModel
@@ -524,7 +525,10 @@ def _model(
         "within": self_collision,
         "ignored": {frozenset(pair) for pair in table.ignored},
     }
-    if source is not None and is_urdf(source) and "<collision" in text(source)[0]:
+    has_shapes = source is not None and is_urdf(source) and "<collision" in text(source)[0]
+    if has_shapes and not installed("pinocchio"):
+        notes = (f"capsules are used as link shapes, not those of the URDF; {lacking('pinocchio')}",)
+    elif source is not None and has_shapes:
         try:
             model = collision.from_urdf(source, chain.base, chain.tip, floor, obstacles, posture=posture, **common)
             if model.missing:

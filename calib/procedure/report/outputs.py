@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calib.files import write_json
+from calib.workers.extras import available
 
 if TYPE_CHECKING:
     from calib.procedure.dynamic_stage.identify import IdentificationOutcome
@@ -29,7 +30,7 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True, pages: bool = 
     report = fit_report.collect(outcome)
     fit_report.write(report, FitFolder(folder).report)
     drawn: Mapping[str, Picture] = {}
-    if plots:
+    if plots and available("matplotlib"):
         from calib.procedure.report.charts import saved
         from calib.procedure.report.geometry_figures import captioned
 
@@ -54,15 +55,18 @@ def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True
     from calib.procedure.report import dynamics_section
 
     drawn: Mapping[str, Picture] = {}
-    from calib.procedure.report import charts, dynamics_figures
-
+    plots = plots and available("matplotlib")
     if plots:
+        from calib.procedure.report import charts, dynamics_figures
+
         charts.save_all(dynamics_figures.friction(outcome), folder)
     if not pages:
         return
     report = dynamics_section.of_outcome(outcome, folder)
     write_json(UnseenFolder(folder).report, report.unseen)
     if plots:
+        from calib.procedure.report import charts, dynamics_figures
+
         drawn = charts.saved(dynamics_figures.captioned(report, folder), folder)
     from calib.procedure.report.certificate import results
 

@@ -34,7 +34,7 @@ from calib.procedure.session.dynamics_steps import design_motions, picked_front,
 from calib.procedure.session.folder import POSES, UNSEEN, WAYS, Say, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
-from calib.procedure.session.recording_names import log_name
+from calib.procedure.session.recording_names import labels_in, log_name
 from calib.procedure.session.second_round import promised
 from calib.procedure.session.settings import NOTHING, SessionSettings
 from calib.procedure.session.steps import DONE, KEPT, WAITING, State
@@ -42,6 +42,7 @@ from calib.robot.chain import Chain
 from calib.robot.collision import meshes_beside
 from calib.robot.library import load, resolve
 from calib.robot.tables import dumps
+from calib.units import JOINT
 
 # units of a log: positions and torques
 UNITS = {"prismatic": ("m", "N"), "revolute": ("deg", "Nm")}
@@ -80,8 +81,9 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
     settings, joints = session.settings, chain_of(session).joint_names
     instrument, images = settings.instrument, settings.instrument.measures == IMAGES
     lists = [POSES] if step == "measure" else [UNSEEN]
-    # both are measured in one visit
-    if step == "measure" and settings.poses.validation and not session.brought("validation"):
+    # both are measured in one visit, unless rows of the first are held out
+    has_validation = settings.poses.validation and not settings.fit.holdout
+    if step == "measure" and has_validation and not session.brought("validation"):
         lists.append(UNSEEN)
 
     planned = _planned_poses(session, lists)
@@ -114,16 +116,38 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
         "and log the joint angles read back.",
         "At the end, measure the first three again to check for drift (optional, into drift.csv).",
     )
-    columns = [f"{joint} [deg]" for joint in joints]
+    columns = ", ".join(measured_columns(session))
+    return task, (
+        f"{' and '.join(files)}, one row per pose: {columns} (calib formats measurements), "
+        "or joints and points apart, by calib join"
+    )
+
+
+def measured_columns(session: Session) -> list[str]:
+    """Return the header of a file of measured poses, as a session's instrument fills it: joints, target, base frame."""
+    instrument = session.settings.instrument
+    columns = []
+    for joint in chain_of(session).joints:
+        _, unit = JOINT["prismatic" if joint.kind == "prismatic" else "revolute"]
+        columns.append(f"{joint.name} [{unit}]")
     columns += ["x [mm]", "y [mm]", "z [mm]"]
     if instrument.measures == "pose":
         columns += ["qx", "qy", "qz", "qw"]
     if instrument.reference:
         columns += ["base_x [mm]", "base_y [mm]", "base_z [mm]", "base_qx", "base_qy", "base_qz", "base_qw"]
-    return task, (
-        f"{' and '.join(files)}, one row per pose: {', '.join(columns)} (calib formats measurements), "
-        "or joints and points apart, by calib join"
-    )
+    return columns
+
+
+def recorded_columns(session: Session) -> list[str]:
+    """Return the header of a log of a motion, with the torques that a session asks for."""
+    section, joints = session.settings.dynamics, chain_of(session).joints
+    columns = ["t [s]"]
+    columns += [f"q_{joint.name} [{UNITS[joint.kind][0]}]" for joint in joints]
+    if section.torques != "link":
+        columns += [f"tau_{joint.name} [{UNITS[joint.kind][1]}]" for joint in joints]
+    if section.torques != "motor":
+        columns += [f"tau_link_{joint.name} [{UNITS[joint.kind][1]}]" for joint in joints]
+    return columns
 
 
 def _planned_poses(session: Session, lists: Sequence[str]) -> list[str]:
@@ -167,7 +191,7 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
     missing = unrecorded_payloads(session) if step == "record" else []
     if step == "record" and (missing or not session.brought("training")):
         names.append("training")
-    if section.validation and not session.brought("unseen"):
+    if section.validation and not section.holdout and not session.brought("unseen"):
         names.append("validation")
 
     if section.plan:
@@ -189,8 +213,23 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
     files = " and ".join(str(session.path(f"7-recorded/{log}")) for log in logs)
     return task, (
         f"{files}, one row per sample: t [s], {', '.join(columns)}; currents are i_{first.name} [A] …; .npz and ROS "
-        "bags work, too (calib formats recordings)"
+        f"bags work, too (calib formats recordings){_present_logs(session)}"
     )
+
+
+def _present_logs(session: Session) -> str:
+    """Return how the recordings of a session that are there were taken by their names; empty without recordings."""
+    taken = [(path, "training") for path in session.brought("training")]
+    taken += [(path, "validation") for path in session.brought("unseen")]
+    if not taken:
+        return ""
+    payloads = session.settings.dynamics.payloads
+    parts = []
+    for path, motion in taken:
+        labels = labels_in(path.stem, payloads)
+        load = f" with {' and '.join(labels)}" if labels else " without payload"
+        parts.append(f"{path.name} ({motion}{load if payloads else ''})")
+    return f". By their names there are already: {'; '.join(parts)}"
 
 
 def _to_play(session: Session, names: Sequence[str], payloads: Sequence[str]) -> str:
@@ -265,6 +304,8 @@ def new_session(
     program: str = "",
     tolerance_mm: float = 0.0,
     reference: bool = False,
+    plan: bool = True,
+    holdout: float = 0.0,
     certificate: Mapping[str, object] | None = None,
     **motion: object,
 ) -> Path:
@@ -284,6 +325,8 @@ def new_session(
         program: robot controller in whose language the poses are written, too (`calib program --list`); empty: none.
         tolerance_mm: largest accepted rms on held-out poses [mm]; 0: none.
         reference: whether a frame on the robot's base is measured beside the target.
+        plan: whether the session chooses poses and designs motions; otherwise other poses and motions are measured.
+        holdout: share of measured poses, and of recordings, that is held out where there is no file for validation.
         certificate: keys of ``[certificate]``: entries of the certificate besides results; None: all are empty.
         motion: other keys of ``[dynamics]`` (``calib formats session``): torques, payloads, period …
 
@@ -311,11 +354,11 @@ def new_session(
         "name": chain.name,
         "created": "",
         "seed": seed,
-        "fit": {"tolerance_mm": tolerance_mm},
+        "fit": {"tolerance_mm": tolerance_mm, "holdout": holdout},
         "robot": {"file": source.name, "given": str(robot), "base": base, "tip": tip, "controller": program},
         "instrument": of_instrument,
-        "poses": {"fit": poses, "validation": validation, "constraints": named},
-        "dynamics": {"wanted": dynamics, "limits": named, **motion},
+        "poses": {"fit": poses, "validation": validation, "plan": plan, "constraints": named},
+        "dynamics": {"wanted": dynamics, "limits": named, "plan": plan, "holdout": holdout, **motion},
         "certificate": dict(certificate or {}),
     }
     create(Path(folder), source, parse(SessionSettings, table, SESSION), copied | meshes_beside(source))

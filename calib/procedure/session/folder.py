@@ -6,7 +6,8 @@ session.toml     what is to be calibrated, with what, how; written by `calib new
                  validation_poses.csv to measure and never fit; poses_prediction.json and predicted.png what they are
                  predicted to identify
 3-measured/      what people bring: measured.csv (any name), files whose name starts with validation, and drift.csv,
-                 some of the poses measured once more at the end (never fitted); columns: `calib formats measurements`
+                 some of the poses measured once more at the end (never fitted); columns: `calib formats measurements`.
+                 received/ holds what was uploaded to `calib serve` and is no measurement yet, or was joined to one
 4-fit/  5-validation/
 6-excitation/    training and validation: two motions for the robot to play, at the controller's rate; round2 …: further
                  ones, where tolerance_percent or sigma_percent asks for more than these brought
@@ -51,6 +52,7 @@ from calib.result_kinds import refusal
 from calib.robot import tables
 from calib.robot.calibrated import ROBOT
 from calib.robot.formats.urdf_tree import converter, is_urdf, text
+from calib.workers.extras import available
 
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
@@ -337,7 +339,7 @@ def open_session(folder: Path, plots: bool = True) -> Session:
     path = folder / SETTINGS
     if not path.exists():
         raise SessionError(refusal(folder, "session"))
-    return Session(folder, read_settings(path), plots=plots)
+    return Session(folder, read_settings(path), plots=plots and available("matplotlib"))
 
 
 def read_state(session: Session) -> StateFile:

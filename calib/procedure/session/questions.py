@@ -12,7 +12,7 @@ from calib.config import described, parse
 from calib.config_types import OneOf, ParsedTable, Real
 from calib.controllers.table import controller_named
 from calib.data.images.board import read_board
-from calib.data.images.lens import read_lens
+from calib.data.images.lens_files import read_lens
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
 from calib.data.poses.measurements import Poses, Positions
 from calib.errors import CalibError, UsageError, one_of, refused_as, require

@@ -18,8 +18,18 @@ def log_name(motion: str, label: str = "") -> str:
 
 
 def check_labels(labels: Iterable[str]) -> None:
-    """Raise a ValueError if a label occurs in the names of all recordings, which labels assign to payloads."""
+    """Raise a ValueError if labels do not assign recordings to payloads by their names.
+
+    No label may be a part of all recordings' names, and no two may differ by upper and lower case alone.
+    """
+    seen: dict[str, str] = {}
     for label in labels:
+        rival = seen.setdefault(label.lower(), label)
+        if rival != label:
+            raise ValueError(
+                f"payloads: '{rival}' and '{label}' differ by upper and lower case alone, which files' names do not "
+                "tell apart; choose another label"
+            )
         if label.lower() in RECORDING_WORDS or re.fullmatch(r"round\d+", label.lower()):
             raise ValueError(f"payloads: '{label}' is a part of all recordings' names; choose another label")
 

@@ -16,7 +16,7 @@ from datetime import datetime
 from pathlib import Path
 
 from calib.config import parse
-from calib.errors import SessionError, command_line, require
+from calib.errors import CalibError, SessionError, command_line, require
 from calib.extensions import Point
 from calib.files import fingerprint
 from calib.folders import COVARIANCE, ESTIMATE, METRICS, REPORT
@@ -116,7 +116,23 @@ class UserFiles:
         return session.files_brought(self.kind)
 
 
-Input = SessionFile | FitFile | ExportedFile | NamedFile | UserFiles
+@dataclass(frozen=True)
+class StatedConstraints:
+    """The Python file of constraints that the identification options name; it does not apply if they name none."""
+
+    optional: bool = False
+
+    def paths(self, session: Session) -> list[Path]:
+        """Return the path of the file of constraints, as a list; empty without one, or with unreadable options."""
+        try:
+            constraints = dynamics_steps.options_of(session).settings.constraints
+        except CalibError:
+            # the step that reads the options says what is wrong with them
+            return []
+        return [Path(constraints.file)] if constraints is not None and constraints.file else []
+
+
+Input = SessionFile | FitFile | ExportedFile | NamedFile | StatedConstraints | UserFiles
 
 
 @dataclass(frozen=True)
@@ -321,7 +337,7 @@ STEPS = (
         "identify",
         "identify the dynamics",
         dynamics_steps.identify,
-        reads=(FITTED_ROBOT, SessionFile(folder.CUTS), IDENTIFY_OPTIONS, UserFiles("training")),
+        reads=(FITTED_ROBOT, SessionFile(folder.CUTS), IDENTIFY_OPTIONS, StatedConstraints(), UserFiles("training")),
         makes=("8-dynamics/*",),
         settings=(StepSetting("dynamics", MODEL_KEYS), StepSetting("seed")),
         stage="dynamics",

@@ -24,6 +24,7 @@ from calib.robot.formats.native import NativeModel
 from calib.robot.formats.urdf_tree import UNLIMITED
 from calib.robot.formats.urdf_write import MOMENTS, add_joint, numbers_text, xml_text
 from calib.transforms import from_quaternion, invert, pose
+from calib.workers.extras import lacking
 
 WORLD = "world"
 
@@ -43,8 +44,7 @@ def convert(path: str) -> str:
     try:
         mujoco = import_module("mujoco")
     except ImportError:
-        advice = "an MJCF file is read by MuJoCo: pip install mujoco (or 'armature-calib[mujoco]')"
-        raise RobotError(f"{path}: {advice}") from None
+        raise RobotError(f"{path}: {lacking('mujoco')}") from None
     try:
         spec = mujoco.MjSpec.from_file(path)
         model = _compiled(spec)

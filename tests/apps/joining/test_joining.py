@@ -5,11 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from sessions import begin
 
 import calib
 from calib.cli import run
+from calib.controllers.table import controller_named
 from calib.data.csv_table import read_table
+from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import Positions
 from calib.errors import MeasurementError, UsageError
 from calib.procedure.session.folder import Session
@@ -90,6 +93,52 @@ def test_wrong_order_or_arm_is_noticed(tmp_path, joints, arm, q):
         calib.join(joints, other, robot="lwr4plus")
     with pytest.raises(UsageError, match="by 'rows' is not one of name, time, row, geometry"):
         calib.join(joints, other, by="rows")
+
+
+def test_columns_of_any_name_are_stated_in_options(tmp_path, arm, q):
+    """Columns, units and angles of both files are as the options state them, and the result needs no options."""
+    angles = np.random.default_rng(3).uniform(-80.0, 80.0, (40, 3))
+    rows = np.column_stack([seen(arm, q), angles])
+    header = ["x", "Xl", "Yl", "Zl", "A", "B", "C"]
+    points = write(tmp_path / "p.csv", header, np.column_stack([np.zeros(40), rows]))
+    log = write(tmp_path / "j.csv", [f"A{k}" for k in range(1, 8)], np.degrees(q))
+    options = tmp_path / "o.toml"
+    columns = [f'q{k} = "A{k}"' for k in range(1, 8)]
+    units = '[units]\njoints = "deg"\nposition = "mm"\norientation = "deg"\n'
+    text = "\n".join(["[columns]", 'x = "Xl"', 'y = "Yl"', 'z = "Zl"', *columns, units])
+    options.write_text('euler = "zyx moving"\n' + text)
+    out = tmp_path / "m.csv"
+    assert (
+        run(["join", str(log), str(points), "--options", str(options), "--robot", "lwr4plus", "--out", str(out)]) == 0
+    )
+    (block,) = calib.read_poses(out, "lwr4plus")
+    np.testing.assert_allclose(block.q, q, atol=1e-9)
+    np.testing.assert_allclose(1e3 * block.position, seen(arm, q), rtol=1e-9)
+    turns = Rotation.from_euler("ZYX", angles, degrees=True).as_matrix()
+    np.testing.assert_allclose(Rotation.from_quat(block.quaternion).as_matrix(), turns, atol=1e-9)
+    notes = calib.join(log, points, options=options).notes
+    assert any("Xl, Yl, Zl read as x, y, z" in note for note in notes)
+    assert any("column x is not read" in note for note in notes)
+    assert any("order not checked: give --robot" in note for note in notes)
+    options.write_text('[columns]\nx = "Xe"')
+    with pytest.raises(UsageError, match=r"columns.x: no file has a column 'Xe'.*p.csv has x, Xl"):
+        calib.join(log, points, options=options)
+
+
+def test_joints_as_a_controller_shows_them(tmp_path):
+    """Joint values as a FANUC shows them are named as such, and converted where the options say so."""
+    robot = Path(__file__).parents[1] / "controller_programs/fanuc_m20ia.urdf"
+    arm = load(robot)
+    q = random_joints(arm, 30, 5)
+    shown = controller_named("fanuc").shown(q)
+    joints = write(tmp_path / "j.csv", [f"q{k} [deg]" for k in range(1, 7)], shown)
+    points = write(tmp_path / "p.csv", POINT, seen(arm, q))
+    with pytest.raises(MeasurementError, match=r"its points fit the joints as FANUC.*state controller = \"fanuc\""):
+        calib.join(joints, points, robot=robot)
+    joined = calib.join(joints, points, robot=robot, options=FitOptions(controller="fanuc"))
+    np.testing.assert_allclose(joined.table.numbers(arm.joint_names[2], "angle"), q[:, 2], atol=1e-9)
+    with pytest.raises(UsageError, match=r"controller = .fanuc.*give --robot"):
+        calib.join(joints, points, options=FitOptions(controller="fanuc"))
 
 
 def test_near_readings_are_averaged(tmp_path, joints, arm, q):

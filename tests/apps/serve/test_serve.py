@@ -13,18 +13,25 @@ from collections.abc import Iterator
 from html import unescape
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
+import numpy as np
 import pytest
 from sessions import begin, go_on
 from starlette.testclient import TestClient
 
 from calib.apps.cell_demo import demo
-from calib.apps.serve import pages
+from calib.apps.serve import pages, received
 from calib.apps.serve.pages import application
 from calib.apps.serve.work import CHECK, NEXT, Work
+from calib.errors import UsageError
 from calib.procedure.session import commands, steps
 from calib.procedure.session.folder import Session, open_session
+from calib.procedure.session.geometry_steps import chain_of, read_measured
+from calib.robot.chain import random_joints
+from calib.robot.kinematics import forward
 from calib.simulation.virtual_cells import virtual_cell
+from calib.transforms import pose
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +58,13 @@ def client(session: Session) -> TestClient:
     return TestClient(application(Recorded(session.folder)), base_url="http://127.0.0.1:8000")
 
 
-def bring(client: TestClient, kind: str, name: str, content: bytes = b"x\n1\n") -> Any:
+# width of a telephone held upright [pixels]
+NARROW = 400
+HEADER = ",".join([*(f"joint{k}" for k in range(1, 8)), "x,y,z,qx,qy,qz,qw"])
+MEASURED = f"{HEADER}\n0,0,0,0,0,0,0,1,1,1,0,0,0,1\n1,0,0,0,0,0,0,1,1,1,0,0,0,1\n"
+
+
+def bring(client: TestClient, kind: str, name: str, content: bytes = MEASURED.encode()) -> Any:
     return client.post(f"/bring/{kind}", files={"file": (name, content)}, follow_redirects=False)
 
 
@@ -61,6 +74,8 @@ def test_the_page_says_what_calib_next_says(session: Session, client: TestClient
     monkeypatch.setattr(pages, "step_states", lambda _: [waits])
     task, file = commands.asks(session, waits)
     shown = re.sub("<.*?>", "", unescape(client.get("/").text))
+    file, _, command = file.partition("; then: ")
+    assert command not in shown, "the page does it"
     lines = [line.partition(" ")[2] for line in task.splitlines()]
     assert len(lines) == 3 and all(line in shown for line in (*lines, file))
 
@@ -72,12 +87,127 @@ def test_files_get_the_sessions_names(session: Session, client: TestClient) -> N
     names = {kind: [path.name for path in session.brought(kind)] for kind in ("measured", "validation")}
     assert names == {"measured": ["Shots 1.csv"], "validation": ["validation_later.csv"]}
     assert client.app.state.work.current.task == CHECK  # type: ignore[attr-defined]
-    for name, words in (("validation.csv", "have another upload"), ("shots.xlsx", "expected .csv")):
+    for name, words in (("validation.csv", "have another upload"), ("shot.png", "is an image, and this session")):
         refused = bring(client, "measured", name)
         assert refused.status_code == 400 and words in refused.text
     assert bring(client, "training", "log.csv").status_code == 404, "the session has no dynamics"
     client.post("/aside/3-measured/Shots 1.csv")
     assert not session.brought("measured") and session.path("3-measured/aside/1_Shots 1.csv").exists()
+
+
+def points_and_joints(session: Session, count: int = 16) -> tuple[bytes, bytes, np.ndarray]:
+    """Return points of a tracker as a text export, in another order, a controller's joints, and the joints [rad]."""
+    chain = chain_of(session)
+    q = 0.5 * random_joints(chain, count, 5)
+    tips = forward(chain, q) @ pose(None, [0.06, -0.04, 0.1])
+    order = np.random.default_rng(1).permutation(count)
+    points = ["// SpatialAnalyzer 2024.1", "// Units: mm"]
+    points += [f"T::C::P{k + 1:02d}; " + "; ".join(f"{x:.4f}" for x in 1e3 * tips[k, :3, 3]) for k in order]
+    joints = ["Punkt;" + ";".join(f"A{k}" for k in range(1, 8))]
+    joints += [f"P{k + 1};" + ";".join(f"{x:.5f}" for x in np.degrees(q[k])) for k in range(count)]
+    return "\n".join(points).encode("utf-16"), "\n".join(joints).encode(), q
+
+
+def test_joints_and_points_apart_are_joined_in_the_page(session: Session, client: TestClient) -> None:
+    """Columns are asked for, the pairing is shown, and taken as the measurement of the step."""
+    points, joints, q = points_and_joints(session)
+    work = client.app.state.work  # type: ignore[attr-defined]
+    assert bring(client, "measured", "points.txt", points).status_code == 303
+    assert "The joint values that belong to these points are missing" in client.get("/").text
+    assert bring(client, "measured", "../joints.dat.csv", joints).status_code == 303
+    assert not session.brought("measured") and not work.joins
+
+    answers = {f"columns.q{k}": f"A{k}" for k in range(1, 8)} | {"units.joints": "deg", "columns.x": ""}
+    page = "/columns/measured/joints.dat.csv"
+    refused = client.post(page, data=answers | {"units.joints": "furlong"})
+    assert refused.status_code == 400 and "furlong" in refused.text and "deg" in refused.text
+    assert client.post(page, data=answers).status_code == 200
+    asked = work.current.pairing
+    assert (asked.joints, asked.points) == ("joints.dat.csv", "points.txt")
+    notes = received.join_received(session, "measured", asked)
+    shown = unescape(client.get("/").text)
+    assert all(note in shown for note in notes[:-1]) and "joined by name" in shown and "A1, A2, A3" in shown
+
+    assert client.post("/take/measured").status_code == 200
+    (path,) = session.brought("measured")
+    ((_, block),) = read_measured(session, chain_of(session), [path])
+    np.testing.assert_allclose(block.q, q, atol=1e-6)
+    assert client.post("/take/measured").status_code == 400, "taken already"
+    assert len(list(session.path("3-measured/received/measured/used").iterdir())) == 2
+
+
+def test_mistakes_in_files_are_shown_with_their_cure(session: Session, client: TestClient) -> None:
+    """What cannot be read is no measurement; the page says why, and what to do."""
+    names = ",".join(f"joint{k}" for k in range(1, 8))
+    for name, content, words in (
+        ("book.xlsx", b"PK\x03\x04" + bytes(range(256)), "save a spreadsheet as CSV"),
+        ("far.csv", b"x,y,z\n1000,2,3\n1100,2,3\n", "[mm]"),
+        ("deg.csv", f"{names}\n0,0,0,0,0,0,0\n90,0,0,0,0,0,0\n".encode(), "[deg]"),
+        ("<i>.csv", b"u,v\n1,2\n", "say below which of them is what"),
+    ):
+        assert bring(client, "measured", name, content).status_code == 303
+        (part,) = received.received(session, "measured")
+        page = client.get("/").text
+        assert part.role == "unclear" and words in part.message, part.message
+        assert words in unescape(page) and "<i>" not in page
+        client.post(f"/aside/3-measured/received/measured/files/{quote(name)}")
+    assert not session.brought("measured") and not received.waiting(session, "measured")
+    refused = bring(client, "measured", "none.csv", b"")
+    assert refused.status_code == 400 and "none.csv is empty" in refused.text
+    for kind, name in (("training", "x"), ("measured", "../../session.toml"), ("measured", "x")):
+        assert client.post(f"/columns/{kind}/{quote(name, safe='')}", data={}).status_code in (400, 404)
+    missing = client.post("/join/measured", data={"joints": "../../session.toml", "points": "/etc/passwd"})
+    assert missing.status_code == 200
+    with pytest.raises(UsageError, match="no such file was received"):
+        received.join_received(session, "measured", client.app.state.work.current.pairing)  # type: ignore[attr-defined]
+
+
+def test_the_page_says_which_columns_it_wants(session: Session, client: TestClient) -> None:
+    """The example of a kind of files is a file that the session reads."""
+    example = client.get("/example/measured")
+    assert all(f"<th>{column}</th>" in client.get("/").text for column in example.text.splitlines()[0].split(","))
+    session.path("2-poses/poses.csv").write_text(f"{HEADER.partition(',x')[0]}\n0.1,0,0,0,0,0,0\n0,0,0,0,0,0,0.2\n")
+    example = client.get("/example/measured")
+    assert bring(client, "measured", "m.csv", example.content).status_code == 303
+    assert [path.name for path in session.brought("measured")] == ["m.csv"]
+    assert client.get("/example/secret").status_code == 400
+
+
+def test_settings_are_edited_in_the_page(session: Session, client: TestClient) -> None:
+    """A mistake is shown with its cure, beside the text as it was typed, and nothing is stored."""
+    settings = session.path("session.toml").read_text()
+    changed = settings.replace("tolerance_mm = 0.0", "tolerance_mm = 0.25")
+    wrong = client.post("/settings/session.toml", data={"text": changed.replace('loss = "auto"', 'loss = "robust"')})
+    assert wrong.status_code == 400 and "cauchy" in wrong.text and "0.25" in wrong.text
+    assert session.path("session.toml").read_text() == settings and not list(session.folder.glob(".*"))
+    assert client.post("/settings/session.toml", data={"text": changed}).status_code == 200
+    assert open_session(session.folder).settings.fit.tolerance_mm == 0.25
+    assert client.post("/options").status_code == 200
+    assert open_session(session.folder).settings.fit.options == "options.toml"
+    assert client.post("/settings/options.toml", data={"text": 'euler = "no such"'}).status_code == 400
+    for name in ("state.json", "..%2Fx", "1-robot%2Frobot.toml"):
+        assert client.post(f"/settings/{name}", data={"text": "x"}).status_code in (400, 404)
+
+
+def test_a_session_begins_in_the_page(tmp_path: Path) -> None:
+    """A new folder becomes a session by the questions of `calib new`; a file of this computer is not read."""
+    folder = tmp_path / "new"
+    client = TestClient(application(Recorded(folder)), base_url="http://127.0.0.1:8000")
+    assert "New calibration session" in client.get("/").text
+    answers = {"robot": "ur5", "instrument": "cmm", "dynamics": "no", "poses": "12", "plan": "no", "holdout": "0.25"}
+    for key, value, words in (
+        ("robot", "/etc/passwd", "no robot of the library"),
+        ("holdout", "a quarter", "a share from 0 to 0.99"),
+        ("holdout", "2", "a share from 0 to 0.99"),
+        ("cone", "wide", "--cone"),
+    ):
+        refused = client.post("/new", data=answers | {key: value})
+        assert refused.status_code == 400 and words in unescape(refused.text) and not folder.exists()
+    assert client.post("/new", data=answers, headers={"origin": "http://evil.example"}).status_code == 403
+    assert client.post("/new", data=answers).status_code == 200
+    settings = open_session(folder).settings
+    assert (settings.poses.plan, settings.poses.fit, settings.fit.holdout) == (False, 12, 0.25)
+    assert "Bring files" in client.get("/").text and client.get("/bundle/1-robot.zip").status_code == 404
 
 
 def test_half_an_upload_leaves_no_file(session: Session, client: TestClient) -> None:
@@ -127,12 +257,22 @@ def browser() -> Iterator[Any]:
         pytest.skip("chromium or chromedriver is not installed (Debian: apt-get install chromium chromium-driver)")
     options = webdriver.ChromeOptions()
     options.binary_location = str(programs[0])
-    for word in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage", "--window-size=820,1180"):
+    for word in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
         options.add_argument(word)
     driver = webdriver.Chrome(options, webdriver.ChromeService(programs[1]))
     driver.implicitly_wait(10)
     yield driver
     driver.quit()
+
+
+def split(path: Path, joints: int) -> list[Path]:
+    """Write joint values and points of a file of measured poses into two files, and return their paths."""
+    lines = [line.split(",") for line in path.read_text().splitlines() if not line.startswith("#")]
+    start = next(k for k, name in enumerate(lines[0]) if name.startswith("x"))
+    parts = {"joints.csv": slice(start - joints, start), "points.csv": slice(start, None)}
+    for name, columns in parts.items():
+        path.with_name(name).write_text("".join(",".join(line[columns]) + "\n" for line in lines))
+    return [path.with_name(name) for name in parts]
 
 
 class Served:
@@ -167,6 +307,10 @@ def test_in_a_browser_nothing_is_lost(session: Session, browser: Any) -> None:
     def text(part: str = "now") -> str:
         return browser.execute_script(f"return document.getElementById('{part}').innerText")
 
+    def press(button: str) -> None:
+        # the page may exchange the button between being found and being clicked
+        browser.execute_script(f'document.querySelector("{button}")?.click()')
+
     try:
         browser.get(served.address)
         browser.execute_script("window.open(arguments[0])", served.address)
@@ -184,15 +328,24 @@ def test_in_a_browser_nothing_is_lost(session: Session, browser: Any) -> None:
         browser.find_element("css selector", "button.main").click()
         until(lambda: "Measure the target" in text())
 
+        screen = {"width": NARROW, "height": 900, "deviceScaleFactor": 1, "mobile": True}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)
         twin = session.folder.with_name("twin")
         shutil.copytree(session.folder, twin)
         demo.simulate_measurements(open_session(twin), virtual_cell("lwr4plus"), 0)
         large = twin / "3-measured/measured.csv"
         large.write_text(large.read_text() + "# filling\n" * 2_000_000)
-        for kind, path in (("measured", large), ("validation", twin / "3-measured/validation_measured.csv")):
+        apart = split(twin / "3-measured/validation_measured.csv", 7)
+        for kind, paths in (("measured", [large]), ("validation", apart)):
             form = browser.find_element("css selector", f"form[action='/bring/{kind}']")
-            form.find_element("css selector", "input").send_keys(str(path))
+            form.find_element("css selector", "input").send_keys("\n".join(map(str, paths)))
             form.find_element("css selector", "button").click()
+            if kind == "validation":
+                # as on a telephone: nothing is wider than the screen
+                until(lambda: "Joined: " in text("brought-validation"))
+                assert "joined by row" in text("brought-validation")
+                assert browser.execute_script("return document.documentElement.scrollWidth") <= NARROW
+                press("form[action='/take/validation'] button")
             until(lambda kind=kind: "rows of kind" in text(f"brought-{kind}"))
         assert session.path("3-measured/measured.csv").read_bytes() == large.read_bytes()
         until(lambda: browser.find_elements("css selector", "button.main"))

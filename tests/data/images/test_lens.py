@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from differences import check
 
-from calib.data.images.lens import Lens, rays, read_lens, write_lens
+from calib.data.images.lens import Lens, rays, write_lens
+from calib.data.images.lens_files import read_lens
 from calib.errors import CalibError, MeasurementError
 
 SIZE = (800, 600)
@@ -67,7 +68,7 @@ def test_lens_is_written_as_ros_reads_it(name, tmp_path):
         (("image_width: 800", "image_width: wide"), "image_width: expected a number of pixels, found 'wide'"),
         (("  data: [780.0", "  data: [.nan"), "camera_matrix: expected data"),
         (("  data: [780.0, 0.0", "  data: [780.0, 5.0"), r"expected \[fx 0 cx"),
-        (("camera_matrix", "matrix"), "camera_matrix: expected data"),
+        (("camera_matrix", "matrix"), "has no lens: expected image_width, camera_matrix"),
         (("image_width: 800", "image_width: 800: 1"), "cannot be read as YAML"),
     ],
 )

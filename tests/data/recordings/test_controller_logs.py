@@ -116,18 +116,22 @@ def test_abb_egm_is_degrees_without_torques(tmp_path):
         read_recording(path, joints(6))
 
 
-def test_sunrise_log_needs_name_of_torques(tmp_path):
-    """KUKA's Sunrise log needs the name of its torques."""
+def test_sunrise_log_tells_name_of_torques(tmp_path):
+    """KUKA's Sunrise log is read by the words of its torques' names, which are said; other names are stated."""
     t, q, _, tau = motion(7)
     arm = "_LBR_iiwa_7_R800_1"
     names = ["ZeitInSec", "ZeitInNanoSec", *named(f"axisQMsr{arm}", 7), *named(f"tauMsr{arm}", 7)]
     stamps = 1_600_000_000.5 + t
     rows = [np.floor(stamps), np.round(1e9 * (0.5 + t) % 1e9), np.degrees(q), tau]
     path = write(tmp_path / "DataRecorder.log", f"% {' '.join(names)}", rows, " ")
-    with pytest.raises(MeasurementError, match="State their names in the options"):
+    by_words = read_recording(path, joints(7))
+    assert any('torque = "tauMsr' in note for note in by_words.notes)
+    stated = read_recording(path, joints(7), RecordingOptions(names={"torque": "tauMsr"}))
+    for found in (by_words, stated):
+        assert np.allclose(found.t, t, atol=1e-7) and np.allclose(found.q, q) and np.allclose(found.effort, tau)
+    path.write_text(path.read_text().replace("tauMsr", "axisMsr"))
+    with pytest.raises(MeasurementError, match=r'columns = \{ torque = "axisMsr'):
         read_recording(path, joints(7))
-    found = read_recording(path, joints(7), RecordingOptions(names={"torque": "tauMsr"}))
-    assert np.allclose(found.t, t, atol=1e-7) and np.allclose(found.q, q) and np.allclose(found.effort, tau)
 
 
 def test_known_logs_say_where_published():

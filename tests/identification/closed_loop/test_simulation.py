@@ -9,6 +9,7 @@ from scipy.interpolate import CubicSpline
 
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
+from calib.dynamics.tables import knots_of
 from calib.errors import CalibError, NotConverged
 from calib.identification.closed_loop import controllers, simulation
 from calib.identification.closed_loop.controllers import Reference
@@ -194,11 +195,12 @@ def test_what_cannot_be_simulated_is_refused():
         replace(plant, terms=drives.standard(["Ia Fv Fc"] * 6, 0.0))
 
 
+ARCTAN = tuple(knots_of(lambda x: np.arctan(5.0 * x), lambda x: 5.0 / (1.0 + 25.0 * x**2), -4.0, 4.0, "arctan").ravel())
 EVERYTHING = {
     "position": (), "speed": (), "cubic": (), "root": (0.05,), "stribeck": (0.3, 2.0, 0.05), "dead": (0.3,),
     "sine": (5.0, 2.0), "cosine": (3.0, np.inf), "sine_band": (6.0, 0.1, 0.5, 1.0, 1.0, -1.5, 1.5),
     "cosine_band": (6.0, 0.0, 0.4, np.inf, -1.0, -0.5, 0.5), "load": (0.05,), "load_velocity": (), "stop": (0.05,),
-    "presliding": (0.05, 0.05),
+    "presliding": (0.05, 0.05), "velocity_table": ARCTAN, "position_table": ARCTAN,
 }  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import planted_motion as planted
+import pytest
 import without_figures
 
 CODES = {"torque-clipped", "encoder-stands", "velocity-stands", "payload-unstated"}
@@ -51,6 +52,28 @@ def test_sound_payload_recordings_are_clear(robot, tmp_path, capsys):
     assert "unstated payload" not in words and " frozen from " not in words
     codes = json.dumps(json.loads((tmp_path / "out" / "metrics.json").read_text()))
     assert not any(code in codes for code in CODES)
+
+
+@pytest.mark.parametrize(
+    ("stated", "code"),
+    [
+        ("mass = 2.0\ncom = [0.05, 0.025, 0.1]", None),
+        ("mass = 3.0", "payload-mass"),
+        ("mass = 2.0\ncom = [0.05, 0.025, 0.3]", "payload-centre"),
+    ],
+)
+def test_wrongly_stated_payload_is_named(robot, tmp_path, stated, code):
+    """A stated mass or centre of mass that the torques contradict is named; the true one is not."""
+    plain = planted.write(tmp_path, "plain.npz", 0)
+    loaded = planted.write(tmp_path, "loaded.npz", 1, tau=planted.series(1, payload=True)["tau"])
+    options = tmp_path / "options.toml"
+    options.write_text(f'[payload.load]\n{stated}\n[files."loaded.npz"]\npayload = ["load"]\n')
+    without_figures.run(
+        "identify", robot, plain, loaded, "--friction", "standard", "--options", options, "--out", tmp_path / "out"
+    )
+    notices = json.loads((tmp_path / "out" / "metrics.json").read_text())["noticed"]
+    codes = {notice["code"] for notice in notices if notice["code"].startswith("payload")}
+    assert codes == ({code} if code else set())
 
 
 def test_standing_joint_is_no_fault(robot, tmp_path, capsys):

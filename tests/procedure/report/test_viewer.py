@@ -217,9 +217,9 @@ def test_missing_rerun_is_said(fitted, monkeypatch, capsys, tmp_path):
     """Without Rerun the command says what to install, and a session goes on."""
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert cli.run(["view", str(fitted), "--save", str(tmp_path / "x.rrd")]) == 2
-    assert "pip install rerun-sdk" in capsys.readouterr().err
+    assert "pip install 'armature-calib[view]'" in capsys.readouterr().err
     assert not (tmp_path / "x.rrd").exists()
-    assert "not installed" in viewer.write_beside(fitted)
+    assert "is not installed" in viewer.write_beside(fitted)
 
 
 def test_failing_recording_stops_nothing(fitted, monkeypatch):

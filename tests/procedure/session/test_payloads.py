@@ -10,6 +10,7 @@ from without_figures import run
 
 from calib.errors import CalibError, UsageError
 from calib.identification.settings import Payload
+from calib.procedure.session.commands import _present_logs
 from calib.procedure.session.dynamics_steps import options_of, unrecorded_payloads
 from calib.procedure.session.folder import open_session
 from calib.procedure.session.questions import stated_payloads
@@ -38,6 +39,12 @@ def test_invalid_payload_shows_its_form(text: str) -> None:
 def test_label_stated_twice_is_refused() -> None:
     with pytest.raises(UsageError, match="'load' is stated twice"):
         stated_payloads(["load=1", "load=2"])
+
+
+def test_labels_that_differ_by_case_are_refused() -> None:
+    """Names of files do not tell upper from lower case."""
+    with pytest.raises(UsageError, match="'Load' and 'load' differ by upper and lower case alone"):
+        stated_payloads(["Load=1", "load=2"])
 
 
 def test_label_in_every_name_is_refused(tmp_path: Path) -> None:
@@ -79,6 +86,16 @@ def test_labels_are_words_of_names(tmp_path: Path) -> None:
     assert unrecorded_payloads(session) == []
     session.path("7-recorded/training_load2_log.csv").unlink()
     assert unrecorded_payloads(session) == ["load2"]
+
+
+def test_misspelt_log_is_named_while_waiting(tmp_path: Path) -> None:
+    """While a session waits for a log, the logs that are there stand with what their names make of them."""
+    session = begin(tmp_path / "cell", "tx40", "cmm", 5, 0, payloads={"load": 2.0})
+    for name in ("training_lod_log.csv", "validation_load_log.csv"):
+        session.path(f"7-recorded/{name}").write_text("t\n")
+    words = _present_logs(session)
+    assert "training_lod_log.csv (training without payload)" in words
+    assert "validation_load_log.csv (validation with load)" in words
 
 
 @pytest.mark.slow

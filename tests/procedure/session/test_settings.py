@@ -29,7 +29,7 @@ from calib.procedure.session.settings import (
     read_settings,
     written,
 )
-from calib.procedure.session.steps import changed_inputs
+from calib.procedure.session.steps import StatedConstraints, changed_inputs
 from calib.records import plain
 
 # as the version before typed settings (commit a217159) wrote it
@@ -172,3 +172,17 @@ def test_example_names_keys_with_defaults() -> None:
     assert set(table) == {f.name for f in dataclasses.fields(SessionSettings)}
     assert table["dynamics"] == plain(DynamicsSection()) and table["fit"] == dataclasses.asdict(FitSection())
     assert all(len(line) <= 120 and line == line.rstrip() for line in example().splitlines())
+
+
+def test_constraints_file_is_an_input(tmp_path: Path) -> None:
+    """A Python file of constraints that the options name counts as read; changed, it makes the identification stale."""
+    session = begin(tmp_path / "cell", "tx40", "cmm", 5, 0)
+    assert StatedConstraints().paths(session) == []
+    constraints = session.path("constraints.py")
+    constraints.write_text("def constraints(beta):\n    return []\n")
+    session.path("options.toml").write_text("[constraints]\nfile = 'constraints.py'\n")
+    file = session.path("session.toml")
+    keys = read_settings(file)
+    dynamics = dataclasses.replace(keys.dynamics, options="options.toml")
+    file.write_text(written(dataclasses.replace(keys, dynamics=dynamics)))
+    assert StatedConstraints().paths(open_session(session.folder)) == [constraints.resolve()]

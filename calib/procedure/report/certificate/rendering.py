@@ -19,10 +19,10 @@ from calib.procedure.report.certificate.record import MAX_PAGES, Certificate, Pa
 from calib.procedure.report.page import Pictures
 from calib.procedure.report.templates import filled, read
 from calib.records import plain
+from calib.workers.extras import installed, lacking, needing
 
 PACKAGE = "calib.procedure.report.certificate"
 FONT = "DejaVu Sans"
-FONT_FOLDER = str(Path(find_spec("matplotlib").origin or "").parent / "mpl-data/fonts/ttf")  # type: ignore[union-attr]
 # refuses letters that no font shows
 STANDARD = "a-2b"
 
@@ -45,7 +45,8 @@ def write_figures(folder: Path, page: Page) -> int:
         folder: the folder.
         page: the report.
     """
-    from calib.procedure.report.charts import vector
+    with needing("matplotlib"):
+        from calib.procedure.report.charts import vector
 
     count = 0
     for section in page.sections:
@@ -70,10 +71,14 @@ def pdf(page: Certificate) -> tuple[bytes, list[str]]:
     """Return a certificate as PDF, and notes for the user.
 
     A certificate above `MAX_PAGES` pages, which only very long entries cause, is set in smaller type. The PDF is empty
-    in a process forked from one that has used Typst, since Typst's threads do not exist after a fork.
+    in a process forked from one that has used Typst, since Typst's threads do not exist after a fork, and where Typst
+    or matplotlib is not installed.
     """
     if _first_user() != os.getpid():
         return b"", [f"{PAGES[1]} was not written, since this process was forked: start processes by spawn"]
+    for module in ("typst", "matplotlib"):
+        if not installed(module):
+            return b"", [f"{PAGES[1]} was not written; {lacking(module)}"]
     images: dict[str, bytes] = {}
 
     def as_json(value: Any) -> object:
@@ -111,6 +116,9 @@ def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]
     """
     import typst  # 80 MB, and needed for nothing else
 
+    matplotlib_package = find_spec("matplotlib")
+    assert matplotlib_package is not None and matplotlib_package.origin is not None
+    font_folder = str(Path(matplotlib_package.origin).parent / "mpl-data/fonts/ttf")
     notes: list[str] = []
     for families, standard in _fonts():
         setting = json.dumps({"fonts": families, "dense": dense}).encode()
@@ -118,7 +126,7 @@ def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]
         own_font = families == [FONT]
         try:
             document: Any = typst.compile(
-                all_inputs, font_paths=[FONT_FOLDER], ignore_system_fonts=own_font, pdf_standards=standard
+                all_inputs, font_paths=[font_folder], ignore_system_fonts=own_font, pdf_standards=standard
             )
             return document, notes
         except typst.TypstError as error:

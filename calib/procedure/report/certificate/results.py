@@ -13,6 +13,7 @@ from calib.procedure.report.certificate.record import NO_DETAILS, Certificate, E
 from calib.procedure.report.page import Picture, Section
 from calib.procedure.report.templates import versions
 from calib.units import DEG
+from calib.workers.extras import available
 
 if TYPE_CHECKING:
     from calib.procedure.kinematic_stage.metrics import FitMetrics
@@ -44,7 +45,7 @@ def read_fit(folder: Path, plots: bool, details: CertificateSection) -> tuple[Ce
 
     fit = fit_report.read(FitFolder(folder).report)
     drawn = {}
-    if plots:
+    if plots and available("matplotlib"):
         from calib.procedure.report.charts import pictures
         from calib.procedure.report.geometry_figures import captioned
 
@@ -142,7 +143,7 @@ def read_model(folder: Path, plots: bool, details: CertificateSection) -> tuple[
 
     model_report = dynamics_section.read(folder)
     drawn = {}
-    if plots:
+    if plots and available("matplotlib"):
         from calib.procedure.report.charts import pictures
         from calib.procedure.report.dynamics_figures import captioned
 

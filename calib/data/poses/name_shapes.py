@@ -1,0 +1,286 @@
+"""Columns of positions and orientations by the shape of their names.
+
+``position.x``, ``tvec_x``, ``t_x``, ``X-Position`` name an axis beside a word; ``orientation.w``, ``quat_x`` a
+quaternion; ``rvec_x`` and ``rotvec[0]`` a rotation vector; ``phix1``, ``theta_x``, ``rot_x`` three angles; ``T_00`` to
+``T_33`` (or ``m11`` …) the elements of a matrix, and ``pose_0`` to ``pose_15`` its rows one after the other. A shape is
+used where the table has no column of this toolkit's names for the quantity, and only where it occurs once.
+"""
+
+import math
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.csv_table import Table
+from calib.data.joint_columns import COMMANDED_WORDS, OTHER_WORDS, words_of
+from calib.data.poses.fit_options import FileOptions
+from calib.data.schema import BOUNDS
+
+VECTOR_WORDS = frozenset(("rvec", "rotvec", "rodrigues", "axisangle", "aa"))
+QUATERNION_WORDS = frozenset(("q", "quat", "quaternion"))
+ORIENTATION_WORDS = VECTOR_WORDS | QUATERNION_WORDS
+ORIENTATION_WORDS |= {"orientation", "orient", "ori", "rotation", "rot", "r", "phi", "theta", "euler", "rpy", "ang"}
+ORIENTATION_WORDS |= {"angle", "angles", "winkel", "orientierung", "drehung", "attitude"}
+PLACE_WORDS = frozenset(("t", "tvec", "trans", "translation", "p", "pos", "position", "d", "tcp"))
+# words of columns that are neither the measured position nor the measured orientation of a target
+REJECTED_WORDS = (OTHER_WORDS - {"v", "i", "name"}) | {"base", "late", "offset", "std", "cov", "unc"}
+UNIT_WORDS = frozenset(("mm", "cm", "deg", "rad"))
+# three angles by names of their own, in the order of rx ry rz
+ANGLE_NAMES = (("roll", "pitch", "yaw"), ("alpha", "beta", "gamma"), ("phi", "theta", "psi"))
+ANGLE_NAMES += (("a", "b", "c"), ("o", "a", "t"))
+AXES = "xyz"
+QUATERNION = ("qx", "qy", "qz", "qw")
+ANGLES = ("rx", "ry", "rz")
+# number of columns of a matrix whose elements are numbered one after the other: with its last row, without, rotation
+FLAT_SIZES = {16: 4, 12: 4, 9: 3}
+_GLUED = re.compile(r"(?P<stem>[a-z]+)(?P<axis>[xyzw])|(?P<first>[xyz])(?P<rest>[a-z]+)")
+
+Mapped = dict[str, str]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Columns that by their names are one quantity.
+
+    Attributes:
+        columns: the toolkit's name of a column → the file's name.
+        words: words that the names have in common.
+        euler: what three angles mean, where their name says it; "" otherwise.
+    """
+
+    columns: Mapping[str, str]
+    words: tuple[str, ...] = ()
+    euler: str = ""
+
+    @property
+    def is_commanded(self) -> bool:
+        """Whether a word means that the quantity was commanded, not measured."""
+        return bool(COMMANDED_WORDS.intersection(self.words))
+
+
+def positions_by_shape(names: Sequence[str]) -> list[Shape]:
+    """Return the triples of columns that name the axes of a position.
+
+    Args:
+        names: the file's names of the columns that have no other meaning yet.
+    """
+    shapes = []
+    for (words, _), columns in _by_axis(names).items():
+        if ORIENTATION_WORDS.isdisjoint(words) and "w" not in columns and set(AXES) <= columns.keys():
+            shapes.append(Shape({axis: columns[axis] for axis in AXES}, words))
+    for words, columns in _numbered(names, PLACE_WORDS - {"p", "t", "d"}, 3).items():
+        shapes.append(Shape(dict(zip(AXES, columns)), words))
+    return _measured(shapes)
+
+
+def orientations_by_shape(names: Sequence[str]) -> list[Shape]:
+    """Return the quaternions and triples of angles that columns name by axis, by number or by names of angles.
+
+    Args:
+        names: the file's names of the columns that have no other meaning yet.
+    """
+    shapes = []
+    for (words, _), columns in _by_axis(names).items():
+        if set("xyzw") <= columns.keys():
+            shapes.append(Shape({f"q{axis}": columns[axis] for axis in "xyzw"}, words))
+        elif set(AXES) <= columns.keys() and not ORIENTATION_WORDS.isdisjoint(words):
+            shapes.append(_angles([columns[axis] for axis in AXES], words))
+    for words, columns in _numbered(names, ORIENTATION_WORDS - QUATERNION_WORDS, 3).items():
+        shapes.append(_angles(columns, words))
+    for angle_names in ANGLE_NAMES:
+        shapes += _named_angles(names, angle_names)
+    return _measured(shapes)
+
+
+def numbered_quaternions(names: Sequence[str]) -> list[tuple[Shape, Shape]]:
+    """Return the quaternions whose components are numbered, with w first and with w last.
+
+    Args:
+        names: the file's names of the columns that have no other meaning yet.
+    """
+    pairs = []
+    for words, columns in _numbered(names, ORIENTATION_WORDS, 4).items():
+        w_first = dict(zip(("qw", "qx", "qy", "qz"), columns))
+        pairs.append((Shape(w_first, words), Shape(dict(zip(QUATERNION, columns)), words)))
+    return pairs
+
+
+def matrices_by_shape(table: Table, names: Sequence[str]) -> list[Shape]:
+    """Return rotations and whole poses that columns name as elements of a matrix.
+
+    Args:
+        table: the table, whose numbers tell whether rows or columns of a matrix follow one another.
+        names: the file's names of the columns that have no other meaning yet.
+    """
+    elements: dict[tuple[str, ...], dict[tuple[int, int], str]] = {}
+    for name in names:
+        words = words_of(name)
+        digits = "".join(word for word in words if word.isdigit())
+        if len(digits) == 2:
+            beside = tuple(word for word in words if not word.isdigit())
+            elements.setdefault(beside, {}).setdefault((int(digits[0]), int(digits[1])), name)
+    shapes = []
+    for words, columns in elements.items():
+        first = min(min(columns))
+        if first in (0, 1):
+            shapes += _matrix({(i - first, j - first): name for (i, j), name in columns.items()}, words)
+    for size, width in FLAT_SIZES.items():
+        for words, columns in _numbered(names, (), size).items():
+            shapes += _flat_matrix(table, columns, width, words)
+    return _measured(shapes)
+
+
+def _by_axis(names: Iterable[str]) -> dict[tuple[tuple[str, ...], str], Mapped]:
+    """Return columns by axis (x, y, z, w), for the words beside the axis and the number behind it.
+
+    Args:
+        names: the file's names of columns.
+    """
+    result: dict[tuple[tuple[str, ...], str], Mapped] = {}
+    for name in names:
+        words = [word for word in words_of(name) if word not in UNIT_WORDS]
+        number = words.pop() if len(words) > 1 and words[-1].isdigit() else ""
+        axis, beside = _axis(words)
+        if axis and REJECTED_WORDS.isdisjoint(beside):
+            result.setdefault((beside, number), {}).setdefault(axis, name)
+    return result
+
+
+def _axis(words: Sequence[str]) -> tuple[str, tuple[str, ...]]:
+    """Return the axis that words name, and the words beside it; "" if they name none or several.
+
+    Args:
+        words: words of a column's name.
+    """
+    axes = [word for word in words if word in ("x", "y", "z", "w")]
+    if len(axes) == 1:
+        return axes[0], tuple(word for word in words if word != axes[0])
+    if axes or not words:
+        return "", ()
+    match = _GLUED.fullmatch(words[-1])
+    if match is None:
+        return "", ()
+    axis = match["axis"] or match["first"]
+    stem = match["stem"] or match["rest"]
+    if stem not in ORIENTATION_WORDS | PLACE_WORDS:
+        return "", ()
+    return axis, (*words[:-1], stem)
+
+
+def _numbered(names: Iterable[str], stems: Collection[str], size: int) -> dict[tuple[str, ...], list[str]]:
+    """Return columns in the order of their numbers, for words with exactly `size` numbers from 0 or from 1.
+
+    Args:
+        names: the file's names of columns.
+        stems: words of which one must stand beside the number; (): any.
+        size: number of columns.
+    """
+    numbered: dict[tuple[str, ...], dict[int, str]] = {}
+    for name in names:
+        words = words_of(name)
+        digits = [word for word in words if word.isdigit()]
+        beside = tuple(word for word in words if not word.isdigit())
+        if len(digits) == 1 and beside and REJECTED_WORDS.isdisjoint(beside):
+            numbered.setdefault(beside, {}).setdefault(int(digits[0]), name)
+    result = {}
+    for words, columns in numbered.items():
+        numbers = sorted(columns)
+        in_sequence = len(numbers) == size and numbers[0] in (0, 1) and numbers[-1] - numbers[0] == size - 1
+        if in_sequence and (not stems or not set(stems).isdisjoint(words)):
+            result[words] = [columns[number] for number in numbers]
+    return result
+
+
+def _named_angles(names: Sequence[str], angle_names: tuple[str, ...]) -> list[Shape]:
+    """Return the triples of columns named as angles, such as ``tcp_roll tcp_pitch tcp_yaw``.
+
+    Args:
+        names: the file's names of columns.
+        angle_names: names of the three angles. Those of one letter stand alone, and are capital letters.
+    """
+    by_words: dict[tuple[str, ...], Mapped] = {}
+    for name in names:
+        words = words_of(name)
+        if len(angle_names[0]) == 1 and not (len(words) == 1 and name.isupper()):
+            continue
+        for angle in angle_names:
+            if words.count(angle) == 1:
+                beside = tuple(word for word in words if word != angle and word not in UNIT_WORDS)
+                by_words.setdefault(beside, {}).setdefault(angle, name)
+    shapes = []
+    for words, columns in by_words.items():
+        if len(columns) == 3 and REJECTED_WORDS.isdisjoint(words):
+            shapes.append(_angles([columns[angle] for angle in angle_names], words))
+    return shapes
+
+
+def _angles(columns: Sequence[str], words: tuple[str, ...]) -> Shape:
+    euler = "" if VECTOR_WORDS.isdisjoint(words) else "vector"
+    return Shape(dict(zip(ANGLES, columns)), words, euler)
+
+
+def _matrix(elements: Mapping[tuple[int, int], str], words: tuple[str, ...]) -> list[Shape]:
+    """Return the rotation, and the position if it is there, of a matrix 3x3, 3x4 or 4x4; [] for another set.
+
+    Args:
+        elements: columns by row and column of the matrix, from 0.
+        words: words that the columns have in common.
+    """
+    columns: Mapped = {}
+    for i in range(3):
+        for j in range(3):
+            if (i, j) not in elements:
+                return []
+            columns[f"r{i + 1}{j + 1}"] = elements[i, j]
+    for i, axis in enumerate(AXES):
+        if (i, 3) in elements:
+            columns[axis] = elements[i, 3]
+    return [Shape(columns, words)] if len(columns) in (9, 12) else []
+
+
+def _flat_matrix(table: Table, columns: Sequence[str], width: int, words: tuple[str, ...]) -> list[Shape]:
+    """Return the matrix whose elements are numbered, if its numbers are a rotation row by row or column by column.
+
+    A rotation alone is read by rows: its transpose is a rotation, too.
+
+    Args:
+        table: the table.
+        columns: the file's names of the elements, in order.
+        width: number of elements in a row.
+        words: words that the columns have in common.
+    """
+    cells = [table.cells[table.header.index(name)] for name in columns]
+    if any(values.dtype != float for values in cells):
+        return []
+    rows = len(columns) // width
+    numbers = np.stack(cells, axis=1)
+    for transposed in (False, True):
+        order = np.arange(len(columns)).reshape(rows, width)
+        if transposed:
+            order = np.arange(len(columns)).reshape(width, rows).T
+        matrices = numbers[:, order[:3, :3]]
+        defect = np.abs(matrices @ np.swapaxes(matrices, 1, 2) - np.eye(3)).max()
+        last_row = numbers[:, order[3]] if rows == 4 else np.array([0.0, 0.0, 0.0, 1.0])
+        is_pose = np.abs(last_row - [0.0, 0.0, 0.0, 1.0]).max() < BOUNDS.max_norm_error
+        if math.isfinite(defect) and defect < 2 * BOUNDS.max_norm_error and is_pose:
+            elements = {(i, j): columns[order[i, j]] for i in range(rows) for j in range(width)}
+            return _matrix(elements, words)
+    return []
+
+
+def _measured(shapes: Sequence[Shape]) -> list[Shape]:
+    """Return the shapes that were not commanded; all of them if there are no others."""
+    return [shape for shape in shapes if not shape.is_commanded] or list(shapes)
+
+
+def with_shape(options: FileOptions, shape: Shape) -> FileOptions:
+    """Return options with the columns and the convention of a shape, under those that the options state.
+
+    Args:
+        options: options for reading a file.
+        shape: columns of one quantity.
+    """
+    columns = {**shape.columns, **options.columns}
+    return replace(options, columns=columns, euler=options.euler or shape.euler)

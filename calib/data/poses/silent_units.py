@@ -1,0 +1,140 @@
+"""Units of columns whose names come from a controller or another program, where the header states none.
+
+The toolkit's own names (``q1``, a joint's name, ``x``) without a unit are SI. Controllers show deg and mm, programs write
+rad and m: where most rows are impossible in SI, the columns are deg or mm, and the notes say so. A name may hold its
+unit as a word (``x_mm``, ``J1 deg``).
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib.data.joint_columns import words_of
+from calib.data.poses.columns import Layout, Sheet, Undecided
+from calib.data.schema import BOUNDS, Joints
+from calib.units import ANGLES
+
+# share of rows that must be impossible in SI (our choice)
+MOST_ROWS = 0.5
+# units that are told from a word of a name; single letters are not
+WORD_UNITS = ("mm", "cm", "um", "deg", "degrees", "rad", "mrad")
+SI = {"deg": "rad", "mm": "m"}
+
+
+def with_silent_units(sheet: Sheet, layout: Layout, robot: Joints) -> tuple[Sheet, tuple[str, ...]]:
+    """Return the sheet with units for columns of foreign names, and notes on those that were concluded from numbers.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns to read.
+        robot: names, types and limits of the joints.
+
+    Raises:
+        Undecided: angles of an orientation that may be rad or deg beside joints in deg.
+    """
+    sheet = _with_units_of_names(sheet, layout)
+    if sheet.has_our_names(layout.joints, robot.names) and not _is_mapped(sheet, layout):
+        return sheet, ()
+    turning: list[str] = []
+    sliding: list[str] = []
+    for name, kind in zip(layout.joints, robot.kinds):
+        names = sliding if kind == "prismatic" else turning
+        names.append(name)
+    families = [(turning, "joints", "deg", BOUNDS.max_turn), (sliding, "joints", "mm", _travel(robot))]
+    for names in layout.positions:
+        families.append((list(names), "position", "mm", BOUNDS.max_length))
+    if len(layout.orientation) == 3:
+        families.append((list(layout.orientation), "orientation", "deg", BOUNDS.max_turn))
+    units = dict(sheet.options.units)
+    notes = []
+    for names, family, unit, most in families:
+        silent = bool(names) and not any(sheet.unit(name, family) for name in names)
+        if silent and _share_above(sheet, names, most) > MOST_ROWS:
+            units |= dict.fromkeys(names, unit)
+            notes.append(f"{', '.join(names)}: no unit stated, read in {unit}; in {SI[unit]} they are impossible")
+    read = replace(sheet, options=replace(sheet.options, units=units))
+    _ask_for_angles(read, layout, turning)
+    return read, tuple(notes)
+
+
+def _with_units_of_names(sheet: Sheet, layout: Layout) -> Sheet:
+    """Return the sheet with the units that stand as words in the names of columns without a unit.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns to read.
+    """
+    families = [(layout.joints, "joints"), (layout.orientation, "orientation")]
+    families += [(names, "position") for names in layout.positions]
+    units = dict(sheet.options.units)
+    for names, family in families:
+        for name in names:
+            words = [word for word in words_of(name) if word in WORD_UNITS]
+            if len(words) == 1 and not sheet.unit(name, family):
+                units[name] = words[0]
+    return replace(sheet, options=replace(sheet.options, units=units))
+
+
+def _is_mapped(sheet: Sheet, layout: Layout) -> bool:
+    """Return whether a position or an orientation was told from the shape of its names.
+
+    Args:
+        sheet: the table with its options, into which the shapes' columns were written.
+        layout: the columns to read.
+    """
+    names = [*layout.orientation]
+    for position in layout.positions:
+        names += position
+    return not set(names).isdisjoint(sheet.options.columns.values())
+
+
+def _travel(robot: Joints) -> float:
+    """Return the largest travel [m] of the robot's prismatic joints; that of any robot where a limit is unknown.
+
+    Args:
+        robot: types and limits of the joints.
+    """
+    travel = 0.0
+    for kind, lower, upper in zip(robot.kinds, robot.lower, robot.upper):
+        if kind == "prismatic":
+            travel = max(travel, abs(lower), abs(upper))
+    return travel + BOUNDS.limit_slack if math.isfinite(travel) else BOUNDS.max_length
+
+
+def _share_above(sheet: Sheet, names: Sequence[str], most: float) -> float:
+    """Return the share of rows with a number above `most` in one of the columns, among rows with numbers.
+
+    Args:
+        sheet: the table.
+        names: the file's names of the columns.
+        most: largest possible absolute value.
+    """
+    columns = [np.abs(sheet.table.numbers(name, None, gaps=True)) for name in names]
+    largest = np.max(np.stack(columns), axis=0)
+    largest = largest[np.isfinite(largest)]
+    return float(np.mean(largest > most)) if len(largest) else 0.0
+
+
+def _ask_for_angles(sheet: Sheet, layout: Layout, turning: Sequence[str]) -> None:
+    """Raise `Undecided` for small angles of an orientation without a unit beside joints in deg.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns to read.
+        turning: the file's names of the columns of turning joints.
+    """
+    joint_units = {ANGLES.get(sheet.unit(name, "joints")) for name in turning}
+    silent = len(layout.orientation) == 3 and not sheet.unit(layout.orientation[0], "orientation")
+    if not silent or joint_units != {ANGLES["deg"]}:
+        return
+    choices = {}
+    for unit in ("deg", "rad"):
+        units = {**sheet.options.units, "orientation": unit}
+        choices[f"units = {{ orientation = '{unit}' }}"] = replace(sheet.options, units=units)
+    lines = " or ".join(choices)
+    message = (
+        f"{', '.join(layout.orientation)} have no unit and may be either: one line in the options says it: {lines}"
+    )
+    raise Undecided(sheet.table, message, choices, layout.orientation[0])

@@ -1,0 +1,230 @@
+"""Joint states that ROS's tools print as CSV, read as the tables of `calib formats recordings` are, by every command.
+
+=====================================  ================================================================================
+``rostopic echo -b log.bag -p TOPIC``  one line of names (``%time, field.header.seq, …, field.name0, …, field.effort5``)
+``ros2 topic echo --csv TOPIC``        no line of names: seconds, nanoseconds, frame, names, then the values
+=====================================  ================================================================================
+
+Both write the joints' names in every row; columns are named by them (``q_elbow``, ``v_elbow``, ``tau_elbow``), so that
+the order of the message does not matter. Read are ``sensor_msgs/JointState`` and ros2_control's ``DynamicJointState``.
+Messages of other joints (a gripper's) in the same file become rows without the arm's positions. Stamps are those of the
+headers; where these are zero, rostopic's times of arrival.
+
+Sources: ros_comm, tools/rostopic (`_str_plot_fields`); ros2cli, ros2topic/verb/echo.py with
+rosidl_runtime_py.convert.message_to_csv (fields in their order, arrays flattened, nothing for an empty array).
+"""
+
+import csv
+import re
+from collections import Counter
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.recordings.controller_logs import LONGEST, Log
+from calib.errors import refuse_data
+from calib.units import is_number
+
+# Names of the state interfaces of ros2_control with the letters of our columns.
+INTERFACES = {"position": "q", "velocity": "v", "effort": "tau"}
+ROSTOPIC, ROS2 = "rostopic echo -p", "ros2 topic echo --csv"
+# Cells before the joints' names: time, sequence, stamp and frame; seconds, nanoseconds and frame.
+LEADING = {ROSTOPIC: 4, ROS2: 3}
+# Lines at the beginning in which the form is looked for, since tools print warnings between.
+FIRST_LINES = 5
+# Correlation with the slope of the positions, from which on the second of two quantities is the velocity (our choice).
+MIN_CORRELATION = 0.8
+_HEADER = re.compile(r"%time,.*\bfield\.(joint_)?names?0\b")
+
+
+@dataclass
+class _Message:
+    """One row: its time as text [s], the joints' names, and the values of each quantity, by the letters of our columns.
+
+    Attributes:
+        second: values of a second quantity that may be velocities or efforts; empty if it is clear.
+    """
+
+    time: str
+    names: tuple[str, ...]
+    values: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    second: tuple[str, ...] = ()
+
+
+def translated(path: str | Path) -> Log | None:
+    """Return joint states in the file at `path` as the text of a CSV table; None if they are not of ROS's tools.
+
+    Raises:
+        MeasurementError: rows of names without the values of a joint state.
+    """
+    with open(path, encoding="utf-8-sig", errors="replace", newline="") as file:
+        first_lines = [line for line in islice(iter(lambda: file.readline(LONGEST), ""), FIRST_LINES)]
+        tool = _tool(first_lines)
+        if not tool:
+            return None
+        file.seek(0)
+        header = ()
+        messages = []
+        unread = 0
+        for cells in csv.reader(file):
+            if not cells:
+                continue
+            if cells[0].startswith("%time"):
+                header = tuple(cells)
+                continue
+            message = _message(cells, tool, header)
+            if message is None:
+                unread += 1
+            else:
+                messages.append(message)
+    if not messages:
+        refuse_data(path, f"looks like '{tool}', but none of its {unread} rows is a joint state: is it that topic?")
+    notes = [f"read as joint states of '{tool}': columns are named by the joints' names in the rows"]
+    notes += _resolved(messages)
+    if unread:
+        notes.append(f"{unread} lines that are no joint state are not used")
+    return _log(messages, notes)
+
+
+def _tool(lines: list[str]) -> str:
+    """Return which tool wrote a file that begins with these lines; "" for none."""
+    for line in lines:
+        if _HEADER.match(line):
+            return ROSTOPIC
+        cells = line.strip().split(",")
+        stamped = len(cells) > 5 and cells[0].isdigit() and cells[1].isdigit()
+        if stamped and not is_number(cells[2]) and _is_name(cells[3]) and is_number(cells[-1]):
+            return ROS2
+    return ""
+
+
+def _is_name(cell: str) -> bool:
+    return bool(cell.strip()) and not is_number(cell) and cell.strip().lower() != "nan"
+
+
+def _message(cells: list[str], tool: str, header: tuple[str, ...]) -> _Message | None:
+    """Return a row as a message; None if it is no joint state.
+
+    Args:
+        cells: the row.
+        tool: the tool that wrote it.
+        header: the line of names; empty without one.
+    """
+    leading = LEADING[tool]
+    if len(cells) <= leading or not cells[0].isdigit() or not cells[1].isdigit():
+        return None
+    time = _time(cells, tool)
+    count = 0
+    while leading + count < len(cells) and _is_name(cells[leading + count]):
+        count += 1
+    texts = [cell.strip() for cell in cells[leading : leading + count]]
+    interfaces = [position for position, text in enumerate(texts) if text in INTERFACES]
+    if interfaces:
+        names = tuple(texts[: interfaces[0]])
+        return _dynamic(_Message(time, names), cells[leading + interfaces[0] :])
+    values = [cell.strip() for cell in cells[leading + count :]]
+    if not count or not values or len(values) % count:
+        return None
+    groups = [tuple(values[start : start + count]) for start in range(0, len(values), count)]
+    message = _Message(time, tuple(texts), {"q": groups[0]})
+    letters = ["q", "v", "tau"]
+    if len(header) == len(cells):
+        letters = [letter for name, letter in INTERFACES.items() if f"field.{name}0" in header]
+    if len(letters) == len(groups):
+        message.values = dict(zip(letters, groups))
+    elif len(groups) == 2:
+        message.second = groups[1]
+    elif len(groups) > 2:
+        return None
+    return message
+
+
+def _time(cells: list[str], tool: str) -> str:
+    """Return the time of a row [s] as text, without loss of digits."""
+    if tool == ROS2:
+        return f"{cells[0]}.{int(cells[1]):09d}"
+    nanoseconds = int(cells[2]) if cells[2].isdigit() and int(cells[2]) else int(cells[0])
+    return f"{nanoseconds // 10**9}.{nanoseconds % 10**9:09d}"
+
+
+def _dynamic(message: _Message, cells: list[str]) -> _Message | None:
+    """Return a `DynamicJointState` from its cells behind the joints' names: for each joint its interfaces, then values.
+
+    Args:
+        message: the message without values.
+        cells: the cells.
+    """
+    columns: dict[str, list[str]] = {letter: [] for letter in INTERFACES.values()}
+    start = 0
+    for _ in message.names:
+        count = 0
+        while start + count < len(cells) and _is_name(cells[start + count]):
+            count += 1
+        interfaces = [cell.strip() for cell in cells[start : start + count]]
+        values = cells[start + count : start + 2 * count]
+        if not count or len(values) < count:
+            return None
+        by_interface = dict(zip(interfaces, values))
+        for interface, letter in INTERFACES.items():
+            columns[letter].append(by_interface.get(interface, "").strip())
+        start += 2 * count
+    if start != len(cells):
+        return None
+    for letter, column in columns.items():
+        if any(column):
+            message.values[letter] = tuple(column)
+    return message
+
+
+def _resolved(messages: list[_Message]) -> list[str]:
+    """Assign the second of two quantities in messages to velocity or effort, by the positions' slope; return notes."""
+    by_names: dict[tuple[str, ...], list[_Message]] = {}
+    for message in messages:
+        if message.second:
+            by_names.setdefault(message.names, []).append(message)
+    notes = []
+    for names, group in by_names.items():
+        positions = np.array([message.values["q"] for message in group], dtype=float)
+        second = np.array([message.second for message in group], dtype=float)
+        times = np.array([message.time for message in group], dtype=float)
+        letter = "v" if _is_slope(times, positions, second) else "tau"
+        for message in group:
+            message.values[letter] = message.second
+        quantity = "velocities: they are the slope of the positions" if letter == "v" else "efforts"
+        notes.append(f"the second quantity of {', '.join(names)} is read as {quantity}")
+    return notes
+
+
+def _is_slope(t: np.ndarray, q: np.ndarray, values: np.ndarray) -> bool:
+    """Return whether values (N, n) are the slope of positions q (N, n) at times t (N,), judged on all joints."""
+    if len(t) < 3:
+        return True
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = np.nan_to_num(np.diff(q, axis=0) / np.diff(t)[:, None], posinf=0.0, neginf=0.0)
+    mean = np.nan_to_num((values[1:] + values[:-1]) / 2.0)
+    norm = float(np.linalg.norm(slope) * np.linalg.norm(mean))
+    return norm == 0.0 or float((slope * mean).sum()) > MIN_CORRELATION * norm
+
+
+def _log(messages: list[_Message], notes: list[str]) -> Log:
+    """Return messages as the text of a CSV table; cells of joints that a message does not contain are empty."""
+    joints = dict.fromkeys(name for message in messages for name in message.names)
+    letters = [letter for letter in INTERFACES.values() if any(letter in message.values for message in messages)]
+    columns = [(letter, joint) for letter in letters for joint in joints]
+    log = Log()
+    writer = csv.writer(log)
+    writer.writerow(["t [s]", *(f"{letter}_{joint}" for letter, joint in columns)])
+    for message in messages:
+        by_joint: dict[tuple[str, str], str] = {}
+        for letter, values in message.values.items():
+            by_joint.update({(letter, joint): value for joint, value in zip(message.names, values)})
+        writer.writerow([message.time, *(by_joint.get(column, "") for column in columns)])
+    log.seek(0)
+    counts = Counter(message.names for message in messages)
+    if len(counts) > 1:
+        several = ", ".join(f"{count} of {', '.join(names)}" for names, count in counts.most_common())
+        notes.append(f"messages: {several}")
+    log.notes = tuple(notes)
+    return log

@@ -1,0 +1,110 @@
+"""Friction terms of a script: any function of a joint's velocity or position, with its derivative.
+
+    tau_j += parameter_j · f(v_j)        or        tau_j += parameter_j · f(q_j)
+
+The parameter is identified with all others. The function is made a table (`calib.dynamics.tables`) over the joint's
+range, so that the identified model is data: it is stored, simulated and read back without the function. URDF and MJCF
+have no place for it; exports say so.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from calib.dynamics.drives import DriveTerm, term
+from calib.dynamics.tables import Function, knots_of
+from calib.errors import UsageError, one_of, require
+from calib.robot.chain import Chain, Joint
+
+# Speeds of the table as a multiple of the joint's limit, and for joints without one [rad/s, m/s] (our choice).
+BEYOND_LIMIT = 2.0
+FASTEST = {"revolute": 10.0, "prismatic": 5.0}
+SHAPES = {"velocity": "velocity_table", "position": "position_table"}
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionTerm:
+    """A drive torque per unit of its parameter, as a function with its derivative, for `identify_dynamics`.
+
+        arctan = calib.FrictionTerm("Fa", lambda v: np.arctan(20 * v), lambda v: 20 / (1 + (20 * v) ** 2))
+        calib.identify_dynamics(robot, "log.csv", terms=[arctan])
+
+    Attributes:
+        name: start of the parameters' names; the joint's number follows, such as ``Fa3``.
+        function: of velocities [rad/s or m/s], or positions [rad or m], (N,), that returns (N,) numbers. The unit of
+            the parameter is N m (N for a prismatic joint) per unit of the function.
+        slope: derivative of the function, of the same shapes.
+        of: ``velocity`` or ``position`` of the joint.
+        joints: numbers of the joints that have the term, from 1; None for all.
+
+    Raises:
+        UsageError: a name that is not an identifier, an argument of another kind.
+    """
+
+    name: str
+    function: Function
+    slope: Function
+    of: str = "velocity"
+    joints: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        require(
+            isinstance(self.name, str) and self.name.isidentifier(),
+            f"FrictionTerm: name {self.name!r}: expected letters, digits and _, such as 'Fa'",
+            UsageError,
+        )
+        one_of(self.of, SHAPES, f"FrictionTerm {self.name}: of", UsageError)
+        for role in ("function", "slope"):
+            value = getattr(self, role)
+            require(
+                callable(value), f"FrictionTerm {self.name}: {role}: expected a function, found {value!r}", UsageError
+            )
+
+    @cached_property
+    def _tables(self) -> dict[tuple[float, float], tuple[float, ...]]:
+        """Tables by the ends of their range, as far as they were made."""
+        return {}
+
+    def drive_terms(self, chain: Chain) -> tuple[DriveTerm, ...]:
+        """Return the term of each of its joints as a table.
+
+        Velocities reach to twice the joint's limit, positions over its range. Beyond, the torque is constant.
+
+        Args:
+            chain: the arm, with the limits of its joints.
+
+        Raises:
+            UsageError: a joint that the arm does not have, or a function that is no friction term
+                (`calib.dynamics.tables.knots_of`).
+        """
+        numbers = range(1, chain.n + 1) if self.joints is None else self.joints
+        terms = []
+        for number in numbers:
+            if isinstance(number, bool) or number not in range(1, chain.n + 1):
+                raise UsageError(f"FrictionTerm {self.name}: joint {number!r}: expected a number from 1 to {chain.n}")
+            joint = chain.joints[number - 1]
+            label = f"{self.name}{number}"
+            table = self._table(*self._range(joint), f"FrictionTerm {self.name}, {joint.name}")
+            linear = joint.kind == "prismatic"
+            terms.append(term(label, SHAPES[self.of], number - 1, *table, linear=linear))
+        return tuple(terms)
+
+    def _range(self, joint: Joint) -> tuple[float, float]:
+        """Return the ends of the table: of the joint's speeds, or of its positions."""
+        if self.of == "velocity":
+            fastest = BEYOND_LIMIT * joint.velocity
+            if not math.isfinite(fastest):
+                fastest = FASTEST[joint.kind]
+            return -fastest, fastest
+        turn = math.pi if joint.kind == "revolute" else 1.0
+        lower = joint.lower if math.isfinite(joint.lower) else -turn
+        upper = joint.upper if math.isfinite(joint.upper) else turn
+        return lower, upper
+
+    def _table(self, lower: float, upper: float, what: str) -> tuple[float, ...]:
+        """Return place, value and slope of each knot between lower and upper, one after the other."""
+        if (lower, upper) not in self._tables:
+            knots = knots_of(self.function, self.slope, lower, upper, what)
+            self._tables[lower, upper] = tuple(knots.ravel().tolist())
+        return self._tables[lower, upper]
