@@ -15,6 +15,9 @@ from calib.data.schema import BOUNDS, Column, Joints, Rows, check_travel, joint_
 from calib.errors import MeasurementError, refuse_data, require
 from calib.units import ANGLES, DEG
 
+# offsets of a joint's zero that are tried where values are outside the limits [rad]
+QUARTERS = (math.pi / 2.0, -math.pi / 2.0, math.pi, -math.pi)
+
 
 def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joints) -> tuple[str, ...]:
     """Check joint values (m, n) [rad or m] for plausibility and return notes on unusual but possible values.
@@ -54,6 +57,12 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
         if turns and not sliding[j]:
             there = f"{fault}, {q[row, j] + turns * math.tau:g} rad ({turns:+d} turn) is inside"
             return f"{there}: was the joint wound, or its turn lost? Then add the turn to these rows. Or {otherwise}"
+        for angle in () if sliding[j] else QUARTERS:
+            if not outside(q[:, j] + angle, lower[j], upper[j]).any():
+                question = (
+                    f"does the controller count {joints[j]} from another zero? With {angle / DEG:+g}° all rows fit"
+                )
+                return f"{fault}: {question}. Or {otherwise}"
         return f"{fault}: {otherwise}"
 
     sliding = np.array([kind == "prismatic" for kind in kinds])

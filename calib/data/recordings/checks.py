@@ -408,9 +408,13 @@ def _still(recording: Recording) -> list[str]:
         fixed = np.ptp(recording.q[:, j]) < BOUNDS.min_travel
         travel = "is constant" if fixed else f"moves less than {LIMITS.min_travel:g}"
         effort = f", and so is its {recording.kind}" if dead[j] else ""
+        question = ""
+        if fixed and not dead[j] and stands.sum() == 1:
+            spread = float(recording.effort[:, j].std())
+            question = f"; its {recording.kind} varies by {spread:.3g} (rms): is its position column frozen?"
         notes.append(
             f"{recording.joint_names[j]} never moves (its position {travel}{effort}): parameters that only its "
-            "motion excites cannot be identified from this file"
+            f"motion excites cannot be identified from this file{question}"
         )
     return notes
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.column_changes import MAX_RIVAL_RATIO, Explanation
+from calib.column_changes import Explanation
 from calib.errors import Finding, finding
 from calib.identification.checks.gravity import GravityHypotheses, gravity_of
 from calib.identification.checks.joint_columns import corrected, without_offsets
@@ -16,6 +16,8 @@ from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.robot.chain import Chain
 from calib.units import TORQUE
 
+# share that gravity leaves over that which columns leave, from which on columns are the likelier cause (our choice)
+MIN_BETTER = 1.5
 # of the joints, whose torques start or average at zero: fewer may do so by chance (our choice)
 MIN_TARED = 0.8
 # largest unexplained share with offsets of the torques, as a share of that without (our choice)
@@ -57,7 +59,7 @@ def likelier_gravity(
     """Return the gravity hypotheses, for corrected columns if these explain the training recordings better.
 
     Wrong columns may look like another gravity. The hypothesis that leaves the smaller share of the torques decides;
-    of equal ones it is gravity. Joints with clipped torques do not tell whether gravity is absent.
+    of similar ones it is gravity, and so it is if the alternative is another robot, whose base may be turned. Joints with clipped torques do not tell whether gravity is absent.
 
     Args:
         inputs: robot, recordings and options.
@@ -70,12 +72,12 @@ def likelier_gravity(
     clipped = set()
     for case in inputs.cases:
         explanation = columns.get(case.name)
-        if explanation is not None:
+        if explanation is not None and (explanation.changes[0].joints or hypotheses.direction is None):
             shares.append(explanation.factor)
         for fault in case.motion.faults:
             if fault.kind == "clipped":
                 clipped.add(fault.joint)
-    if shares and (hypotheses.direction is None or min(shares) * MAX_RIVAL_RATIO < hypotheses.factor):
+    if shares and (hypotheses.direction is None or min(shares) * MIN_BETTER < hypotheses.factor):
         hypotheses = gravity_hypotheses(inputs, columns) or hypotheses
     absent = tuple(joint for joint in hypotheses.absent if joint not in clipped)
     return replace(hypotheses, absent=absent)

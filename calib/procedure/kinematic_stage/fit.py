@@ -287,8 +287,10 @@ def _residual_findings(
         notes.append(rigid_misfit)
     notes += _moved_between(selection.nominal.cell, inputs.fit, weighing)
     notes += diagnose(selection.fit, with_changes=not changes)
-    if not any(note.code == "joint-factor" for note in notes):
-        notes += plausibility.joint_scales(selection.fit)
+    with_factor = [change.values.get("joint") for change in changes]
+    for scale in plausibility.joint_scales(selection.fit):
+        if scale.values["joint"] not in with_factor:
+            notes.append(scale)
     notes += image_notes(selection.fit)
     return notes
 
