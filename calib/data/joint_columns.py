@@ -13,7 +13,6 @@ import tomllib
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import filterfalse
 from operator import attrgetter
 from pathlib import Path
@@ -146,13 +145,15 @@ def joints_in(header: Sequence[str], joints: Sequence[str]) -> list[str]:
         header: names of the columns.
         joints: names of joints.
     """
-    columns = list(map(words_of, header))
+    longest = sorted(joints, key=lambda joint: len(words_of(joint)), reverse=True)
     result = []
-    for joint in joints:
-        remainders = map(partial(_without, part=words_of(joint)), columns)
-        if set(remainders) - {None}:
-            result.append(joint)
-    return result
+    for column in header:
+        terms = words_of(column)
+        for joint in longest:
+            if _without(terms, words_of(joint)) is not None:
+                result.append(joint)
+                break
+    return list(dict.fromkeys(result))
 
 
 def mapping_line(series: JointSeries) -> str:

@@ -104,7 +104,7 @@ def numbered_quaternions(names: Sequence[str]) -> list[tuple[Shape, Shape]]:
     """
     pairs = []
     for terms, columns in _numbered(names, ORIENTATION_WORDS, 4).items():
-        w_first = dict(zip(("qw", "qx", "qy", "qz"), columns))
+        w_first: Mapped = dict(zip(("qw", "qx", "qy", "qz"), columns))
         pairs.append((Shape(w_first, terms), Shape(dict(zip(QUATERNION, columns)), terms)))
     return pairs
 
@@ -273,7 +273,7 @@ def _flat_matrix(table: Table, columns: Sequence[str], width: int, terms: tuple[
         last_row = numbers[:, order[3:].ravel()]
         is_pose = rows < 4 or np.abs(last_row - [0.0, 0.0, 0.0, 1.0]).max() < BOUNDS.max_norm_error
         if math.isfinite(defect) and defect < 2 * BOUNDS.max_norm_error and is_pose:
-            elements = {(i, j): columns[order[i, j]] for i in range(rows) for j in range(width)}
+            elements = {(i, j): columns[int(order[i, j])] for i in range(rows) for j in range(width)}
             return _matrix(elements, terms)
     return []
 

@@ -276,8 +276,9 @@ def load_robot(
         header = joint_columns(table)
         columns = dict.fromkeys([*header, *options.for_file(measured).columns])
         names = [column for column in columns if column in joints and joints[column].actuated]
-        if not names:
-            names = joints_in(header, [name for name, joint in joints.items() if joint.actuated])
+        with_words = joints_in(header, [name for name, joint in joints.items() if joint.actuated])
+        if len(with_words) > len(names):
+            names = with_words
         # numbered columns hold more joints than are named
         if f"q{len(names) + 1}" in header:
             names = []
