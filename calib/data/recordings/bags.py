@@ -115,14 +115,18 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
         notes.append(f"{skipped} messages that lack a joint are not used")
     if not parts["header"].any():
         notes.append("message headers have no stamps; the logging times are used, which jitter more")
+    stated_kind = "current" if parts["current"].all() else "torque"
+    optional = {}
+    for field, series in (("v", "v"), ("q_ref", "reference")):
+        if parts[series].size:
+            optional[field] = parts[series]
     return Recording(
         (parts["stamp"] - parts["stamp"][0]) * 1e-9,
         parts["q"],
         parts["effort"],
-        options.kind or ("current" if parts["current"].all() else "torque"),
+        options.kind or stated_kind,
         names,
-        v=parts["v"] if parts["v"].size else None,
-        q_ref=parts["reference"] if parts["reference"].size else None,
+        **optional,
         file=str(path),
         notes=tuple(notes),
     )
