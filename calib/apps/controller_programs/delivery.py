@@ -9,14 +9,15 @@ Each frame is relative to the controller's base or flange (`calib.apps.controlle
 too. Where the pose of that base or flange is not known, no numbers are printed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from calib.apps.controller_programs.frames import ControllerFrame, Description, base_frame, flange_frame
 from calib.apps.controller_programs.targets import number, pose_values
-from calib.toolkit.chains import Controller
+from calib.errors import UsageError
+from calib.toolkit.chains import Axes, Chain, Controller, axes_of
 from calib.toolkit.installations import Installation, read_arms
 from calib.toolkit.result_folders import NoOffsets, open_result, read_exported, read_mastering
 from calib.transforms import invert
@@ -26,7 +27,11 @@ DECIMALS = {"m": 7, "mm": 4}
 
 
 def delivery_text(
-    folder: Path, controller: Controller, world: np.ndarray | None = None, flange: np.ndarray | None = None
+    folder: Path,
+    controller: Controller,
+    world: np.ndarray | None = None,
+    flange: np.ndarray | None = None,
+    external: Sequence[str] = (),
 ) -> str:
     """Return the numbers of a fit that a controller accepts, as text for the person who enters them.
 
@@ -35,6 +40,7 @@ def delivery_text(
         controller: the controller.
         world, flange: (4, 4) poses of the controller's base in the arm's base, and of its flange in the arm's tip, as
             the user specifies them; None: known from the robot's description, or from the controller's rule.
+        external: names of joints that are external axes, where names and kinds do not tell.
 
     Raises:
         UsageError: a folder without a fit.
@@ -45,7 +51,8 @@ def delivery_text(
     fit = folder if fit_folder is None else fit_folder.path
     robot = read_exported(fit, "deliver")
     _, nominal = read_arms(fit)
-    arm = Description.of_fit(fit, nominal.chain)
+    axes = _axes(controller, nominal.chain, external)
+    arm = Description.of_fit(fit, nominal.chain, axes)
     frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)
     verdicts = open_result(fit, "deliver").verdicts
     lines = [f"{controller.title}: calibration of {robot.chain.name}", str(verdicts), ""]
@@ -59,7 +66,7 @@ def delivery_text(
     if not controller.mastered:
         lines.append("Users cannot master the axes of this controller.")
     else:
-        lines += _mastering(fit, controller, frames)
+        lines += _mastering(fit, controller, frames, axes)
     lines.append("")
     for frame in frames:
         if frame.warning:
@@ -67,6 +74,22 @@ def delivery_text(
     lines.append(f"{controller.base}, {controller.flange}: {controller.frames}.")
     lines.append("A tool's angles are nominal where only its position was measured.")
     return "\n".join([*lines, ""])
+
+
+def _axes(controller: Controller, chain: Chain, external: Sequence[str]) -> Axes:
+    """Return an arm's joints as a controller's axes; all of them as the arm's, where none is coupled to another.
+
+    Args:
+        controller: the controller.
+        chain: the arm.
+        external: names of joints that are external axes, where names and kinds do not tell.
+    """
+    try:
+        return axes_of(controller, chain.joints, external)
+    except UsageError:
+        if controller.coupled or external:
+            raise
+        return Axes.plain(chain.joints)
 
 
 def _frames(arm: Installation, controller: Controller, base: ControllerFrame, flange: ControllerFrame) -> Iterator[str]:
@@ -109,13 +132,16 @@ def _written(form: str, controller: Controller, pose: np.ndarray, index: int) ->
     return form.format(*numbers, n=index)
 
 
-def _mastering(fit: Path, controller: Controller, frames: tuple[ControllerFrame, ControllerFrame]) -> Iterator[str]:
-    """Yield one line per axis with the offset to add to the displayed angle, in the controller's unit, and the frames.
+def _mastering(
+    fit: Path, controller: Controller, frames: tuple[ControllerFrame, ControllerFrame], axes: Axes
+) -> Iterator[str]:
+    """Yield one line per axis with the offset to add to the displayed value, in the controller's unit, and the frames.
 
     Args:
         fit: folder of the fit.
         controller: the controller.
         frames: the controller's base and flange, located in the arm's base and tip.
+        axes: the arm's joints as its axes.
     """
     try:
         mastering = read_mastering(fit)
@@ -123,7 +149,9 @@ def _mastering(fit: Path, controller: Controller, frames: tuple[ControllerFrame,
         yield f"Mastering offsets are left out: {reason}."
         return
     yield f"Mastering {mastering}, with frames that belong to it:"
-    for axis, value in enumerate(controller.shown(mastering.offset), 1):
+    shown = axes.shown(controller, mastering.offset)
+    for label, unit, value in zip(axes.labels(), axes.units(controller.unit), shown):
         note = "" if value else " (kept at nominal)"
-        yield f"  axis {axis}: true angle = shown angle {value:+.5f} {controller.unit}{note}"
+        quantity = "angle" if unit == controller.unit else "position"
+        yield f"  {label}: true {quantity} = shown {quantity} {value:+.5f} {unit}{note}"
     yield from _frames(mastering.cell, controller, *frames)

@@ -49,7 +49,7 @@ from calib.apps.joining.stated import check_columns, stated
 from calib.apps.joining.streams import join_streams
 from calib.arguments import checked
 from calib.errors import MeasurementError, UsageError, counted, finding, listing, one_of, refuse_data
-from calib.toolkit.chains import CalibratedChain, Chain, controllers, load_calibrated
+from calib.toolkit.chains import CalibratedChain, Chain, as_described, controllers, load_calibrated
 from calib.toolkit.installations import check_scale
 from calib.toolkit.pose_data import (
     POSITION,
@@ -63,7 +63,7 @@ from calib.toolkit.pose_data import (
     read_table,
 )
 from calib.toolkit.recordings import dataset_table, is_dataset
-from calib.toolkit.result_folders import lines_of
+from calib.toolkit.result_folders import joints_of, lines_of
 
 METHODS = ("name", "time", "row", "geometry", "motion")
 # requirements of each method except motion, for messages
@@ -205,7 +205,7 @@ def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joine
     else:
         pose = np.arange(len(points))
     if chain is not None and by != "time":
-        q, _ = Sheet(joints).joints(chain.joint_names)
+        q, _ = Sheet(joints).joints(joints_of(chain))
         candidates = {} if by == "geometry" else {f"joined by {by}": pose}
         pose, notes = ordered(chain, q, points, candidates)
     else:
@@ -288,7 +288,12 @@ def _refuse_shown(
     for name, controller in controllers().items():
         if not controller.coupled:
             continue
-        if find_order(chain, controller.described(q), measured, candidates) is not None:
+        try:
+            described = as_described(name, q, chain.joints)
+        except UsageError:
+            # this controller has no such arm
+            continue
+        if find_order(chain, described, measured, candidates) is not None:
             refuse_data(
                 points.file,
                 f"its points fit the joints as {controller.title} shows them, not as the description counts them: "

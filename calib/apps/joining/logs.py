@@ -189,7 +189,7 @@ def _by_time(base: Log, added: Log) -> tuple[np.ndarray, np.ndarray, list[str]]:
         refuse_data(added.table.file, message, added.clock)
     order = np.argsort(added.t, kind="stable")
     values = at_times(added.t[order], added.values[order], base.t)
-    rows = np.isfinite(values).any(axis=1)
+    rows = np.asarray(np.isfinite(values).any(axis=1))
     shift = float(np.median(_nearest(added.t[order], base.t[rows])))
     notes = [
         f"{len(base.table)} rows of {base.table.file}, joined by time with {len(added.table)} rows of "

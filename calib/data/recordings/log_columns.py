@@ -105,9 +105,9 @@ def families(header: Sequence[str], joints: Joints) -> list[Family]:
     result = []
     for series in joint_series(header, joints.names, joints.kinds):
         columns = tuple(map(headings.index, series.columns))
-        quantity = series_of(series.words)
+        quantity = series_of(series.terms)
         plain = not quantity and series.is_position and not series.is_commanded
-        result.append(Family(_pattern(series.columns, joints.names), columns, quantity, series.named, plain))
+        result.append(Family(_pattern(series.columns, joints.names), columns, quantity, series.by_name, plain))
     return result
 
 

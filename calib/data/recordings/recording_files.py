@@ -19,7 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.controllers.table import as_described, motors_as_described
+from calib.controllers.axes import as_described, named_joints
+from calib.controllers.table import motors_as_described
 from calib.data.csv_table import Table, read_header, read_table
 from calib.data.joint_columns import words_of
 from calib.data.recordings import log_columns
@@ -433,7 +434,7 @@ def read_recording(
     for name, unit in options.units.items():
         check_units(name, [unit] * len(joints.names if joints else ()), joints, file)
     reader = _reader(Path(file), (start, stop))
-    recording = _described(reader(Path(file), joints, options), options.controller)
+    recording = _described(reader(Path(file), joints, options), options, joints)
     for note in recording.notes:
         if note.startswith("read as"):
             _LOG.info("%s: %s", Path(file).name, note)
@@ -449,25 +450,49 @@ def read_recording(
     return check_recording(earlier(recording, options.lag), joints)
 
 
-def _described(recording: Recording, controller: str) -> Recording:
+def read_at_rest(path: Path, joints: Joints, options: RecordingOptions) -> tuple[Recording, bool]:
+    """Return the rows of a table of joints and torques, and whether they have stamps; values are only checked for gaps.
+
+    Rows without stamps are numbered by t; they may be standing poses.
+
+    Args:
+        path: the table.
+        joints: the robot's joints.
+        options: options for reading the file.
+
+    Raises:
+        MeasurementError: no joint or torque columns, or cells that are no numbers.
+    """
+    try:
+        recording, stamped = read_log(path, joints, options), True
+    except MeasurementError:
+        recording, stamped = read_log(path, joints, replace(options, rate=1.0)), False
+    return _described(recording, options, joints), stamped
+
+
+def _described(recording: Recording, options: RecordingOptions, joints: Joints | None) -> Recording:
     """Return a recording converted from the controller's joint convention to that of the robot's description.
 
     Args:
         recording: the recording.
-        controller: name of the controller; empty: the recording is returned unchanged.
+        options: options with the controller and its external axes; without one, the recording is returned unchanged.
+        joints: the robot's joints; None: all are turning joints of the arm.
     """
+    controller = options.controller
     if not controller:
         return recording
-    series_of = {
-        as_described: ("q", "v", "q_link", "q_ref"),
-        motors_as_described: ("effort", "tau_link", "tau_motor", "tau_ff"),
-    }
+    named = None
+    if joints is not None and len(joints.names) == recording.n:
+        named = named_joints(joints.names, joints.kinds)
     changes: dict[str, object] = {}
-    for conversion, names in series_of.items():
-        for name in names:
-            values = getattr(recording, name)
-            if values is not None:
-                changes[name] = conversion(controller, values)
+    for name in ("q", "v", "q_link", "q_ref"):
+        values = getattr(recording, name)
+        if values is not None:
+            changes[name] = as_described(controller, values, named, options.external)
+    for name in ("effort", "tau_link", "tau_motor", "tau_ff"):
+        values = getattr(recording, name)
+        if values is not None:
+            changes[name] = motors_as_described(controller, values)
     return replace(recording, **changes)
 
 

@@ -8,7 +8,8 @@ import pytest
 
 from calib import cli
 from calib.apps.controller_programs.delivery import delivery_text
-from calib.controllers.table import as_described, controller_named, controllers
+from calib.controllers.axes import as_described
+from calib.controllers.table import controller_named, controllers
 from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.robot.kinematics import forward
 from calib.robot.library import load
