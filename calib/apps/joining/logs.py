@@ -50,15 +50,23 @@ class Log:
     @property
     def names(self) -> list[str]:
         """Names of the columns of numbers, without the times."""
-        columns = zip(self.table.header, self.table.cells)
-        return [name for name, cells in columns if name != self.clock and cells.dtype == float]
+        names = []
+        for name, cells in zip(self.table.header, self.table.cells):
+            if name != self.clock and cells.dtype == float:
+                names.append(name)
+        return names
+
+    @property
+    def values(self) -> np.ndarray:
+        """Cells (N, k) of the columns `names`, NaN where they are empty."""
+        return np.column_stack([self.table.numbers(name, None, gaps=True) for name in self.names])
 
     @property
     def has_positions(self) -> bool:
         """Whether the file's name or one of its columns tells positions."""
         if self.quantity:
             return self.quantity == "q"
-        return any(series_of(words_of(name)) == "q" for name in self.names)
+        return "q" in quantities(self.names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +81,12 @@ class JoinedLogs(Joined):
 
 def is_log(table: Table) -> bool:
     """Return whether a table without points has times, or columns of a quantity of joints."""
-    return bool(clock_of(table)) or any(series_of(words_of(name)) for name in table.header)
+    return bool(clock_of(table)) or bool(quantities(table.header) - {""})
+
+
+def quantities(names: Sequence[str]) -> set[str]:
+    """Return the toolkit's series that names of columns tell; "" for a name that tells none."""
+    return {series_of(words_of(name)) for name in names}
 
 
 def clock_of(table: Table) -> str:
@@ -90,8 +103,10 @@ def log_of(table: Table) -> Log:
     clock = clock_of(table)
     stem = words_of(Path(table.file).stem)
     quantity = series_of(stem)
-    units = [UNIT_WORDS[word] for word in words_of(Path(table.file).stem.lower()) if word in UNIT_WORDS]
-    unit = units[0] if units and units[0].lower() in UNITS.get(quantity, {}) else ""
+    unit = ""
+    for text in words_of(Path(table.file).stem.lower()):
+        if UNIT_WORDS.get(text, "").lower() in UNITS.get(quantity, {}):
+            unit = UNIT_WORDS[text]
     t = seconds(table, clock) if clock else np.zeros(0)
     return Log(table, clock, t, quantity, unit)
 
@@ -132,59 +147,56 @@ def join_logs(first: Table, second: Table, by: str = "") -> JoinedLogs:
     logs = [log_of(first), log_of(second)]
     if logs[1].has_positions and not logs[0].has_positions:
         logs.reverse()
-    base, other = logs
-    if by == "row" or not (base.clock and other.clock):
-        values, rows, notes = _by_row(base, other)
+    base, added = logs
+    if by == "row" or not (base.clock and added.clock):
+        values, rows, notes = _by_row(base, added)
     else:
-        values, rows, notes = _by_time(base, other)
-    names = _names(base, other)
+        values, rows, notes = _by_time(base, added)
+    names = _names(base, added)
     header = ["t", *names[: len(base.names)], *names[len(base.names) :]]
     t = base.t if len(base.t) else np.arange(len(base.table), dtype=float)
-    units = ["s" if len(base.t) else "", *_units(base), *_units(other)]
-    own = [base.table.numbers(name, None, gaps=True)[rows] for name in base.names]
+    units = ["s" if len(base.t) else "", *_units(base), *_units(added)]
     # as texts: times since 1970 have more digits than other numbers are written with
     times = np.array([f"{time:.9f}" for time in t[rows]], dtype=object)
-    cells = (times, *own, *values.T)
+    cells = (times, *base.values[rows].T, *values.T)
     if not len(base.t):
         header, units, cells = header[1:], units[1:], cells[1:]
-    table = Table(other.table.file, tuple(header), tuple(units), tuple(cells), base.table.rows[rows])
-    notes += _mapping(base, names[: len(base.names)]) + _mapping(other, names[len(base.names) :])
+    table = Table(added.table.file, tuple(header), tuple(units), tuple(cells), base.table.rows[rows])
+    notes += _mapping(base, names[: len(base.names)]) + _mapping(added, names[len(base.names) :])
     return JoinedLogs(table, np.flatnonzero(rows), (*first.notes, *second.notes, *notes))
 
 
-def _by_row(base: Log, other: Log) -> tuple[np.ndarray, np.ndarray, list[str]]:
+def _by_row(base: Log, added: Log) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Return the other log's values (m, k), the rows of the base log that are used (N,), and notes; row by row."""
-    count, other_count = len(base.table), len(other.table)
+    count, other_count = len(base.table), len(added.table)
     if count != other_count:
         message = f"has {other_count} rows, {base.table.file} has {count}"
-        refuse_data(other.table.file, f"{message}, and not both have a column of times (t, time): add one of one clock")
-    values = np.column_stack([other.table.numbers(name, None, gaps=True) for name in other.names])
-    return values, np.ones(count, bool), [f"{count} rows, joined by row: are they of the same instants?"]
+        refuse_data(added.table.file, f"{message}, and not both have a column of times (t, time): add one of one clock")
+    return added.values, np.ones(count, bool), [f"{count} rows, joined by row: are they of the same instants?"]
 
 
-def _by_time(base: Log, other: Log) -> tuple[np.ndarray, np.ndarray, list[str]]:
+def _by_time(base: Log, added: Log) -> tuple[np.ndarray, np.ndarray, list[str]]:
     """Return the other log's values (m, k) at the base log's times, the rows that are used (N,), and notes."""
-    start, stop = max(base.t[0], other.t[0]), min(base.t[-1], other.t[-1])
-    shorter = min(np.ptp(base.t), np.ptp(other.t))
+    start, stop = max(base.t[0], added.t[0]), min(base.t[-1], added.t[-1])
+    shorter = min(np.ptp(base.t), np.ptp(added.t))
     if not stop - start >= MIN_OVERLAP * shorter:
-        message = f"its times are {other.t[0]:.10g} to {other.t[-1]:.10g} s, those of {base.table.file} are "
+        message = f"its times are {added.t[0]:.10g} to {added.t[-1]:.10g} s, those of {base.table.file} are "
         message += f"{base.t[0]:.10g} to {base.t[-1]:.10g} s: are both of one clock?"
-        if len(base.table) == len(other.table):
+        if len(base.table) == len(added.table):
             message += " If the rows belong together one by one, join them by row (--by row)"
         else:
             message += " If both logs began at the same instant, let both times begin at 0"
-        refuse_data(other.table.file, message, other.clock)
-    order = np.argsort(other.t, kind="stable")
-    columns = [other.table.numbers(name, None, gaps=True)[order] for name in other.names]
-    values = at_times(other.t[order], np.column_stack(columns), base.t)
-    rows = ~np.isnan(values).all(axis=1)
-    shift = float(np.median(_nearest(other.t[order], base.t[rows])))
+        refuse_data(added.table.file, message, added.clock)
+    order = np.argsort(added.t, kind="stable")
+    values = at_times(added.t[order], added.values[order], base.t)
+    rows = np.asarray(np.isfinite(values).any(axis=1))
+    shift = float(np.median(_nearest(added.t[order], base.t[rows])))
     notes = [
-        f"{len(base.table)} rows of {base.table.file}, joined by time with {len(other.table)} rows of "
-        f"{other.table.file}, interpolated (nearest stamps {1e3 * shift:.3g} ms apart, median)"
+        f"{len(base.table)} rows of {base.table.file}, joined by time with {len(added.table)} rows of "
+        f"{added.table.file}, interpolated (nearest stamps {1e3 * shift:.3g} ms apart, median)"
     ]
     if not rows.all():
-        notes.append(f"{int((~rows).sum())} rows without a sample of {other.table.file} near their times are left out")
+        notes.append(f"{int((~rows).sum())} rows without a sample of {added.table.file} near their times are left out")
     return values[rows], rows, notes
 
 
@@ -194,12 +206,12 @@ def _nearest(t: np.ndarray, times: np.ndarray) -> np.ndarray:
     return np.minimum(np.abs(t[after] - times), np.abs(times - t[after - 1]))
 
 
-def _names(base: Log, other: Log) -> list[str]:
+def _names(base: Log, added: Log) -> list[str]:
     """Return the names of both logs' columns in one table; equal ones are told apart by the files' quantities."""
-    common = [name for name in base.names if name in other.names]
+    common = [name for name in base.names if name in added.names]
     if not common:
-        return [name.lstrip("- ") for name in (*base.names, *other.names)]
-    for log, rival in ((base, other), (other, base)):
+        return [name.lstrip("- ") for name in (*base.names, *added.names)]
+    for log, rival in ((base, added), (added, base)):
         if not log.quantity or log.quantity == rival.quantity:
             message = f"has columns named as those of {rival.table.file}: {listing(common)}"
             refuse_data(
@@ -208,7 +220,7 @@ def _names(base: Log, other: Log) -> list[str]:
                 "its columns",
             )
     names = []
-    for log in (base, other):
+    for log in (base, added):
         names += [_with_quantity(name, log.quantity) if name in common else name for name in log.names]
     return names
 
@@ -228,8 +240,12 @@ def _units(log: Log) -> list[str]:
 
 def _mapping(log: Log, names: Sequence[str]) -> list[str]:
     """Return a note on the columns of a log, by the names that they have in the joined table."""
-    changed = [f"{name} as {new}" for name, new in zip(log.names, names) if name.lstrip("- ") != new]
-    entries = changed or log.names
-    clock = f"times from '{log.clock}', " if log.clock else ""
-    unit = f" [{log.unit}, from the file's name]" if log.unit else ""
-    return [f"{log.table.file}: {clock}columns {listing(entries, MAX_LISTED)}{unit}"]
+    entries = []
+    for name, new in zip(log.names, names):
+        entries.append(new if name.lstrip("- ") == new else f"{name} as {new}")
+    note = f"columns {listing(entries, MAX_LISTED)}"
+    if log.clock:
+        note = f"times from '{log.clock}', {note}"
+    if log.unit:
+        note += f" [{log.unit}, from the file's name]"
+    return [f"{log.table.file}: {note}"]

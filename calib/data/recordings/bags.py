@@ -51,8 +51,6 @@ INTERFACE_NAMES = "control_msgs/msg/InterfacesNames"
 TRAJECTORY_STATE = ("control_msgs/msg/JointTrajectoryControllerState", "control_msgs/JointTrajectoryControllerState")
 # Accepted types, the preferred ones first.
 KINDS = (JOINT_STATE, DYNAMIC_STATE, INTERFACE_VALUES, FRANKA_STATE, TRAJECTORY_STATE)
-# Our series → names of state interfaces of ros2_control.
-INTERFACES = {"q": ("position",), "v": ("velocity",), "effort": ("effort", "torque"), "current": ("current",)}
 # Messages of a topic that are read to see which quantities it has.
 FIRST_MESSAGES = 20
 # Definitions that bags of ROS 2 Humble (sqlite3) leave out: ros-controls/control_msgs, branch humble.
@@ -117,14 +115,18 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
         notes.append(f"{skipped} messages that lack a joint are not used")
     if not parts["header"].any():
         notes.append("message headers have no stamps; the logging times are used, which jitter more")
+    stated_kind = "current" if parts["current"].all() else "torque"
+    optional = {}
+    for field, series in (("v", "v"), ("q_ref", "reference")):
+        if parts[series].size:
+            optional[field] = parts[series]
     return Recording(
         (parts["stamp"] - parts["stamp"][0]) * 1e-9,
         parts["q"],
         parts["effort"],
-        options.kind or ("current" if parts["current"].all() else "torque"),
+        options.kind or stated_kind,
         names,
-        v=parts["v"] if parts["v"].size else None,
-        q_ref=parts["reference"] if parts["reference"].size else None,
+        **optional,
         file=str(path),
         notes=tuple(notes),
     )
@@ -139,13 +141,15 @@ def _with_torques(reader: AnyReader, topic: str, joints: Joints | None, path: Pa
         joints: the robot's joints; None: any.
         path: the bag, for messages.
     """
-    accepted = [connection.msgtype for connection in reader.connections if topic in ("", connection.topic)]
-    kinds = [kind for kind in KINDS if set(kind) & set(accepted)]
-    choices = []
-    any_kind = tuple(chain.from_iterable(KINDS))
-    for kind in kinds or [any_kind]:
-        option = "in the options (--options): recording.topic = '...'"
-        choices.append(connections_of(reader, kind, topic, path, "joint states", option, "/joint_states"))
+    accepted = {connection.msgtype for connection in reader.connections if topic in ("", connection.topic)}
+    option = "in the options (--options): recording.topic = '...'"
+    choices = [
+        connections_of(reader, kind, topic, path, "joint states", option, "/joint_states")
+        for kind in filter(accepted.intersection, KINDS)
+    ]
+    if not choices:
+        any_kind = tuple(chain.from_iterable(KINDS))
+        return connections_of(reader, any_kind, topic, path, "joint states", option)
     for connections in choices:
         if _has_torques(reader, connections, joints):
             return connections
@@ -166,9 +170,10 @@ def _has_torques(reader: AnyReader, connections: list[Connection], joints: Joint
 def _interface_names(reader: AnyReader) -> dict[str, tuple[str, ...]]:
     """Return the names of state interfaces (``elbow/position``) that a broadcaster states once, by its namespace."""
     names: dict[str, tuple[str, ...]] = {}
-    connections = [connection for connection in reader.connections if connection.msgtype == INTERFACE_NAMES]
-    if connections:
-        for connection, _, raw in reader.messages(connections=connections):
+    for connection in reader.connections:
+        if connection.msgtype != INTERFACE_NAMES:
+            continue
+        for _, _, raw in reader.messages(connections=[connection]):
             message: Message = reader.deserialize(raw, connection.msgtype)
             names.setdefault(_namespace(connection), tuple(message.names))
     return names
@@ -215,7 +220,8 @@ def as_joint_state(message: Message, interfaces: Sequence[str] = ()) -> JointSta
 def _first_point(message: Message, names: Sequence[str]) -> Message:
     """Return the first of a message's points that has positions; the first that there is if none has."""
     points = [getattr(message, name) for name in names if hasattr(message, name)]
-    return next((point for point in points if len(point.positions)), points[0])
+    filled = [point for point in points if len(point.positions)]
+    return (filled or points)[0]
 
 
 def _of_interfaces(stamp: int, values_of: Mapping[str, Mapping[str, float]]) -> JointState:
@@ -226,17 +232,17 @@ def _of_interfaces(stamp: int, values_of: Mapping[str, Mapping[str, float]]) -> 
         values_of: joint → name of the interface → value.
     """
     joints = [joint for joint, values in values_of.items() if "position" in values]
-    series = {}
-    for name, interfaces in INTERFACES.items():
-        values = []
-        for joint in joints:
-            present = [values_of[joint][interface] for interface in interfaces if interface in values_of[joint]]
-            values.append(present[0] if present else np.nan)
-        column = np.array(values, dtype=float)
-        series[name] = column if _is_there(column) else np.empty(0)
-    kind = "" if len(series["effort"]) else "current"
-    effort = series["current"] if kind else series["effort"]
-    return JointState(stamp, tuple(joints), series["q"], series["v"], effort, np.empty(0), kind)
+    series = dict.fromkeys(("position", "velocity", "effort", "torque", "current"), np.empty(0))
+    for interface in series:
+        column = np.array([values_of[joint].get(interface, np.nan) for joint in joints])
+        if _is_there(column):
+            series[interface] = column
+    kind, effort = "", series["torque"]
+    if len(series["effort"]):
+        effort = series["effort"]
+    elif not len(effort):
+        kind, effort = "current", series["current"]
+    return JointState(stamp, tuple(joints), series["position"], series["velocity"], effort, np.empty(0), kind)
 
 
 @contextmanager

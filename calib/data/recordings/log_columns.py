@@ -24,7 +24,7 @@ _WORDS = {
     "torque": "tau torque torques trq torq effort efforts eff moment drehmoment couple par coppia 力矩 扭矩",
     "current": "i current currents curr amps strom courant corriente corrente 电流",
 }
-QUANTITIES: Mapping[str, str] = {word: series for series, words in _WORDS.items() for word in words.split()}
+QUANTITIES: Mapping[str, str] = {token: series for series, tokens in _WORDS.items() for token in tokens.split()}
 TIME_WORDS = {"t", "time", "times", "timestamp", "timestamps", "stamp", "clock", "header"}
 TIME_WORDS |= {"zeit", "zeitstempel", "temps", "tiempo", "tempo", "时间"}
 UNITS_OF_TIME = {"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "us": "us", "ns": "ns"}
@@ -47,7 +47,7 @@ FEEDFORWARD = {"ff", "feedforward"}
 # Words of a heading whose values are no measurement of the quantity itself.
 UNREAD = {"error", "errors", "err", "limit", "min", "max", "tolerance", "offset", "std", "sigma", "variance"}
 UNREAD |= {"external", "ext", "estimated", "model", "computed", "output", "acceleration", "accelerations", "hat"}
-# Series with a word of their own: (series of the last word, word) → series.
+# Series with a token of their own: (series of the last token, token) → series.
 SPECIAL = {
     ("torque", "link"): "tau_link",
     ("torque", "sensor"): "tau_link",
@@ -59,9 +59,9 @@ SPECIAL = {
 def time_column(header: Sequence[str]) -> tuple[int, str] | None:
     """Return the index of the column of times and the unit in its name (``timestamp_ns``), "" for none; or None."""
     for column, heading in enumerate(header):
-        words = re.findall(r"[^\W_]+", heading.lower())
-        units = UNITS_OF_TIME.keys() & set(words)
-        time_words = set(words) - units
+        tokens = re.findall(r"[^\W_]+", heading.lower())
+        units = UNITS_OF_TIME.keys() & set(tokens)
+        time_words = set(tokens) - units
         if time_words and len(units) <= 1 and time_words <= TIME_WORDS:
             return column, UNITS_OF_TIME[units.pop()] if units else ""
     return None
@@ -122,9 +122,7 @@ def _pattern(headings: Sequence[str], joints: Sequence[str]) -> str:
     if len(patterns) == 1 and JOINT in min(patterns):
         return patterns.pop()
     start = _common_start(headings)
-    backwards = []
-    for heading in headings:
-        backwards.append(heading[len(start) :][::-1])
+    backwards = [heading[len(start) :][::-1] for heading in headings]
     end = _common_start(backwards)[::-1]
     parts = ""
     for heading in headings:
@@ -133,18 +131,18 @@ def _pattern(headings: Sequence[str], joints: Sequence[str]) -> str:
     return f"{start}{placeholder}{end}"
 
 
-def series_of(words: Sequence[str]) -> str:
-    """Return the toolkit's series that the words of a family or column tell; "" if they do not tell it."""
-    quantities = [QUANTITIES[word] for word in words if word in QUANTITIES]
-    if not quantities or UNREAD & set(words):
+def series_of(tokens: Sequence[str]) -> str:
+    """Return the toolkit's series that the words `tokens` of a family or column tell; "" if they do not tell it."""
+    quantities = [QUANTITIES[token] for token in tokens if token in QUANTITIES]
+    if not quantities or UNREAD & set(tokens):
         return ""
     series = quantities[-1]
-    if FEEDFORWARD & set(words):
+    if FEEDFORWARD & set(tokens):
         return "tau_ff" if series == "torque" else ""
-    if REFERENCE & set(words):
+    if REFERENCE & set(tokens):
         return "q_ref" if series == "q" else ""
-    for (of_series, word), special in SPECIAL.items():
-        if series == of_series and word in words:
+    for (of_series, token), special in SPECIAL.items():
+        if series == of_series and token in tokens:
             return special
     return series
 
@@ -199,12 +197,12 @@ def columns_meant(value: str, header: Sequence[str], joints: Joints) -> tuple[in
         names = [header[column] for column in family.columns]
         if _plain(value) in map(_plain, [family.pattern, *names]):
             return family.columns
-    words = words_of(value.replace(JOINT, " ").replace(NUMBER, " "))
-    series = series_of(words)
-    # as many words as a heading has, without some of the joint's
+    tokens = words_of(value.replace(JOINT, " ").replace(NUMBER, " "))
+    series = series_of(tokens)
+    # as many tokens as a heading has, without some of the joint's
     for family in candidates:
         for column in family.columns:
-            is_part = set(words) <= set(words_of(header[column]))
+            is_part = set(tokens) <= set(words_of(header[column]))
             if series and is_part and family.series == series:
                 return family.columns
     return ()

@@ -12,6 +12,7 @@ their own: ``calib join``.
 
 import logging
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +21,7 @@ import numpy as np
 
 from calib.controllers.axes import as_described, named_joints
 from calib.controllers.table import motors_as_described
-from calib.data.csv_table import Table, read_table
+from calib.data.csv_table import Table, read_header, read_table
 from calib.data.joint_columns import words_of
 from calib.data.recordings import log_columns
 from calib.data.recordings.archives import read_archive
@@ -47,6 +48,8 @@ from calib.units import TIMES
 
 _LOG = logging.getLogger(__name__)
 NO_JOINTS = Joints(())
+# Largest number of files that are looked at for a missing quantity (our choice).
+MAX_BESIDE = 50
 # Letter of the heading of a column that is not looked at.
 HIDDEN = "\0"
 # What a note says of columns without any number.
@@ -275,9 +278,27 @@ def _advice(table: Table, columns_of: dict[str, list[int]], joints: Joints) -> s
         quantities = " and ".join({"q": "positions", "torque": "torques"}[name] for name in needed)
         return (
             f". Are the {quantities} in another file? If its times are of the same clock, join them first: "
-            f"calib join {table.file} OTHER.csv --out log.csv"
+            f"calib join {table.file} {_file_beside(Path(table.file), needed)} --out log.csv"
         )
     return ""
+
+
+def _file_beside(path: Path, needed: Sequence[str]) -> str:
+    """Return the first table in the folder of `path` whose columns or name tell a needed series; ``OTHER.csv`` if none.
+
+    Args:
+        path: the table that lacks them.
+        needed: the toolkit's names of the series.
+    """
+    for candidate in sorted(path.parent.glob("*.csv"))[:MAX_BESIDE]:
+        if candidate.name == path.name:
+            continue
+        with suppress(MeasurementError):
+            header, _ = read_header(candidate)
+            quantities = {log_columns.series_of(words_of(name)) for name in (*header, candidate.stem)}
+            if quantities.intersection(needed):
+                return str(candidate)
+    return "OTHER.csv"
 
 
 def _stamp_column(table: Table, names: Sequence[str]) -> list[int]:

@@ -18,7 +18,8 @@ import csv
 import re
 from collections import Counter
 from dataclasses import dataclass, field
-from itertools import islice
+from functools import cache
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -60,25 +61,23 @@ def translated(path: str | Path) -> Log | None:
         MeasurementError: rows of names without the values of a joint state.
     """
     with open(path, encoding="utf-8-sig", errors="replace", newline="") as file:
-        first_lines = [line for line in islice(iter(lambda: file.readline(LONGEST), ""), FIRST_LINES)]
+        first_lines = [file.readline(LONGEST) for _ in range(FIRST_LINES)]
         tool = _tool(first_lines)
         if not tool:
             return None
         file.seek(0)
-        header = ()
+        header: tuple[str, ...] = ()
         messages = []
         unread = 0
-        for cells in csv.reader(file):
-            if not cells:
-                continue
+        for cells in filter(None, csv.reader(file)):
             if cells[0].startswith("%time"):
                 header = tuple(cells)
                 continue
             message = _message(cells, tool, header)
-            if message is None:
-                unread += 1
-            else:
+            if message is not None:
                 messages.append(message)
+            else:
+                unread += 1
     if not messages:
         refuse_data(path, f"looks like '{tool}', but none of its {unread} rows is a joint state: is it that topic?")
     notes = [f"read as joint states of '{tool}': columns are named by the joints' names in the rows"]
@@ -104,6 +103,11 @@ def _is_name(cell: str) -> bool:
     return bool(cell.strip()) and not is_number(cell) and cell.strip().lower() != "nan"
 
 
+def _first_names(cells: list[str]) -> tuple[str, ...]:
+    """Return the names with which cells begin."""
+    return tuple(map(str.strip, takewhile(_is_name, cells)))
+
+
 def _message(cells: list[str], tool: str, header: tuple[str, ...]) -> _Message | None:
     """Return a row as a message; None if it is no joint state.
 
@@ -116,19 +120,17 @@ def _message(cells: list[str], tool: str, header: tuple[str, ...]) -> _Message |
     if len(cells) <= leading or not cells[0].isdigit() or not cells[1].isdigit():
         return None
     time = _time(cells, tool)
-    count = 0
-    while leading + count < len(cells) and _is_name(cells[leading + count]):
-        count += 1
-    texts = [cell.strip() for cell in cells[leading : leading + count]]
-    interfaces = [position for position, text in enumerate(texts) if text in INTERFACES]
-    if interfaces:
-        names = tuple(texts[: interfaces[0]])
-        return _dynamic(_Message(time, names), cells[leading + interfaces[0] :])
-    values = [cell.strip() for cell in cells[leading + count :]]
+    values = cells[leading:]
+    names = _first_names(values)
+    interfaces = list(takewhile(lambda name: name not in INTERFACES, names))
+    if len(interfaces) < len(names):
+        return _dynamic(_Message(time, tuple(interfaces)), values[len(interfaces) :])
+    count = len(names)
+    values = values[count:]
     if not count or not values or len(values) % count:
         return None
-    groups = [tuple(values[start : start + count]) for start in range(0, len(values), count)]
-    message = _Message(time, tuple(texts), {"q": groups[0]})
+    groups = list(zip(*[iter(values)] * count))
+    message = _Message(time, names, {"q": groups[0]})
     letters = ["q", "v", "tau"]
     if len(header) == len(cells):
         letters = [letter for name, letter in INTERFACES.items() if f"field.{name}0" in header]
@@ -159,10 +161,8 @@ def _dynamic(message: _Message, cells: list[str]) -> _Message | None:
     columns: dict[str, list[str]] = {letter: [] for letter in INTERFACES.values()}
     start = 0
     for _ in message.names:
-        count = 0
-        while start + count < len(cells) and _is_name(cells[start + count]):
-            count += 1
-        interfaces = [cell.strip() for cell in cells[start : start + count]]
+        interfaces = _first_names(cells[start:])
+        count = len(interfaces)
         values = cells[start + count : start + 2 * count]
         if not count or len(values) < count:
             return None
@@ -186,13 +186,14 @@ def _resolved(messages: list[_Message]) -> list[str]:
             by_names.setdefault(message.names, []).append(message)
     notes = []
     for names, group in by_names.items():
-        positions = np.array([message.values["q"] for message in group], dtype=float)
-        second = np.array([message.second for message in group], dtype=float)
-        times = np.array([message.time for message in group], dtype=float)
-        letter = "v" if _is_slope(times, positions, second) else "tau"
+        rows = [(message.time, *message.values["q"], *message.second) for message in group]
+        numbers = np.array(rows, dtype=float)
+        positions, second = np.split(numbers[:, 1:], 2, axis=1)
+        letter, quantity = "tau", "efforts"
+        if _is_slope(numbers[:, 0], positions, second):
+            letter, quantity = "v", "velocities: they are the slope of the positions"
         for message in group:
             message.values[letter] = message.second
-        quantity = "velocities: they are the slope of the positions" if letter == "v" else "efforts"
         notes.append(f"the second quantity of {', '.join(names)} is read as {quantity}")
     return notes
 
@@ -210,21 +211,29 @@ def _is_slope(t: np.ndarray, q: np.ndarray, values: np.ndarray) -> bool:
 
 def _log(messages: list[_Message], notes: list[str]) -> Log:
     """Return messages as the text of a CSV table; cells of joints that a message does not contain are empty."""
-    joints = dict.fromkeys(name for message in messages for name in message.names)
-    letters = [letter for letter in INTERFACES.values() if any(letter in message.values for message in messages)]
-    columns = [(letter, joint) for letter in letters for joint in joints]
-    log = Log()
-    writer = csv.writer(log)
-    writer.writerow(["t [s]", *(f"{letter}_{joint}" for letter, joint in columns)])
-    for message in messages:
-        by_joint: dict[tuple[str, str], str] = {}
-        for letter, values in message.values.items():
-            by_joint.update({(letter, joint): value for joint, value in zip(message.names, values)})
-        writer.writerow([message.time, *(by_joint.get(column, "") for column in columns)])
-    log.seek(0)
     counts = Counter(message.names for message in messages)
+    columns: dict[str, str] = {}
+    for letter in INTERFACES.values():
+        for message in messages:
+            if letter in message.values:
+                columns.update(dict.fromkeys(_headings(letter, message.names), ""))
+    log = Log()
+    writer = csv.DictWriter(log, ["t [s]", *columns], restval="")
+    writer.writeheader()
+    for message in messages:
+        row = {"t [s]": message.time}
+        for letter, values in message.values.items():
+            row.update(zip(_headings(letter, message.names), values))
+        writer.writerow(row)
+    log.seek(0)
     if len(counts) > 1:
-        several = ", ".join(f"{count} of {', '.join(names)}" for names, count in counts.most_common())
-        notes.append(f"messages: {several}")
+        numbers = [f"{count} of {', '.join(names)}" for names, count in counts.most_common()]
+        notes.append(f"messages: {', '.join(numbers)}")
     log.notes = tuple(notes)
     return log
+
+
+@cache
+def _headings(letter: str, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the headings of a quantity's columns of joints."""
+    return tuple(f"{letter}_{name}" for name in names)

@@ -48,6 +48,21 @@ def test_two_logs_become_one(tmp_path, files, headings, reverse):
     assert np.allclose(recording.q, Q[1:], atol=1e-7) and np.allclose(recording.effort, expected, atol=1e-3)
 
 
+def test_proposed_command_joins_the_file_beside(tmp_path):
+    """A log without torques names the file beside it that has them, in a line that works."""
+    paths = []
+    for file, quantity, values in (("a.csv", "position", Q), ("b.csv", "torque", TAU)):
+        header = ["t", *(f"{name} {quantity}" for name in NAMES)]
+        paths.append(table(tmp_path / file, header, T, values))
+    with pytest.raises(MeasurementError) as refusal:
+        read_recording(paths[0], ROBOT)
+    command = str(refusal.value).partition("calib ")[2].split()
+    assert command[:3] == ["join", *map(str, paths)]
+    command[-1] = str(tmp_path / command[-1])
+    assert run(command) == 0
+    assert np.allclose(read_recording(tmp_path / "log.csv", ROBOT).effort, TAU)
+
+
 def test_file_names_tell_quantity_and_unit(tmp_path):
     """Equal names of columns are told apart by the files' names, which may state a unit."""
     header = ["t", *NAMES, "gripper"]
