@@ -111,14 +111,15 @@ def _changes(cell: Installation, block: Positions) -> tuple[np.ndarray, list[Fil
     for joint, element in zip(cell.chain.joint_names, cell.chain.moving):
         groups.append(("zero", joint, [cell.chain.names[element]]))
     residual = np.zeros((0, 3))
+    index = np.arange(len(block))
     changes = []
     for kind, name, parameters in groups:
         columns = np.array([number[parameter] for parameter in parameters])
         part = next(part for part in observe(cell, prepared, columns) if part.label == "position")
         residual = part.value.T
+        index = part.index
         changes.append(_fitted(kind, name, residual, part.jacobian.transpose(2, 1, 0)))
-    growth = block.position[part.index] if len(residual) else block.position
-    changes.append(_fitted("scale", station, residual, growth[:, :, None]))
+    changes.append(_fitted("scale", station, residual, block.position[index][:, :, None]))
     return residual, changes
 
 

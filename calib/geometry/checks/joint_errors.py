@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import minimize_scalar
+from scipy.optimize import fminbound
 
 from calib.data.poses.measurements import Positions
 from calib.errors import Finding, finding
@@ -220,8 +220,8 @@ def _best_ratio(residuals: np.ndarray, shape: np.ndarray) -> tuple[float, float]
     def cost(power: float) -> float:
         return -_likelihood(residuals, shape, 10.0**power / scale)
 
-    best = minimize_scalar(cost, bounds=RATIOS, method="bounded")
-    return float(10.0**best.x / scale), -float(best.fun)
+    power, least, *_ = fminbound(cost, *RATIOS, full_output=True)
+    return float(10.0**power / scale), -float(least)
 
 
 def _covariance_parts(residuals: np.ndarray, shape: np.ndarray, ratio: float) -> tuple[np.ndarray, float]:

@@ -13,7 +13,7 @@ from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar, nnls
+from scipy.optimize import fminbound, nnls
 
 from calib.column_changes import Change, Explanation, best_changes, coupling, couplings, exchange, reversal
 from calib.dynamics.bodies import REVOLUTE, Bodies, bodies_of, standard_parameters
@@ -171,8 +171,7 @@ def _best_factor(columns: Columns, unexplained: Callable[[Columns], np.ndarray],
         return float(np.log(unexplained(scaled(columns))).sum())
 
     start = min(np.log(FACTORS), key=cost)
-    bounds = (start - MAX_FACTOR_STEP, start + MAX_FACTOR_STEP)
-    return float(np.exp(minimize_scalar(cost, bounds=bounds, method="bounded").x))
+    return float(np.exp(fminbound(cost, start - MAX_FACTOR_STEP, start + MAX_FACTOR_STEP)))
 
 
 def _scaling(n: int, joint: int, factor: float) -> np.ndarray:

@@ -59,7 +59,8 @@ def likelier_gravity(
     """Return the gravity hypotheses, for corrected columns if these explain the training recordings better.
 
     Wrong columns may look like another gravity. The hypothesis that leaves the smaller share of the torques decides;
-    of similar ones it is gravity, and so it is if the alternative is another robot, whose base may be turned. Joints with clipped torques do not tell whether gravity is absent.
+    of similar ones it is gravity, and so it is if the alternative is another robot, whose base may be turned.
+    Joints with clipped torques do not tell whether gravity is absent.
 
     Args:
         inputs: robot, recordings and options.
