@@ -54,6 +54,7 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> ParsedT
     """
     from calib.files import check_regular
 
+    data = b""
     try:
         check_regular(path, streams=True)
         with open(path, "rb") as file:

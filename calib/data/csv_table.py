@@ -2,8 +2,9 @@
 
 The separator is tab, semicolon, comma or bar (the first of these that the header contains). It is blanks if the first
 row of numbers, split at blanks, has as many cells as the header. Files are UTF-8 with or without a byte order mark, or
-Windows-1252 (ANSI); the decimal mark is a point. Lines that begin with ``#`` are comments, except for a spreadsheet's error (``#REF!``). If
-only a comment names the columns (numpy's savetxt), the last comment before the numbers is the header.
+Windows-1252 (ANSI); the decimal mark is a point. Lines that begin with ``#`` are comments, except for a spreadsheet's
+error (``#REF!``). If only a comment names the columns (numpy's savetxt), the last comment before the numbers is the
+header.
 """
 
 from __future__ import annotations

@@ -62,7 +62,8 @@ from calib.toolkit.pose_data import (
     read_fit_options,
     read_table,
 )
-from calib.toolkit.result_folders import lines_of
+from calib.toolkit.recordings import dataset_table, is_dataset
+from calib.toolkit.result_folders import joints_of, lines_of
 
 METHODS = ("name", "time", "row", "geometry", "motion")
 # requirements of each method except motion, for messages
@@ -127,13 +128,13 @@ def join(
             raise UsageError("joining by motion needs the nominal arm's path: give --robot")
         return join_streams(joints_file, points_file, robot.complete, _pose_options(options))
     chain = None if robot is None else robot.complete
-    point_table = read_table(points)
+    point_table = _table(points_file)
     if is_program(joints_file):
         joint_table = joints_table(joints_file)
         options = _pose_options(options)
         check_columns(options, [joint_table, point_table], chain)
     else:
-        joint_table = read_table(joints)
+        joint_table = _table(joints_file)
         tables = (joint_table, point_table)
         mapping = _mapping(options)
         if _are_logs(*(with_options(table, mapping) for table in tables)):
@@ -145,6 +146,11 @@ def join(
         joint_table = stated(joint_table, options.for_file(joints_file), chain, holds_joints=True)
     point_table = stated(point_table, options.for_file(points_file), chain, holds_points=True)
     return _joined(joint_table, point_table, by, chain)
+
+
+def _table(path: Path) -> Table:
+    """Return a CSV file, or a LeRobot data set, as a table."""
+    return dataset_table(path) if is_dataset(path) else read_table(path)
 
 
 def _pose_options(options: str | Path | FitOptions | None) -> FitOptions:
@@ -199,7 +205,7 @@ def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joine
     else:
         pose = np.arange(len(points))
     if chain is not None and by != "time":
-        q, _ = Sheet(joints).joints(chain.joint_names)
+        q, _ = Sheet(joints).joints(joints_of(chain))
         candidates = {} if by == "geometry" else {f"joined by {by}": pose}
         pose, notes = ordered(chain, q, points, candidates)
     else:

@@ -142,7 +142,9 @@ def join_logs(first: Table, second: Table, by: str = "") -> JoinedLogs:
     t = base.t if len(base.t) else np.arange(len(base.table), dtype=float)
     units = ["s" if len(base.t) else "", *_units(base), *_units(other)]
     own = [base.table.numbers(name, None, gaps=True)[rows] for name in base.names]
-    cells = (t[rows], *own, *values.T)
+    # as texts: times since 1970 have more digits than other numbers are written with
+    times = np.array([f"{time:.9f}" for time in t[rows]], dtype=object)
+    cells = (times, *own, *values.T)
     if not len(base.t):
         header, units, cells = header[1:], units[1:], cells[1:]
     table = Table(other.table.file, tuple(header), tuple(units), tuple(cells), base.table.rows[rows])

@@ -17,10 +17,16 @@ from calib.toolkit.pose_data import (
     TURN_NAMES,
     FileOptions,
     FitOptions,
+    Joints,
+    Layout,
     Sheet,
     Table,
     orientation,
+    positions_by_shape,
+    with_shape,
+    with_silent_units,
 )
+from calib.toolkit.result_folders import joints_of
 
 # family of columns under which the options may state a unit
 FAMILIES = {
@@ -76,14 +82,43 @@ def stated(
         MeasurementError: header and options state different units.
     """
     joints: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    if holds_points:
+        options, notes = with_point_columns(table, options)
     if holds_joints:
         joints = _joint_columns(table, options, chain)
+    if holds_joints and chain is not None:
+        sheet, joint_notes = with_silent_units(Sheet(table, options), Layout("", joints), joints_of(chain))
+        options, notes = sheet.options, (*notes, *joint_notes)
+    table = replace(table, notes=(*table.notes, *notes))
     if holds_joints and options.controller:
         table = _described(table, options, chain)
         joints = ()
     if holds_points:
         table = _turned(table, options)
     return _renamed(table, options, joints)
+
+
+def with_point_columns(table: Table, options: FileOptions) -> tuple[FileOptions, tuple[str, ...]]:
+    """Return the options with columns mapped that are a position by the shape of their names, and notes.
+
+    A unit that such columns do not state is told from their numbers, as `calib fit` does.
+
+    Args:
+        table: the table of points.
+        options: how it is read.
+    """
+    sheet = Sheet(table, options)
+    if sheet.family(POSITION.names) or sheet.family(POSITION.names, "1"):
+        return options, ()
+    mapped = options.columns.values()
+    shapes = positions_by_shape([name for name in table.header if name not in mapped])
+    if len(shapes) != 1:
+        return options, ()
+    options = with_shape(options, shapes[0])
+    columns = tuple(shapes[0].columns.values())
+    sheet, notes = with_silent_units(Sheet(table, options), Layout("position", (), (columns,)), Joints(()))
+    return sheet.options, notes
 
 
 def _joint_columns(table: Table, options: FileOptions, chain: Chain | None) -> tuple[str, ...]:
@@ -93,7 +128,7 @@ def _joint_columns(table: Table, options: FileOptions, chain: Chain | None) -> t
         UsageError: without an arm, the unit of joints is stated, and no such column is there.
     """
     if chain is not None:
-        return Sheet(table, options).find_joints(chain.joint_names)
+        return Sheet(table, options).find_joints(joints_of(chain))
     names = {heading: name for name, heading in options.columns.items()}
     joints = [heading for heading in table.header if _JOINT.fullmatch(names.get(heading, heading))]
     message = f"the options state the unit of joints, but which of {', '.join(table.header)} are joints is not known"
@@ -114,7 +149,7 @@ def _described(table: Table, options: FileOptions, chain: Chain | None) -> Table
             f"the options state controller = '{options.controller}', whose joints are converted to those of the "
             "robot's description: give --robot"
         )
-    q, names = Sheet(table, options).joints(chain.joint_names)
+    q, names = Sheet(table, options).joints(joints_of(chain))
     note = f"{Path(table.file).name}: {', '.join(names)} read as {options.controller} shows its joints"
     return _exchanged(table, names, chain.joint_names, list(q.T), note)
 

@@ -12,7 +12,7 @@ are compared by these angles first; those that agree are placed (Shah 2013) and 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from calib.errors import refuse_data
 from calib.records import evenly
 from calib.toolkit.installations import direction, median_misfit
-from calib.toolkit.pose_pairs import MAX_METRES, PoseList, PosePairs, poses_of
+from calib.toolkit.pose_pairs import PoseList, PosePairs, poses_of
 from calib.transforms import invert
 from calib.units import DEG, LENGTHS
 
@@ -47,21 +47,21 @@ class Reading:
     """One reading of pairs of poses.
 
     Attributes:
-        robot, seen: (m, 4, 4) poses of the robot and of what was seen.
+        robot, camera: (m, 4, 4) poses of the robot and of what was camera.
         conventions: conventions of both orientations; empty where there is nothing to choose.
         misfit: median misfit, angles included [m].
     """
 
     robot: np.ndarray
-    seen: np.ndarray
+    camera: np.ndarray
     conventions: tuple[str, str]
     misfit: float
 
-    def equals(self, other: Reading) -> bool:
+    def equals(self, reading: Reading) -> bool:
         """Return whether two readings are one, in other words."""
-        same_robot = np.abs(self.robot - other.robot).max() < SAME
-        same_seen = np.abs(self.seen - other.seen).max() < SAME
-        return bool(same_robot and same_seen)
+        same_robot = np.abs(self.robot - reading.robot).max() < SAME
+        same_camera = np.abs(self.camera - reading.camera).max() < SAME
+        return bool(same_robot and same_camera)
 
 
 def agreed(pairs: PosePairs) -> tuple[Reading, list[str]]:
@@ -74,62 +74,59 @@ def agreed(pairs: PosePairs) -> tuple[Reading, list[str]]:
         MeasurementError: several conventions agree about as well, and the file states none.
     """
     robot_position, robot_note = pairs.robot.metres()
-    seen_position, seen_note = pairs.seen.metres()
-    notes = [note for note in (robot_note, seen_note) if note]
+    camera_position, camera_note = pairs.camera.metres()
+    best = _best_reading(pairs, robot_position, camera_position)
+    if not pairs.camera.length_unit and len(pairs) >= MIN_ROWS and not direction(best.robot, best.camera).agrees:
+        for unit in UNITS:
+            reading = _best_reading(pairs, robot_position, pairs.camera.position * LENGTHS[unit])
+            agreement = direction(reading.robot, reading.camera)
+            if agreement.agrees and agreement.is_inverse is not None:
+                best = reading
+                reason = "with which the poses agree (no unit is stated)"
+                camera_note = f"{pairs.camera.title}: the lengths are read as {unit}, {reason}"
+                break
+    notes = list(filter(None, (robot_note, camera_note)))
+    for poses, convention in zip((pairs.robot, pairs.camera), best.conventions):
+        if convention and convention != poses.convention:
+            note = f"{poses.title}: the orientation is read as {convention}, with which the poses agree"
+            if poses.convention:
+                note += f" ({poses.convention} is stated)"
+            notes.append(note)
+    return best, notes
+
+
+def _best_reading(pairs: PosePairs, robot_position: np.ndarray, camera_position: np.ndarray) -> Reading:
+    """Return the reading of the orientations in which poses agree; the stated one unless another agrees clearly better.
+
+    Args:
+        pairs: m pairs of poses.
+        robot_position, camera_position: (m, 3) their positions [m].
+    """
     rows = evenly(len(pairs), MAX_ROWS)
     robot_turns = dict(pairs.robot.readings())
-    seen_turns = dict(pairs.seen.readings())
-    choices = list(_choices(robot_turns, seen_turns, rows))
-    stated = pairs.robot.convention, pairs.seen.convention
-    is_stated = _states(pairs.robot) and _states(pairs.seen)
-    first = choices[0]
+    camera_turns = dict(pairs.camera.readings())
+    choices = list(_choices(robot_turns, camera_turns, rows))
     smallest = min(gap for gap, _ in choices)
     limit = max(MAX_GAP, GAP_RATIO * smallest)
     likely = sorted((choice for choice in choices if choice[0] <= limit), key=lambda choice: choice[0])
     readings = []
-    for _, names in dict.fromkeys([first, *likely[:MAX_PLACED]]):
+    for _, names in dict.fromkeys([choices[0], *likely[:MAX_PLACED]]):
         robot = poses_of(robot_position, robot_turns[names[0]])
-        seen = poses_of(seen_position, seen_turns[names[1]])
-        readings.append(_placed(robot, seen, names, rows))
-    as_stated = readings[0]
+        camera = poses_of(camera_position, camera_turns[names[1]])
+        readings.append(_placed(robot, camera, names, rows))
+    stated_reading = readings[0]
     readings.sort(key=lambda reading: reading.misfit)
     best = readings[0]
-    if is_stated and as_stated.misfit <= CLEAR_RATIO * best.misfit:
-        return _in_likely_unit(pairs, as_stated, notes), notes
-    others = [reading for reading in readings[1:] if not reading.equals(best)]
-    if others and not is_stated:
-        _check_clear(pairs, best, others[0])
-    for poses, convention, name in zip((pairs.robot, pairs.seen), best.conventions, stated):
-        if convention and convention != name:
-            notes.append(
-                f"{poses.name or 'poses'}: the orientation is read as {convention}, with which the poses agree"
-                f"{f' ({name} is stated)' if name else ''}"
-            )
-    return _in_likely_unit(pairs, best, notes), notes
-
-
-def _in_likely_unit(pairs: PosePairs, reading: Reading, notes: list[str]) -> Reading:
-    """Return a reading with the lengths of the poses seen in the unit with which they agree, where none is stated.
-
-    Args:
-        pairs: the pairs.
-        reading: their reading.
-        notes: remarks, to which that on the unit is added.
-    """
-    if pairs.seen.length_unit or len(pairs) < MIN_ROWS or direction(reading.robot, reading.seen).agrees:
-        return reading
-    read_unit = "m" if np.abs(pairs.seen.position).max() <= MAX_METRES else "mm"
-    for unit in UNITS:
-        factor = LENGTHS[unit] / LENGTHS[read_unit]
-        seen = reading.seen.copy()
-        seen[:, :3, 3] *= factor
-        ways = direction(reading.robot, seen)
-        if unit != read_unit and ways.agrees and ways.is_inverse is not None:
-            name = pairs.seen.name or "poses"
-            notes[:] = [note for note in notes if not note.startswith(f"{name}: up to")]
-            notes.append(f"{name}: the lengths are read as {unit}, with which the poses agree (no unit is stated)")
-            return replace(reading, seen=seen)
-    return reading
+    has_conventions = _states(pairs.robot) and _states(pairs.camera)
+    if has_conventions and stated_reading.misfit <= CLEAR_RATIO * best.misfit:
+        return stated_reading
+    if has_conventions:
+        return best
+    for reading in readings[1:]:
+        if not reading.equals(best):
+            _check_clear(pairs, best, reading)
+            break
+    return best
 
 
 def _states(poses: PoseList) -> bool:
@@ -138,14 +135,14 @@ def _states(poses: PoseList) -> bool:
 
 
 def _choices(
-    robot: dict[str, np.ndarray], seen: dict[str, np.ndarray], rows: np.ndarray
+    robot: dict[str, np.ndarray], camera: dict[str, np.ndarray], rows: np.ndarray
 ) -> Iterator[tuple[float, tuple[str, str]]]:
     """Yield for each choice of conventions the median difference of relative rotations [rad], and the conventions."""
     robot_angles = {name: _relative_angles(turns[rows]) for name, turns in robot.items()}
-    seen_angles = {name: _relative_angles(turns[rows]) for name, turns in seen.items()}
-    for robot_name, seen_name in product(robot_angles, seen_angles):
-        difference = np.abs(robot_angles[robot_name] - seen_angles[seen_name])
-        yield float(np.median(difference)), (robot_name, seen_name)
+    camera_angles = {name: _relative_angles(turns[rows]) for name, turns in camera.items()}
+    for robot_name, camera_name in product(robot_angles, camera_angles):
+        difference = np.abs(robot_angles[robot_name] - camera_angles[camera_name])
+        yield float(np.median(difference)), (robot_name, camera_name)
 
 
 def _relative_angles(turns: np.ndarray) -> np.ndarray:
@@ -158,26 +155,25 @@ def _relative_angles(turns: np.ndarray) -> np.ndarray:
     return np.concatenate(angles)
 
 
-def _placed(robot: np.ndarray, seen: np.ndarray, names: tuple[str, str], rows: np.ndarray) -> Reading:
-    """Return a reading with its misfit in the direction of the poses seen in which they agree better."""
-    direct = median_misfit(robot[rows], seen[rows])
-    inverse = median_misfit(robot[rows], invert(seen[rows]))
-    return Reading(robot, seen, names, min(direct, inverse))
+def _placed(robot: np.ndarray, camera: np.ndarray, names: tuple[str, str], rows: np.ndarray) -> Reading:
+    """Return a reading with its misfit in the direction of the poses camera in which they agree better."""
+    direct = median_misfit(robot[rows], camera[rows])
+    inverse = median_misfit(robot[rows], invert(camera[rows]))
+    return Reading(robot, camera, names, min(direct, inverse))
 
 
 def _check_clear(pairs: PosePairs, best: Reading, second: Reading) -> None:
     """Raise MeasurementError if two readings agree about as well, or if there are too few samples to choose."""
     if len(pairs) >= MIN_ROWS and second.misfit > CLEAR_RATIO * best.misfit:
         return
-    words = []
+    texts = []
     for reading in (best, second):
-        names = [
-            f"{poses.name or 'poses'} {name}" for poses, name in zip((pairs.robot, pairs.seen), reading.conventions)
-        ]
-        words.append(f"{' and '.join(names)} ({1e3 * reading.misfit:.3g} mm)")
+        robot_convention, camera_convention = reading.conventions
+        names = f"{pairs.robot.title} {robot_convention} and {pairs.camera.title} {camera_convention}"
+        texts.append(f"{names} ({1e3 * reading.misfit:.3g} mm)")
     refuse_data(
         pairs.file,
         f"the file does not say how its orientations are meant, and {len(pairs)} pairs agree about as well as "
-        f"{words[0]} or as {words[1]}: state the convention in the options (euler = 'vector', 'zyx moving' …), or give "
+        f"{texts[0]} or as {texts[1]}: state the convention in the options (euler = 'vector', 'zyx moving' …), or give "
         "quaternions",
     )

@@ -71,20 +71,20 @@ def measured_pairs(pairs: PosePairs, mounting: str, robot: Chain | None) -> tupl
         arm = invert(arm)
         notes.append(f"the robot's poses are read as its base in its tool: {reason}")
     chain, q = free_flyer(arm, pairs, robot)
-    ways = direction(arm, reading.seen)
-    if ways.agrees and ways.is_inverse is None:
+    agreement = direction(arm, reading.camera)
+    if agreement.agrees and agreement.is_inverse is None:
         refuse_data(
             pairs.file,
-            f"{count} pairs agree both as they are ({1e3 * ways.direct:.3g} mm) and as their inverse "
-            f"({1e3 * ways.inverse:.3g} mm), so they do not determine the placements: measure 12 poses, with the wrist "
-            "turned by 90° and more about two axes between them",
+            f"{count} pairs agree both as they are ({1e3 * agreement.direct:.3g} mm) and as their inverse "
+            f"({1e3 * agreement.inverse:.3g} mm), so they do not determine the placements: measure 12 poses, with the "
+            "wrist turned by 90° and more about two axes between them",
         )
     block = Poses(
         q,
         POSE_JOINTS,
-        reading.seen[:, :3, 3],
-        to_quaternion(reading.seen),
-        mounting=mounting or _mounting_by_name(pairs, bool(ways.is_inverse)),
+        reading.camera[:, :3, 3],
+        to_quaternion(reading.camera),
+        mounting=mounting or _mounting_by_name(pairs, bool(agreement.is_inverse)),
         file=pairs.file,
         rows=pairs.rows,
         station=Path(pairs.file).stem,
@@ -94,13 +94,13 @@ def measured_pairs(pairs: PosePairs, mounting: str, robot: Chain | None) -> tupl
 
 
 def _is_board_in_camera(pairs: PosePairs) -> bool | None:
-    """Return whether the poses seen are those of the board in the camera, if their name says so."""
-    of, frame = pairs.seen.frames
+    """Return whether the poses camera are those of the board in the camera, if their name says so."""
+    of, frame = pairs.camera.frames
     if of & BOARD_WORDS and frame & LENS_WORDS:
         return True
     if of & LENS_WORDS and frame & BOARD_WORDS:
         return False
-    return True if pairs.seen.name.lower() in EASY_HANDEYE else None
+    return True if pairs.camera.name.lower() in EASY_HANDEYE else None
 
 
 def _mounting_by_name(pairs: PosePairs, inverse: bool) -> str:
@@ -108,7 +108,7 @@ def _mounting_by_name(pairs: PosePairs, inverse: bool) -> str:
 
     Args:
         pairs: the pairs, whose robot poses are those of the tool in the base.
-        inverse: whether the poses seen agree as their inverse.
+        inverse: whether the poses camera agree as their inverse.
     """
     board_in_camera = _is_board_in_camera(pairs)
     if board_in_camera is None:
@@ -125,7 +125,7 @@ def _robot_is_inverse(pairs: PosePairs, reading: Reading, mounting: str) -> str:
     if not mounting or board_in_camera is None:
         return ""
     expected = board_in_camera == (mounting == IN_HAND)
-    if expected == bool(direction(reading.robot, reading.seen).is_inverse):
+    if expected == bool(direction(reading.robot, reading.camera).is_inverse):
         return ""
     carried = "camera" if mounting == IN_HAND else "board"
     return f"only so the poses agree with an arm that carries the {carried} (easy_handeye stores them like this)"

@@ -18,13 +18,14 @@ from calib.apps.controller_programs.program import joints_table
 from calib.apps.controller_programs.targets import is_program
 from calib.apps.joining.joined import Joined
 from calib.apps.joining.joining import join
-from calib.apps.joining.stated import stated
+from calib.apps.joining.stated import stated, with_point_columns
 from calib.errors import CalibError, UsageError, counted, listing, require
 from calib.toolkit.chains import CalibratedChain, Chain, toml_table, toml_text
 from calib.toolkit.pose_data import (
     POSITION,
     FileOptions,
     FitOptions,
+    Layout,
     Sheet,
     Table,
     check_joints,
@@ -32,6 +33,7 @@ from calib.toolkit.pose_data import (
     read_fit_options,
     read_measurements,
     read_table,
+    with_silent_units,
 )
 from calib.toolkit.result_folders import joints_of
 from calib.toolkit.sessions import BROUGHT, POSES, UNSEEN, Session, chain_of, open_session
@@ -160,13 +162,16 @@ def _part(table: Table, options: FileOptions, chain: Chain, name: str, message: 
     problems = {}
     contents = {}
     try:
-        columns = sheet.find_joints(chain.joint_names)
+        columns = sheet.find_joints(joints_of(chain))
+        sheet, _ = with_silent_units(sheet, Layout("", columns), joints_of(chain))
         contents[JOINTS] = f"{len(table)} rows of joint values: {listing(columns)}"
-        q, _ = sheet.joints(chain.joint_names)
+        q, _ = sheet.joints(joints_of(chain))
         check_joints(q, sheet, columns, joints_of(chain))
     except CalibError as error:
         problems[JOINTS] = _message(error, Path(table.file))
     try:
+        point_options, _ = with_point_columns(table, options)
+        sheet = Sheet(table, point_options)
         columns = sheet.family(POSITION.names) or sheet.family(POSITION.names, "1")
         if columns:
             contents[POINTS] = f"{len(table)} points: {listing(columns)}"

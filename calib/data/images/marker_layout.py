@@ -67,23 +67,23 @@ def layout_words(image: np.ndarray, board: Board) -> str:
     ids, pixels = markers(image, board.dictionary)
     if len(ids) < MIN_MARKERS:
         return ""
-    seen = f"{len(ids)} markers of {board.dictionary} are seen, but not where board.toml has them"
-    for candidate, words in _candidates(board):
+    count = f"{len(ids)} markers of {board.dictionary} are seen, but not where board.toml has them"
+    for candidate, cause in _candidates(board):
         if candidate.tags > ids.max() and _explains(candidate, ids, pixels):
             values = f"columns = {candidate.columns}, rows = {candidate.rows}"
             if candidate.legacy:
                 values += ", legacy = true"
-            return f"{seen}: {words}; they fit {values}: state this in board.toml"
+            return f"{count}: {cause}; they fit {values}: state this in board.toml"
     for columns in range(2, MAX_COLUMNS + 1):
         rows = -(-int(ids.max() + 1) * (2 if board.kind == "charuco" else 1) // columns) + 1
         for legacy in (False, True):
             candidate = _sized(board, columns, rows + rows % 2, legacy)
             if columns != board.columns and _explains(candidate, ids, pixels):
                 return (
-                    f"{seen}: they fit a board of {columns} columns (board.toml: {board.columns}): count its squares "
+                    f"{count}: they fit a board of {columns} columns (board.toml: {board.columns}): count its squares "
                     "across and down"
                 )
-    return f"{seen}: are kind, columns and rows (squares, not inner corners) those of the print?"
+    return f"{count}: are kind, columns and rows (squares, not inner corners) those of the print?"
 
 
 def _candidates(board: Board) -> Iterator[tuple[Board, str]]:
@@ -96,11 +96,11 @@ def _candidates(board: Board) -> Iterator[tuple[Board, str]]:
         (rows + 1, columns + 1, f"{EXCHANGED}, and {INNER}"),
     )
     for legacy in (False, True):
-        for width, height, words in sizes:
+        for width, height, difference in sizes:
             candidate = _sized(board, width, height, legacy)
             if legacy and not has_two_patterns(candidate):
                 continue
-            causes = [words, OLD_PATTERN if legacy else ""]
+            causes = [difference, OLD_PATTERN if legacy else ""]
             yield candidate, ", and ".join(cause for cause in causes if cause)
 
 

@@ -21,6 +21,7 @@ columns of padding, joints [deg] last; 18 to 21 columns for six joints. A reflec
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -63,14 +64,14 @@ def _is_robodk(header: Sequence[str]) -> bool:
     Args:
         header: names of the columns; fewer than those of a point count, too.
     """
-    if not recognises(header) or len(header) > WIDTHS[0] and len(header) not in WIDTHS:
+    if not recognises(header) or (len(header) > WIDTHS[0] and len(header) not in WIDTHS):
         return False
-    words = [words_of(name) for name in header[6:]]
-    if any(not COMMANDED_WORDS.isdisjoint(name) for name in words):
+    term_lists = list(map(words_of, header[6:]))
+    if not COMMANDED_WORDS.isdisjoint(chain(*term_lists)):
         return False
     is_pose = len(header) == WIDTHS[-1] or _plain("".join(header[9:10])) in _POSE_MARKS
     axes = "xyz" if is_pose else "xyzxyz"
-    return all(axis in (name[-1][-1], name[-1][0]) for name, axis in zip(words, axes))
+    return all(axis in (name[-1][-1], name[-1][0]) for name, axis in zip(term_lists, axes))
 
 
 def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:

@@ -57,14 +57,16 @@ def arrangements(path: str | Path, joints: int, options: FileOptions) -> tuple[T
         return None
     choices = {}
     for names in _orders(table, numbers, joints):
-        columns = {ours: column for ours, column in names.items() if ours}
+        columns = {standard_names: column for standard_names, column in names.items() if standard_names}
         heading = [""] * len(table.header)
-        for ours, column in columns.items():
-            heading[table.header.index(column)] = ours
+        for standard_names, column in columns.items():
+            heading[table.header.index(column)] = standard_names
         for index, name in enumerate(table.header):
             heading[index] = heading[index] or name
         choices[",".join(heading)] = replace(options, columns={**columns, **options.columns})
-    return (table, choices) if choices else None
+    if not choices:
+        return None
+    return table, choices
 
 
 def _orders(table: Table, numbers: Sequence[str], joints: int) -> Iterator[dict[str, str]]:
@@ -78,11 +80,11 @@ def _orders(table: Table, numbers: Sequence[str], joints: int) -> Iterator[dict[
     q = tuple(f"q{number}" for number in range(1, joints + 1))
     counted = _is_counter(table.cells[table.header.index(numbers[0])])
     for target in TARGETS:
-        for ours in ((*target, *q), (*q, *target)):
-            if len(ours) == len(numbers):
-                yield dict(zip(ours, numbers))
-            elif counted and len(ours) == len(numbers) - 1:
-                yield dict(zip(ours, numbers[1:]))
+        for standard_names in ((*target, *q), (*q, *target)):
+            if len(standard_names) == len(numbers):
+                yield dict(zip(standard_names, numbers))
+            elif counted and len(standard_names) == len(numbers) - 1:
+                yield dict(zip(standard_names, numbers[1:]))
 
 
 def _is_counter(values: np.ndarray) -> bool:

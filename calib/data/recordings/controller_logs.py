@@ -72,7 +72,7 @@ def translated(path: str | Path) -> Log | None:
 
 
 def with_decimal_points(path: str | Path) -> Log | None:
-    """Return a table with decimal commas, parted by another mark, with points instead; None if it has no such commas."""
+    """Return a table that has decimal commas, and another separator, with points instead; None for other tables."""
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         head = file.readline(LONGEST)
         while head.startswith("#") or (head and not head.strip()):

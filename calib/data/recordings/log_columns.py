@@ -8,6 +8,7 @@ reference, or columns that are not read. Of several topics with positions, the f
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 from calib.data.csv_table import Table
 from calib.data.joint_columns import joint_series, words_of
@@ -59,10 +60,10 @@ def time_column(header: Sequence[str]) -> tuple[int, str] | None:
     """Return the index of the column of times and the unit in its name (``timestamp_ns``), "" for none; or None."""
     for column, heading in enumerate(header):
         words = re.findall(r"[^\W_]+", heading.lower())
-        units = [UNITS_OF_TIME[word] for word in words if word in UNITS_OF_TIME]
-        others = [word for word in words if word not in UNITS_OF_TIME]
-        if others and len(units) <= 1 and TIME_WORDS.issuperset(others):
-            return column, "".join(units)
+        units = UNITS_OF_TIME.keys() & set(words)
+        time_words = set(words) - units
+        if time_words and len(units) <= 1 and time_words <= TIME_WORDS:
+            return column, UNITS_OF_TIME[units.pop()] if units else ""
     return None
 
 
@@ -74,20 +75,20 @@ class Family:
         pattern: the headings, with ``{joint}`` in place of the joint's name or ``{n}`` in place of its number.
         columns: indices of the columns, in the order of the robot's joints, or of the numbers.
         series: the toolkit's name of the quantity; empty if the words do not tell it.
-        named: whether the columns have the joints' names, not only numbers.
+        by_name: whether the columns have the joints' names, not only numbers.
         plain: whether the names are those of joints, without a word for a quantity (``elbow``, ``A1``).
     """
 
     pattern: str
     columns: tuple[int, ...]
     series: str
-    named: bool = True
+    by_name: bool = True
     plain: bool = False
 
     @property
     def topic(self) -> str:
         """The pattern without the words of the quantity: equal for all quantities of one message."""
-        names = [word for word in re.split(r"[\W_]+", self.pattern) if word.lower() not in QUANTITIES]
+        names = [name for name in re.split(r"[\W_]+", self.pattern) if name.lower() not in QUANTITIES]
         return "/".join(names)
 
 
@@ -100,15 +101,13 @@ def families(header: Sequence[str], joints: Joints) -> list[Family]:
     """
     if not joints.names:
         return []
-    index_of: dict[str, int] = {}
-    for column, heading in enumerate(header):
-        index_of.setdefault(heading, column)
+    headings = list(header)
     result = []
     for series in joint_series(header, joints.names, joints.kinds):
-        columns = tuple(index_of[heading] for heading in series.columns)
-        quantity = series_of(series.words)
+        columns = tuple(map(headings.index, series.columns))
+        quantity = series_of(series.terms)
         plain = not quantity and series.is_position and not series.is_commanded
-        result.append(Family(_pattern(series.columns, joints.names), columns, quantity, series.named, plain))
+        result.append(Family(_pattern(series.columns, joints.names), columns, quantity, series.by_name, plain))
     return result
 
 
@@ -119,23 +118,27 @@ def _pattern(headings: Sequence[str], joints: Sequence[str]) -> str:
         headings: the heading of each joint's column.
         joints: the joints' names.
     """
-    patterns = {heading.replace(joint, JOINT) for heading, joint in zip(headings, joints)}
+    patterns = set(map(str.replace, headings, joints, [JOINT] * len(joints)))
     if len(patterns) == 1 and JOINT in min(patterns):
         return patterns.pop()
     start = _common_start(headings)
-    backwards = [heading[len(start) :][::-1] for heading in headings]
+    backwards = []
+    for heading in headings:
+        backwards.append(heading[len(start) :][::-1])
     end = _common_start(backwards)[::-1]
-    parts = [heading[len(start) : len(heading) - len(end)] for heading in headings]
-    placeholder = NUMBER if all(part.isdigit() for part in parts) else JOINT
+    parts = ""
+    for heading in headings:
+        parts += heading[len(start) : len(heading) - len(end)]
+    placeholder = NUMBER if parts.isdigit() else JOINT
     return f"{start}{placeholder}{end}"
 
 
 def series_of(words: Sequence[str]) -> str:
     """Return the toolkit's series that the words of a family or column tell; "" if they do not tell it."""
-    quantity = next((word for word in reversed(words) if word in QUANTITIES), "")
-    if not quantity or UNREAD & set(words):
+    quantities = [QUANTITIES[word] for word in words if word in QUANTITIES]
+    if not quantities or UNREAD & set(words):
         return ""
-    series = QUANTITIES[quantity]
+    series = quantities[-1]
     if FEEDFORWARD & set(words):
         return "tau_ff" if series == "torque" else ""
     if REFERENCE & set(words):
@@ -167,18 +170,20 @@ def chosen(candidates: Sequence[Family]) -> tuple[dict[str, Family], tuple[str, 
     for family in candidates:
         by_topic.setdefault(family.topic, set()).add(family.series)
     complete = [topic for topic, series in by_topic.items() if "q" in series and series & {"torque", "current"}]
-    ordered = sorted(candidates, key=lambda family: (family.topic not in complete[:1], not family.named))
+    ranked: dict[tuple[bool, bool], list[Family]] = {}
+    for family in candidates:
+        ranked.setdefault((family.topic not in complete[:1], not family.by_name), []).append(family)
     families_by_series: dict[str, Family] = {}
     rivals = []
-    for family in ordered:
+    for family in chain.from_iterable(ranked[rank] for rank in sorted(ranked)):
         first = families_by_series.setdefault(family.series, family)
-        if family.series and first is not family and first.named == family.named:
+        if family.series and first is not family and first.by_name == family.by_name:
             rivals.append(family.pattern)
     families_by_series.pop("", None)
     return families_by_series, tuple(rivals)
 
 
-def stated(value: str, header: Sequence[str], joints: Joints) -> tuple[int, ...]:
+def columns_meant(value: str, header: Sequence[str], joints: Joints) -> tuple[int, ...]:
     """Return the columns that a user means by `value`, in the order of the joints; () if it is none of the families.
 
     Accepted are a pattern (``- {joint}_position``), the heading of any joint's column, with or without punctuation, and
@@ -191,13 +196,16 @@ def stated(value: str, header: Sequence[str], joints: Joints) -> tuple[int, ...]
     """
     candidates = families(header, joints)
     for family in candidates:
-        if _plain(value) in (_plain(family.pattern), *(_plain(header[column]) for column in family.columns)):
+        names = [header[column] for column in family.columns]
+        if _plain(value) in map(_plain, [family.pattern, *names]):
             return family.columns
     words = words_of(value.replace(JOINT, " ").replace(NUMBER, " "))
+    series = series_of(words)
     # as many words as a heading has, without some of the joint's
     for family in candidates:
         for column in family.columns:
-            if words and set(words) <= set(words_of(header[column])) and family.series == series_of(words) != "":
+            is_part = set(words) <= set(words_of(header[column]))
+            if series and is_part and family.series == series:
                 return family.columns
     return ()
 
@@ -217,25 +225,35 @@ def paste(header: Sequence[str], joints: Joints, needed: Sequence[str]) -> str:
         joints: the robot's joints.
         needed: the toolkit's names of the series.
     """
-    patterns = [family.pattern for family in families(header, joints) if not family.series]
-    headings = [heading for heading in header if not heading.startswith("\0")]
-    entries = []
+    count = len(joints.names)
+    groups: dict[int, str] = {}
+    together: set[int] = set()
+    for family in families(header, joints):
+        if not family.series:
+            groups[min(family.columns)] = family.pattern
+            together.update(family.columns)
+    by_series: dict[str, list[int]] = {}
+    for column, heading in enumerate(header):
+        if not heading.startswith("\0") and column not in together:
+            by_series.setdefault(series_of(words_of(heading)), []).append(column)
+    unknown = by_series.get("", [])
+    entries: list[str] = []
     for series in needed:
-        if patterns:
-            entries.append(f'{series} = "{patterns.pop(0)}"')
-        elif not entries and len(joints.names) and len(headings) >= len(joints.names) * len(needed):
-            entries += _joint_by_joint(headings, len(joints.names), needed)
-            break
+        columns = by_series.get(series, [])
+        first_group = min(groups, default=len(header))
+        if count and len(columns) >= count:
+            entries += _joint_by_joint(series, header, columns[:count])
+        elif count and len(unknown) >= count and unknown[0] < first_group:
+            entries += _joint_by_joint(series, header, unknown[:count])
+            unknown = unknown[count:]
+        elif groups:
+            entries.append(f'{series} = "{groups.pop(first_group)}"')
     return f"columns = {{ {', '.join(entries)} }}" if entries else ""
 
 
-def _joint_by_joint(headings: Sequence[str], count: int, needed: Sequence[str]) -> list[str]:
-    """Return entries of the options' [columns] for each series and joint, in the order of the headings."""
-    entries = []
-    remaining = iter(headings)
-    for series in needed:
-        entries += [f'{series}{number} = "{next(remaining)}"' for number in range(1, count + 1)]
-    return entries
+def _joint_by_joint(series: str, header: Sequence[str], columns: Sequence[int]) -> list[str]:
+    """Return entries of the options' [columns] for a series, with one column per joint."""
+    return [f'{series}{number} = "{header[column]}"' for number, column in enumerate(columns, 1)]
 
 
 def mapping_line(header: Sequence[str], joints: Joints, columns_of: Mapping[str, Sequence[int]]) -> str:
@@ -249,15 +267,13 @@ def mapping_line(header: Sequence[str], joints: Joints, columns_of: Mapping[str,
     pattern_of = {family.columns: family.pattern for family in families(header, joints)}
     entries = []
     for series in SYNONYMS:
-        columns = columns_of.get(series, ())
-        if not columns:
-            continue
-        names = [header[column] for column in columns]
-        pattern = pattern_of.get(tuple(columns), names[0] if len(names) == 1 else "")
-        if pattern:
-            entries.append(f'{series} = "{pattern}"')
+        columns = tuple(columns_of.get(series, ()))
+        if columns in pattern_of:
+            entries.append(f'{series} = "{pattern_of[columns]}"')
+        elif len(columns) == 1:
+            entries.append(f'{series} = "{header[columns[0]]}"')
         else:
-            entries += [f'{series}_{number} = "{name}"' for number, name in enumerate(names, 1)]
+            entries += _joint_by_joint(series, header, columns)
     return f"columns = {{ {', '.join(entries)} }}"
 
 
@@ -282,9 +298,10 @@ def condensed(header: Sequence[str], joints: Joints, columns: Sequence[int]) -> 
 def near_names(value: str, header: Sequence[str], joints: Joints) -> str:
     """Return what the file has instead of `value`, for messages: the most similar pattern, then all patterns."""
     patterns = [family.pattern for family in families(header, joints)]
-    listed = ", ".join(f"'{pattern}'" for pattern in patterns)
-    near = suggestion(value, [*patterns, *header])
-    return f"{near}; groups of columns, one per joint: {listed}" if listed else near
+    hint = suggestion(value, [*patterns, *header])
+    if patterns:
+        hint += f"; groups of columns, one per joint: {', '.join(map(repr, patterns))}"
+    return hint
 
 
 def joint_keys(columns: Mapping[str, str], joints: Joints, table: Table) -> dict[str, dict[int, str]]:

@@ -1,9 +1,13 @@
-"""Recordings from files: NumPy archives, CSV tables or ROS bags, recognised by their first bytes.
+"""Recordings from files: NumPy archives, CSV tables, ROS bags or LeRobot data sets, by their first bytes.
 
 A CSV table has one column of stamps, one per joint and quantity (``q1 [deg]``, ``tau_elbow [Nm]``). A quantity's name
 (`recording_options`) is before or after the joint's number or name, with or without a ``_`` (``q1``, ``q_1``,
-``position_elbow``, ``elbow_position``, ``J1 pos``; ``q[1]`` has a number, not a unit); numbers start at 0 or 1. What
-bags hold: ``calib formats logs``.
+``position_elbow``, ``elbow_position``, ``J1 pos``; ``q[1]`` has a number, not a unit); numbers start at 0 or 1. Other
+names are told by their words (``/joint_states/elbow/position`` of PlotJuggler, ``A1 current [mA]``, ``Winkel A1``), and
+said as a line ``columns = { … }``, which options files take. Rows without positions (of other topics) are left out;
+quantities that are NaN in every row are not provided. Times without a unit that can be no seconds are read in the only
+plausible one. Bags, data sets, and what ROS's tools print: ``calib formats logs``. Positions and torques in files of
+their own: ``calib join``.
 """
 
 import logging
@@ -21,6 +25,7 @@ from calib.data.joint_columns import words_of
 from calib.data.recordings import log_columns
 from calib.data.recordings.archives import read_archive
 from calib.data.recordings.checks import check_recording
+from calib.data.recordings.datasets import dataset_table, is_dataset
 from calib.data.recordings.recording import Ends, Recording, earlier, in_pieces, named, parse_cut, rows_used
 from calib.data.recordings.recording_options import (
     MEASURED,
@@ -42,6 +47,8 @@ from calib.units import TIMES
 
 _LOG = logging.getLogger(__name__)
 NO_JOINTS = Joints(())
+# Letter of the heading of a column that is not looked at.
+HIDDEN = "\0"
 # What a note says of columns without any number.
 ABSENT = "not provided, NaN or empty in every row"
 
@@ -57,7 +64,7 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
         options: options for reading the file.
         ends: begin and end of the part to read; None: no bound.
     """
-    table = _numbered_brackets(read_table(path, doubles=True))
+    table = dataset_table(path) if is_dataset(path) else _numbered_brackets(read_table(path, doubles=True))
     robot_joints = joints or NO_JOINTS
     joint_names = robot_joints.names
     columns_of, column_notes = _find_columns(table, options, robot_joints)
@@ -212,7 +219,7 @@ def _hide(header: list[str], columns: Sequence[int]) -> str:
     """Replace the headings of columns that the logger did not provide by unique blanks; return a note on them."""
     headings = ", ".join(header[column] for column in columns)
     for column in columns:
-        header[column] = "\0" * (column + 1)
+        header[column] = HIDDEN * (column + 1)
     return f"{ABSENT}: {headings}"
 
 
@@ -232,10 +239,10 @@ def _stated_columns(table: Table, options: RecordingOptions, joints: Joints) -> 
             columns = _stamp_column(table, [heading])
         elif "{" not in heading:
             columns = _joint_columns(table, [heading], joints.names)
-        columns = columns or list(log_columns.stated(heading, table.header, joints))
+        columns = columns or list(log_columns.columns_meant(heading, table.header, joints))
         if not columns:
-            near = log_columns.near_names(heading, table.header, joints)
-            table.fail(f"no columns are named '{heading}' ({name}){near}; found: {', '.join(table.header)}")
+            hint = log_columns.near_names(heading, table.header, joints)
+            table.fail(f"no columns are named '{heading}' ({name}){hint}; found: {', '.join(table.header)}")
         columns_of[name] = columns
     of_joints = {key: heading for key, heading in options.columns.items() if key not in SYNONYMS}
     for name, by_joint in log_columns.joint_keys(of_joints, joints, table).items():
@@ -258,14 +265,16 @@ def _advice(table: Table, columns_of: dict[str, list[int]], joints: Joints) -> s
     read_columns: set[int] = set()
     for columns in columns_of.values():
         read_columns.update(columns)
-    header = ["\0" * (column + 1) if column in read_columns else name for column, name in enumerate(table.header)]
+    header = list(table.header)
+    for column in read_columns:
+        header[column] = HIDDEN * (column + 1)
     line = log_columns.paste(header, joints, needed)
     if line:
         return f". If these are meant, state them in the options (--options FILE), joints in this order: {line}"
     if columns_of.keys() - {"t"}:
-        other = " and ".join("positions" if name == "q" else "torques" for name in needed)
+        quantities = " and ".join({"q": "positions", "torque": "torques"}[name] for name in needed)
         return (
-            f". Are the {other} in another file? If its times are of the same clock, join them first: "
+            f". Are the {quantities} in another file? If its times are of the same clock, join them first: "
             f"calib join {table.file} OTHER.csv --out log.csv"
         )
     return ""
@@ -476,6 +485,8 @@ def _reader(path: Path, ends: Ends) -> Reader:
     try:
         if path.exists():
             check_regular(path)
+        if is_dataset(path) and path.exists():
+            return partial(read_log, ends=ends)
         if path.is_dir() or path.suffix in (".bag", ".mcap", ".db3"):
             from calib.data.recordings.bags import read_bag
 

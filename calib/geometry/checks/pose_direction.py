@@ -121,7 +121,7 @@ def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurem
 
     Args:
         chain: the nominal arm.
-        block: measurements of any kind; only full poses are tried both ways.
+        block: measurements of any kind; only full poses are tried both agreement.
     """
     if not isinstance(block, Poses) or block.lever is not None or block.base is not None:
         return block
@@ -129,12 +129,13 @@ def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurem
     if len(rows) < MIN_ROWS:
         return block
     arm = forward(chain, block.q[rows])
-    ways = direction(arm, from_quaternion(block.position[rows], block.quaternion[rows]))
-    if not ways.is_inverse:
+    agreement = direction(arm, from_quaternion(block.position[rows], block.quaternion[rows]))
+    if not agreement.is_inverse:
         return block
     note = (
-        f"the poses agree as their inverse ({1e3 * ways.inverse:.3g} mm, as they are {1e3 * ways.direct:.3g} mm, median "
-        "misfit): read as what stands (board) seen from what the arm carries (camera)"
+        f"the poses agree as their inverse ({1e3 * agreement.inverse:.3g} mm, as they are "
+        f"{1e3 * agreement.direct:.3g} mm, median misfit): read as what stands (board) seen from what the arm carries "
+        "(camera)"
     )
     if not block.mounting:
         note += "; if the arm carries the board, state [camera] mounting = 'to hand' in the options"
@@ -154,7 +155,7 @@ def parted_set_up(chain: Chain, block: PoseMeasurements) -> list[Finding]:
         return []
     arm = forward(chain, block.q)
     measured = from_quaternion(block.position, block.quaternion)
-    whole = _rms_misfit(arm, measured)
+    together = _rms_misfit(arm, measured)
     cuts = range(MIN_PART, len(arm) - MIN_PART + 1)
     squares = []
     for cut in cuts:
@@ -162,8 +163,8 @@ def parted_set_up(chain: Chain, block: PoseMeasurements) -> list[Finding]:
         after = _rms_misfit(arm[cut:], measured[cut:])
         squares.append(cut * before**2 + (len(arm) - cut) * after**2)
     best = int(np.argmin(squares))
-    apart = float(np.sqrt(squares[best] / len(arm)))
-    if apart > MAX_LEFT * whole or apart > MAX_SHARE * _motion(arm):
+    parted = float(np.sqrt(squares[best] / len(arm)))
+    if parted > MAX_LEFT * together or parted > MAX_SHARE * _motion(arm):
         return []
     cut = cuts[best]
     station, tool = place_pose(arm[:cut], measured[:cut])
@@ -186,8 +187,8 @@ def parted_set_up(chain: Chain, block: PoseMeasurements) -> list[Finding]:
             last=rows[cut - 1],
             next=rows[cut],
             end=rows[-1],
-            apart=apart,
-            together=whole,
+            apart=parted,
+            together=together,
             changed=changed,
             angle=angle,
             shift=shift,

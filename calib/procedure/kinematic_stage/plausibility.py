@@ -42,6 +42,8 @@ SQUARES = " (square size of the board)"
 # too, and a gear with another number of teeth is off by more (our choice)
 SURE_SCALE = 5.0
 LEAST_SCALE = {"prismatic": 5e-5, "revolute": 2e-3}
+# of a rigid misfit, where the data name none
+USUAL_CAUSES = "flexibility, gear errors or a moved target"
 # number of images by which the scale is judged
 MAX_IMAGES = 100
 
@@ -76,7 +78,15 @@ def misfit(selection: ModelSelection, reach: float) -> Finding | None:
     if min(rigid.cross_validated, fitted) <= healthy:
         return None
     left = selection.cross_validated / healthy
-    return finding("rigid-misfit", rms=fitted, folds=rigid.cross_validated, reach=reach, healthy=healthy, left=left)
+    return finding(
+        "rigid-misfit",
+        rms=fitted,
+        folds=rigid.cross_validated,
+        reach=reach,
+        healthy=healthy,
+        left=left,
+        causes=USUAL_CAUSES,
+    )
 
 
 def gross_rows(selection: ModelSelection, robust: ModelSelection, reach: float) -> Finding | None:

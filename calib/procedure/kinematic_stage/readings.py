@@ -46,11 +46,11 @@ def decided(chain: Chain, undecided: Undecided, joints: Joints) -> list[PoseMeas
         raise faults[0]
     if not scores or min(scores) > 1.0:
         raise undecided
-    best, *others = np.argsort(scores, kind="stable").tolist()
-    if others and scores[others[0]] < MIN_RATIO * scores[best]:
+    best, *rivals = np.argsort(scores, kind="stable").tolist()
+    if rivals and scores[rivals[0]] < MIN_RATIO * scores[best]:
         raise undecided
     says, options = readings[best]
-    note = f"read with {says}: the arm agrees with this reading and contradicts the {len(others)} others"
+    note = f"read with {says}: the arm agrees with this reading and contradicts the {len(rivals)} others"
     blocks = read_measurements(table, joints, options)
     return [replace(block, notes=(note, *block.notes)) for block in blocks]
 

@@ -126,6 +126,18 @@ def test_columns_of_any_name_are_stated_in_options(tmp_path, arm, q):
         calib.join(log, points, options=options)
 
 
+def test_systematic_names_need_no_options(tmp_path, arm, q):
+    """Joints by number and positions by the shape of their names are read as `calib fit` reads them, units too."""
+    log = write(tmp_path / "j.csv", [f"A{k}" for k in range(1, 8)], np.degrees(q))
+    header = ["Punkt", "tracker pos X", "tracker pos Y", "tracker pos Z"]
+    points = write(tmp_path / "p.csv", header, ([f"P{k + 1}", *seen(arm, q)[k]] for k in SHUFFLED))
+    joined = calib.join(log, points, robot="lwr4plus")
+    assert any("joined by geometry" in note for note in joined.notes)
+    assert any("tracker pos Z read as x, y, z" in note for note in joined.notes)
+    np.testing.assert_allclose(1e3 * joined.table.numbers("x", "length"), seen(arm, q)[joined.poses, 0], rtol=1e-9)
+    np.testing.assert_allclose(joined.table.numbers("A3", "angle"), q[joined.poses, 2], atol=1e-9)
+
+
 def test_joints_as_a_controller_shows_them(tmp_path):
     """Joint values as a FANUC shows them are named as such, and converted where the options say so."""
     robot = Path(__file__).parents[1] / "controller_programs/fanuc_m20ia.urdf"
