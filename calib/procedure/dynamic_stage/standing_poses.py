@@ -329,7 +329,8 @@ def fitted(chain: Chain, options: IdentifyOptions, poses: Sequence[StandingPoses
     columns = [_regressor(model, block)[..., base.kept] for block in poses]
     W = np.concatenate(columns)
     torque = np.concatenate([block.torque for block in poses])
-    sided = all(block.approach is not None for block in poses)
+    approaches = [block.approach for block in poses if block.approach is not None]
+    sided = len(approaches) == len(poses)
     count, n = torque.shape
     if W.shape[0] * n < ROWS * base.b:
         needed = int(np.ceil(ROWS * base.b / n))
@@ -339,7 +340,7 @@ def fitted(chain: Chain, options: IdentifyOptions, poses: Sequence[StandingPoses
             poses[0].name,
         )
     if sided:
-        approach = np.concatenate([block.approach for block in poses])
+        approach = np.concatenate(approaches)
         W = np.concatenate([W, approach[:, :, None] * np.eye(n)], axis=2)
     values, covariance, residual = _least_squares(W, torque)
     friction = np.quantile(np.abs(residual), 0.95, axis=0), np.full(n, np.nan)
@@ -367,6 +368,8 @@ def _least_squares(W: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.nd
     count, n, b = W.shape
     sigma = np.ones(n)
     sizes = np.maximum(np.linalg.norm(W.reshape(-1, b), axis=0), 1e-12)
+    values, residual = np.zeros(b), torque
+    inverse = np.zeros((b, count * n))
     for _ in range(ROUNDS):
         weighted = (W / sizes / sigma[:, None]).reshape(-1, b)
         inverse = np.linalg.pinv(weighted)
