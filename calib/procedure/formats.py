@@ -46,7 +46,8 @@ TOPICS: Mapping[str, tuple[str, str]] = {
     ),
     "recordings": (
         "recordings of motion, for calib identify",
-        "calib.data.recordings.recording_options calib.data.recordings.recording_files calib.data.recordings.archives",
+        "calib.data.recordings.recording_options calib.data.recordings.recording_files calib.data.recordings.archives "
+        "calib.procedure.dynamic_stage.standing_poses",
     ),
     "images": (
         "a folder of images of a board, its board.toml, camera.yaml, corners.csv",

@@ -53,6 +53,10 @@ TABLES = (".csv", ".txt", ".tsv", ".dat")
 MAX_BYTES = 50_000_000
 # [rad or m], [s] a joint stands where it moves by less for longer; share of the rows that stand in a standing log
 STILL, STANDING, SHARE = 1e-3, 0.5, 0.95
+# of a table without stamps: more rows than this, with steps of less than this share of their spread, are a motion
+MAX_POSES, SMOOTH = 200, 0.05
+# [rad/s or m/s] a standing joint has no larger velocity
+MAX_SPEED = 0.01
 # [rad or m] poses that differ by less are one, fitted or held out together
 SAME = 0.02
 # share of the poses that is held out where no file is
@@ -234,9 +238,20 @@ def stand(
         except MeasurementError:
             # said by the reader of recordings
             return False
+        if not stamped and _moves(recording):
+            return False
         if stamped and not len(_standing_rows(recording)):
             return False
     return True
+
+
+def _moves(recording: Recording) -> bool:
+    """Return whether rows without stamps follow each other as those of a motion do, or have velocities."""
+    if recording.v is not None and np.abs(recording.v).max() > MAX_SPEED:
+        return True
+    spread = np.linalg.norm(recording.q - recording.q.mean(axis=0), axis=1).mean()
+    steps = np.linalg.norm(np.diff(recording.q, axis=0), axis=1)
+    return len(recording.q) > MAX_POSES and steps.mean() < SMOOTH * spread
 
 
 def _standing_rows(recording: Recording) -> list[np.ndarray]:
@@ -314,7 +329,8 @@ def fitted(chain: Chain, options: IdentifyOptions, poses: Sequence[StandingPoses
     columns = [_regressor(model, block)[..., base.kept] for block in poses]
     W = np.concatenate(columns)
     torque = np.concatenate([block.torque for block in poses])
-    sided = all(block.approach is not None for block in poses)
+    approaches = [block.approach for block in poses if block.approach is not None]
+    sided = len(approaches) == len(poses)
     count, n = torque.shape
     if W.shape[0] * n < ROWS * base.b:
         needed = int(np.ceil(ROWS * base.b / n))
@@ -324,7 +340,7 @@ def fitted(chain: Chain, options: IdentifyOptions, poses: Sequence[StandingPoses
             poses[0].name,
         )
     if sided:
-        approach = np.concatenate([block.approach for block in poses])
+        approach = np.concatenate(approaches)
         W = np.concatenate([W, approach[:, :, None] * np.eye(n)], axis=2)
     values, covariance, residual = _least_squares(W, torque)
     friction = np.quantile(np.abs(residual), 0.95, axis=0), np.full(n, np.nan)
@@ -352,6 +368,8 @@ def _least_squares(W: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.nd
     count, n, b = W.shape
     sigma = np.ones(n)
     sizes = np.maximum(np.linalg.norm(W.reshape(-1, b), axis=0), 1e-12)
+    values, residual = np.zeros(b), torque
+    inverse = np.zeros((b, count * n))
     for _ in range(ROUNDS):
         weighted = (W / sizes / sigma[:, None]).reshape(-1, b)
         inverse = np.linalg.pinv(weighted)

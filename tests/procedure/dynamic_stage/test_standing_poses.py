@@ -152,6 +152,9 @@ def test_a_log_that_stands_is_averaged_and_one_that_moves_is_not(tmp_path, arm):
     with log.open("w", newline="") as file:
         csv.writer(file).writerows([head, *table.tolist()])
     assert not stand(urdf, [str(log)], None, None, None)
+    # a motion without stamps is asked for its rate, as before
+    moving = write(tmp_path / "moving.csv", table[:, 1:8], table[:, 8:])
+    assert not stand(urdf, [moving], None, None, None)
 
 
 @pytest.mark.parametrize(
