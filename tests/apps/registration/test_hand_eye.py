@@ -281,3 +281,12 @@ def test_reported_case(name):
     """The public reports' pairs give the camera at 30, -60, 45 mm."""
     carried, _ = calib.hand_eye(CASE / "arm.urdf", CASE / name).transforms
     assert 1e3 * carried.pose[:3, 3] == pytest.approx([30.0, -60.0, 45.0], abs=0.6)
+
+
+def test_other_commands_name_pairs(tmp_path):
+    """A fit refuses pairs of poses by naming the command that takes them; hand-eye without a file says what it needs."""
+    path = table(tmp_path / "pairs.csv", *sampled(0))
+    with pytest.raises(CalibError, match="15 pairs of poses .* and no joints: calib hand-eye"):
+        calib.tool("ur5", path)
+    with pytest.raises(UsageError, match="a robot and measured poses are needed"):
+        calib.hand_eye("ur5")
