@@ -325,7 +325,7 @@ def hand_eye(
     file_options = options if isinstance(options, FitOptions) else read_fit_options(options)
     sources = _listed(measured)
     if not sources and isinstance(robot, (str, Path)) and Path(robot).is_file() and not is_urdf(Path(robot)):
-        sources = [Path(robot)]
+        sources.append(Path(robot))
         robot = None
     pairs = _read_pairs(sources, file_options)
     if pairs:
@@ -342,7 +342,10 @@ def _listed(measured: Several) -> list[Path | PoseMeasurements]:
         return [Path(measured)]
     if isinstance(measured, PoseMeasurements):
         return [measured]
-    return [Path(source) if isinstance(source, str) else source for source in measured]
+    sources = list[Path | PoseMeasurements]()
+    for source in measured:
+        sources += _listed(source)
+    return sources
 
 
 def _read_pairs(sources: list[Path | PoseMeasurements], options: FitOptions) -> list[PosePairs]:
