@@ -285,9 +285,9 @@ def test_reported_case(name):
 
 
 def test_other_commands_name_pairs(tmp_path):
-    """A fit refuses pairs of poses by naming the command that takes them; hand-eye without a file says what it needs."""
+    """A fit refuses pairs of poses by naming the command that takes them; hand-eye without files says what it needs."""
     path = table(tmp_path / "pairs.csv", *sampled(0))
-    with pytest.raises(CalibError, match="15 pairs of poses .* and no joints: calib hand-eye"):
+    with pytest.raises(CalibError, match=r"15 pairs of poses .* and no joints: calib hand-eye"):
         calib.tool("ur5", path)
     with pytest.raises(UsageError, match="a robot and measured poses are needed"):
         calib.hand_eye("ur5")
