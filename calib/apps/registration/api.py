@@ -19,7 +19,7 @@ from calib.apps.registration.pairs import measured_pairs
 from calib.apps.registration.settings import DEFAULT_PLACEMENT, PlacementSettings
 from calib.errors import UsageError
 from calib.records import as_subclass
-from calib.toolkit.chains import CalibratedChain, controller_named, load_calibrated, resolve
+from calib.toolkit.chains import CalibratedChain, controller_named, is_urdf, load_calibrated, resolve
 from calib.toolkit.installations import FRAME_AXES
 from calib.toolkit.pose_data import FitOptions, PoseMeasurements, read_fit_options
 from calib.toolkit.pose_pairs import IN_HAND, TO_HAND, PosePairs, read_pairs
@@ -324,16 +324,14 @@ def hand_eye(
     """
     file_options = options if isinstance(options, FitOptions) else read_fit_options(options)
     sources = _listed(measured)
-    if not sources and isinstance(robot, (str, Path)):
-        sources = [Path(robot)]
+    if not sources and isinstance(robot, (str, Path)) and Path(robot).is_file() and not is_urdf(Path(robot)):
+        sources.append(Path(robot))
         robot = None
     pairs = _read_pairs(sources, file_options)
     if pairs:
         return _of_pairs(robot, pairs, settings, file_options, base, tip, progress)
     if robot is None or not sources:
-        raise UsageError(
-            "a robot and measured poses are needed; only pairs of poses (robot and board) do without robot"
-        )
+        raise UsageError("a robot and measured poses are needed; only a file of pairs of poses does without robot")
     fit = tool(robot, sources, settings, options=file_options, base=base, tip=tip, progress=progress)
     return as_subclass(fit, HandEye)
 
@@ -344,7 +342,10 @@ def _listed(measured: Several) -> list[Path | PoseMeasurements]:
         return [Path(measured)]
     if isinstance(measured, PoseMeasurements):
         return [measured]
-    return [Path(source) if isinstance(source, str) else source for source in measured]
+    sources = list[Path | PoseMeasurements]()
+    for source in measured:
+        sources += _listed(source)
+    return sources
 
 
 def _read_pairs(sources: list[Path | PoseMeasurements], options: FitOptions) -> list[PosePairs]:

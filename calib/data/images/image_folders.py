@@ -146,10 +146,11 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
     if stored.is_file():
         times = [file.stat().st_mtime for file in (*images, path / BOARD)]
         newest = max(times)
-        detection = read_corners(stored, board)
-        all_stored = all(image.name in detection.images for image in images)
-        if all_stored and stored.stat().st_mtime >= newest:
-            return detection
+        # with another board, the stored corners may be none of it
+        if stored.stat().st_mtime >= newest:
+            detection = read_corners(stored, board)
+            if all(image.name in detection.images for image in images):
+                return detection
     if not images:
         missing = "images"
         if len(names) == 1:

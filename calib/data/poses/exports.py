@@ -151,11 +151,13 @@ def translated(path: str | Path) -> InstrumentExport | None:
 def unnamed_table(path: str | Path) -> Table | None:
     """Return a file of numbers without a row of names as a table with columns ``column 1``, ``column 2`` ….
 
-    None for a file with names.
+    None for a file with names, and for what is no regular file, which reading the header refuses.
 
     Args:
         path: the file.
     """
+    if not Path(path).is_file():
+        return None
     with open(path, "rb") as file:
         content = file.read(HEAD)
         encoding = encoding_of(content)

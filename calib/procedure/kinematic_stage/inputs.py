@@ -1,6 +1,7 @@
 """Inputs of a fit: the robot, the rows to fit, and the held-out rows."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 
 from calib.data.images.pixels import Pixels
 from calib.data.joint_columns import joints_in
+from calib.data.pose_pairs.reading import read_pairs
 from calib.data.poses import JOINTS, is_image_folder
 from calib.data.poses.columns import Undecided
 from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
@@ -370,6 +372,9 @@ def read_file(
                 blocks = read_measurements(path, joints, file_options)
             except Undecided as undecided:
                 blocks = decided(chain, undecided, joints)
+            except MeasurementError:
+                _refuse_pairs(path, file_options)
+                raise
 
     result = []
     for block in blocks:
@@ -384,6 +389,19 @@ def read_file(
         check_scale(block, chain)
         check_orientations(chain, block)
     return [replace(block, torque=gravity_of(chain, block.q)) for block in result]
+
+
+def _refuse_pairs(path: Path, options: FileOptions) -> None:
+    """Raise MeasurementError for a file with pairs of poses, which do not say the joints; return for other files."""
+    pairs = None
+    with suppress(MeasurementError):
+        pairs = read_pairs(path, options)
+    if pairs is not None:
+        raise MeasurementError(
+            f"has {len(pairs)} pairs of poses ({pairs.robot.title}, {pairs.camera.title}) and no joints: calib "
+            "hand-eye places camera and board by them; all else needs joint values",
+            path,
+        )
 
 
 def gravity_of(chain: Chain, q: np.ndarray) -> np.ndarray | None:

@@ -18,7 +18,7 @@ from calib.errors import CalibError, UsageError
 CASE = DATA / "cases/13_hand_eye_pose_pairs"
 
 
-def motion(rotation: Rotation, position: object) -> np.ndarray:
+def motion(rotation: Rotation, position: np.ndarray | list[float]) -> np.ndarray:
     matrix = np.eye(4)
     matrix[:3, :3] = rotation.as_matrix()
     matrix[:3, 3] = position
@@ -126,7 +126,8 @@ def test_detector_poses_with_joints_are_read_as_their_inverse(tmp_path, capsys):
 )
 def test_conventions_and_units_are_found_by_what_agrees(tmp_path, forms, names, mm):
     """Conventions of orientations, and units, that a file does not state are those with which the poses agree."""
-    path = table(tmp_path / "pairs.csv", *sampled(3), forms, names, mm)
+    robot, seen = sampled(3)
+    path = table(tmp_path / "pairs.csv", robot, seen, forms, names, mm)
     carried, standing = calib.hand_eye(None, path).transforms
     assert carried.name == "camera in tool" and standing.name == "board in base"
     assert np.abs(off(carried, CARRIED)[:3]).max() < 5e-4 and np.abs(off(standing, BOARD)[:3]).max() < 5e-4
@@ -281,3 +282,12 @@ def test_reported_case(name):
     """The public reports' pairs give the camera at 30, -60, 45 mm."""
     carried, _ = calib.hand_eye(CASE / "arm.urdf", CASE / name).transforms
     assert 1e3 * carried.pose[:3, 3] == pytest.approx([30.0, -60.0, 45.0], abs=0.6)
+
+
+def test_other_commands_name_pairs(tmp_path):
+    """A fit refuses pairs of poses by naming the command that takes them; hand-eye without files says what it needs."""
+    path = table(tmp_path / "pairs.csv", *sampled(0))
+    with pytest.raises(CalibError, match=r"15 pairs of poses .* and no joints: calib hand-eye"):
+        calib.tool("ur5", path)
+    with pytest.raises(UsageError, match="a robot and measured poses are needed"):
+        calib.hand_eye("ur5")
