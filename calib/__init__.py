@@ -29,6 +29,8 @@ if TYPE_CHECKING:
     from calib.api.kinematic import GeometryFit, PoseSelection, fit_geometry, select_poses
     from calib.api.motions import ExcitationDesign, MotionPlan, design_excitation, plan_motion
     from calib.api.reading import load, read_poses, read_recording
+    from calib.api.result_table import ResultTable
+    from calib.api.sweeps import sweep
     from calib.apps.compensation.api import JointCommands, compensate
     from calib.apps.fleet.fleet import run_sessions
     from calib.apps.joining.joining import join
@@ -43,6 +45,9 @@ if TYPE_CHECKING:
     from calib.results.result import Result
     from calib.results.result_classes import open_result
     from calib.robot.calibrated import CalibratedChain
+    from calib.simulation.cell import SimulatedInstrument
+    from calib.simulation.population import PlantedArm, population
+    from calib.simulation.virtual_cells import PlantedErrors
 
 # names that `import calib` provides, and their modules, which are loaded at first use to keep `calib --help` fast
 _HOMES = {
@@ -50,6 +55,8 @@ _HOMES = {
     "api.kinematic": ("select_poses", "fit_geometry", "PoseSelection", "GeometryFit"),
     "api.motions": ("design_excitation", "plan_motion", "ExcitationDesign", "MotionPlan"),
     "api.dynamic": ("identify_dynamics", "methods", "DynamicsModel"),
+    "api.sweeps": ("sweep",),
+    "api.result_table": ("ResultTable",),
     "api.exporting": ("validate", "export"),
     "procedure.session.commands": ("new_session",),
     "apps.fleet.fleet": ("run_sessions",),
@@ -64,6 +71,9 @@ _HOMES = {
     "procedure.excitation.settings": ("ExcitationSettings", "PlanSettings"),
     "identification.identify_options": ("IdentifySettings",),
     "identification.friction.friction_terms": ("FrictionTerm",),
+    "simulation.population": ("population", "PlantedArm"),
+    "simulation.virtual_cells": ("PlantedErrors",),
+    "simulation.cell": ("SimulatedInstrument",),
     "errors": ("CalibError",),
 }
 
@@ -88,6 +98,8 @@ __all__ = [  # noqa: RUF022 (in the order of use)
     "compensate",
     "new_session",
     "run_sessions",
+    "population",
+    "sweep",
     "CalibratedChain",
     "PoseSelection",
     "GeometryFit",
@@ -96,12 +108,16 @@ __all__ = [  # noqa: RUF022 (in the order of use)
     "DynamicsModel",
     "JointCommands",
     "Result",
+    "ResultTable",
     "SelectionSettings",
     "FitSettings",
     "ExcitationSettings",
     "PlanSettings",
     "IdentifySettings",
     "FrictionTerm",
+    "PlantedArm",
+    "PlantedErrors",
+    "SimulatedInstrument",
     "CalibError",
 ]
 

@@ -54,6 +54,7 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> ParsedT
     """
     from calib.files import check_regular
 
+    data = b""
     try:
         check_regular(path, streams=True)
         with open(path, "rb") as file:
@@ -67,7 +68,10 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> ParsedT
         raise error(f"{path}: is nested too deeply: more than {MAX_LEVELS} levels") from None
     except ValueError as cause:  # of tomllib, of the decoder, of a number with thousands of digits, of a name with NUL
         reason = "a whole number with thousands of digits" if "digits" in str(cause) else cause
-        raise error(f"{path}: is not a TOML file: {reason}") from cause
+        hint = ""
+        if re.search(r'"[A-Za-z]:\\[^\\]', data.decode(errors="replace")):
+            hint = "; write Windows paths with /, or in single quotes: 'C:\\cells\\robot.urdf'"
+        raise error(f"{path}: is not a TOML file: {reason}{hint}") from cause
     _check_size(tables, str(path), error)
     return tables
 

@@ -230,6 +230,8 @@ class Real(_Read):
         if (self.least is None or value >= self.least) and (self.most is None or value <= self.most):
             return ""
         hint = " (are these mm, or degrees?)" if self.unit in ("m", "rad") else ""
+        if self.quantity == "length" and self.most is not None and 1e-3 * value <= self.most:
+            hint = f" ({value:g} mm are {1e-3 * value:g}, or '{value:g} mm')"
         low = "" if self.least is None else f"at least {self.least:g} and "
         upper = math.inf if self.most is None else self.most
         return f"a number{self.unit and f' [{self.unit}]'}, {low}at most {upper:g}{hint}"

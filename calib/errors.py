@@ -219,8 +219,13 @@ def refused_as(
 
 
 def command_line(*arguments: object, program: str = "calib") -> str:
-    """Return a command quoted for a shell: ``calib next 'cell 7'``."""
-    return shlex.join([program, *map(str, arguments)])
+    """Return a command quoted for a shell: ``calib next 'cell 7'``; on Windows ``calib next "cell 7"``."""
+    words = [program, *map(str, arguments)]
+    if sys.platform == "win32":
+        from subprocess import list2cmdline
+
+        return list2cmdline(words)
+    return shlex.join(words)
 
 
 def brief(error: BaseException, max_length: int = 200) -> str:

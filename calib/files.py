@@ -13,6 +13,7 @@ import re
 import shutil
 import socket
 import stat
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,7 +21,7 @@ from contextvars import ContextVar
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 
 from calib.errors import CalibError, UsageError, refuse_option, refused_as, require
 from calib.records import plain, shielded
@@ -35,6 +36,11 @@ RESULTS = ".armature-calib.json"
 # Number of rows that are written at once: of general tables, and of tables of numbers.
 TABLE_CHUNK = 1000
 NUMBERS_CHUNK = 10_000
+# Windows: byte of a lock file that is locked, far behind its text; right and exit code by which a process is known to
+# run (PROCESS_QUERY_LIMITED_INFORMATION, STILL_ACTIVE of winbase.h).
+LOCKED_BYTE = 1 << 30
+QUERY_INFORMATION = 0x1000
+STILL_ACTIVE = 259
 
 Results = Sequence[tuple[Path, Sequence[str]]]
 _staged: ContextVar[list[tuple[str, Path]] | None] = ContextVar("staged", default=None)
@@ -122,23 +128,21 @@ def _written(path: Path) -> dict[str, str]:
 def locked(path: Path, busy: str, kind: type[CalibError] = UsageError) -> Iterator[str]:
     """Hold a lock file during the block, and yield the name of its last holder if that process was killed, else "".
 
-    The lock is the operating system's (flock), so that it ends with the process. The file contains the name of the
-    process that holds it.
+    The lock is the operating system's (flock; on Windows of one byte far behind the file's end), so that it ends with
+    the process. The file contains the name of the process that holds it.
 
     Args:
         path: the lock file.
         busy: message of the error where another process holds the lock; ``{}`` is replaced by the name of that process.
         kind: class of that error.
     """
-    import fcntl
-
     with refused_as(CalibError, OSError, f"cannot write in {path.parent}: {{}}"):
-        file = path.open("a+", errors="replace")
+        file = path.open("a+", encoding="utf-8", errors="replace")
     with file:
         file.seek(0)
         holder = file.read(200).strip()
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock(file)
         except OSError:
             raise kind(busy.replace("{}", holder or "another command")) from None
         if not path.exists() or not os.path.samestat(path.stat(), os.fstat(file.fileno())):
@@ -149,9 +153,30 @@ def locked(path: Path, busy: str, kind: type[CalibError] = UsageError) -> Iterat
         try:
             yield holder
         except Exception:
-            path.unlink(missing_ok=True)
+            _remove_open(path, file)
             raise
+        _remove_open(path, file)
+
+
+def _lock(file: IO[str]) -> None:
+    """Lock an open file for this process; raise OSError if another process holds it."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        os.lseek(file.fileno(), LOCKED_BYTE, os.SEEK_SET)
+        msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        return
+    import fcntl
+
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _remove_open(path: Path, file: IO[str]) -> None:
+    """Remove a lock file that this process has open; where Windows refuses that, it stays without a holder's name."""
+    try:
         path.unlink(missing_ok=True)
+    except PermissionError:
+        file.truncate(0)
 
 
 def write(path: str | Path, content: str | bytes | Iterable[str]) -> Path:
@@ -226,6 +251,8 @@ def in_use(path: Path) -> bool:
 
 
 def _alive(process: int) -> bool:
+    if sys.platform == "win32":
+        return _alive_on_windows(process)
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
@@ -233,6 +260,20 @@ def _alive(process: int) -> bool:
     except OSError:
         return True  # another user's
     return True
+
+
+def _alive_on_windows(process: int) -> bool:
+    """Return whether a process runs; ``os.kill`` would end it there."""
+    import ctypes
+
+    kernel = ctypes.windll.kernel32  # type: ignore[attr-defined]
+    handle = kernel.OpenProcess(QUERY_INFORMATION, False, process)
+    if not handle:
+        return False
+    code = ctypes.c_ulong()
+    kernel.GetExitCodeProcess(handle, ctypes.byref(code))
+    kernel.CloseHandle(handle)
+    return code.value == STILL_ACTIVE
 
 
 def check_target(out: Path, inputs: Iterable[str | Path | None], suffixes: Sequence[str] = ()) -> None:

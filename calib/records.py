@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, get_args, get_type_hints
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from calib.errors import CalibError, UsageError
 from calib.units import is_number
@@ -34,6 +34,8 @@ if TYPE_CHECKING:
     from pydantic_core import CoreSchema
 
 T = TypeVar("T")
+Floats: TypeAlias = NDArray[np.float64]
+"""Numbers that the Python API returns."""
 FieldValues: TypeAlias = dict[str, Any]
 """Values of fields of a record by name, to be passed on as keywords."""
 # Characters with which a spreadsheet's formula begins, and the apostrophe that `shielded` adds.

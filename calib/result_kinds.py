@@ -73,7 +73,11 @@ KINDS = (
             "view": "it has nothing to show yet: calib next {folder}",
         },
     ),
-    ResultKind("export", "an exported robot", ((OFFSETS, "README.txt"), (PARAMETERS, "README.txt"))),
+    ResultKind(
+        "export",
+        "an exported robot",
+        (("robot.toml", "README.txt"), (OFFSETS, "README.txt"), (PARAMETERS, "README.txt")),
+    ),
     ResultKind("package", "a ROS 2 package", (("package.xml",),)),
     ResultKind(
         "identification",

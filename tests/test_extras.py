@@ -46,10 +46,10 @@ def test_the_core_asks_for_none_of_them():
 
 
 def test_readme_installs_everything_that_is_not_asked_for_by_name():
-    """README's one command brings all extras but four, and none that asks for trimesh's own extras."""
+    """README's one command brings all extras but five, and none that asks for trimesh's own extras."""
     (requirement,) = EXTRAS["all"]
     combined = set(requirement.partition("[")[2].rstrip("]").split(","))
-    by_name = {"all", "yourdfpy", "mujoco", "pandas", "cluster", "study", "test", "docs"}
+    by_name = {"all", "yourdfpy", "mujoco", "parquet", "pandas", "cluster", "study", "test", "docs"}
     assert combined == set(EXTRAS) - by_name
     assert 'pip install ".[all]"' in (ROOT / "README.md").read_text(encoding="utf-8")
 

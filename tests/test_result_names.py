@@ -21,7 +21,8 @@ RESULTS = (
     "run.csv", "arm.toml",
     "motion.csv", "approach.csv", "trajectory.yaml", "trajectory.json", "geometries.csv", "geometry_effects.csv",
     "sensitivity.csv", "covariance_torque.csv", "drift.csv", "parameters.json", "drives.csv", "joint_offsets.csv",
-    "joint_origins.yaml", "ur_kinematics.yaml", "poses.csv", "validation_poses.csv", "selection.json", "summary.txt",
+    "joint_origins.yaml", "mastering.toml",
+    "ur_kinematics.yaml", "poses.csv", "validation_poses.csv", "selection.json", "summary.txt",
     "checked.txt", "cuts.json",
     "simulated.txt", "session.toml", "state.json", "session.rrd",
 )  # fmt: skip

@@ -24,14 +24,13 @@ from calib.identification.registry import METHODS
 from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
 from calib.procedure.excitation import coefficients
 from calib.procedure.robot_kinds import Mechanism, stage_of
-from calib.records import as_subclass, plain, shaped
+from calib.records import Floats, as_subclass, plain, shaped
 from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain, like_joints
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
-    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
-
+    from calib.api.result_table import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -58,11 +57,15 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
         """
         titles = self.found.settings.torque_rows.titles(self.inputs.chain.joint_names)
         cases = (*self.inputs.cases, *self.inputs.unseen)
-        files = [np.full(len(case.motion.t), case.name) for case in cases]
-        times = [case.motion.t for case in cases]
-        torques = np.concatenate([case.target - self.predictions[case.name] for case in cases])
+        files = []
+        times = []
+        torques = []
+        for case in cases:
+            files.append(np.full(len(case.motion.t), case.name))
+            times.append(case.motion.t)
+            torques.append(case.target - self.predictions[case.name])
         columns = {"file": np.concatenate(files), "t [s]": np.concatenate(times)}
-        for title, unit, residual in zip(titles, self.inputs.row_units, torques.T, strict=True):
+        for title, unit, residual in zip(titles, self.inputs.row_units, np.concatenate(torques).T, strict=True):
             columns[f"{title} [{unit}]"] = residual
         return ResultTable(columns)
 
@@ -80,7 +83,7 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
         return replace(estimate, covariance=self.carried.covariance)
 
     @one_blas_thread()
-    def torques(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> np.ndarray:
+    def torques(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
         """Return the predicted torques [N m or N]: (N, rows) of a motion (N, n), (rows,) of one state (n,).
 
         Args:
@@ -93,7 +96,7 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
         return like_joints(q, dynamics.model.torque(dynamics.values, *self._states(q, v, a)))
 
     @one_blas_thread()
-    def torque_sigma(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> np.ndarray:
+    def torque_sigma(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> Floats:
         """Return the standard deviations σ [N m or N] of predicted torques, in the shape of `torques`.
 
         ± 1.96 σ contains 95 % of the errors.
@@ -110,17 +113,16 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
             raise UsageError("torque errors cannot be estimated, since the recording is too short: record longer")
         return like_joints(q, self.errors.sigma(self.found.dynamics, *self._states(q, v, a)))
 
-    def _states(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> list[np.ndarray]:
+    def _states(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> tuple[Floats, Floats, Floats]:
         """Return positions, velocities and accelerations as arrays (N, n) of equal shape.
 
         Args:
             q, v, a: (N, n) or (n,) joint positions, velocities and accelerations.
         """
         positions = self.robot.joint_rows(q)
-        states = [positions]
-        for name, values in (("v", v), ("a", a)):
-            states.append(shaped(np.atleast_2d(np.asarray(values, dtype=float)), positions.shape, name))
-        return states
+        velocities = shaped(np.atleast_2d(np.asarray(v, dtype=float)), positions.shape, "v")
+        accelerations = shaped(np.atleast_2d(np.asarray(a, dtype=float)), positions.shape, "a")
+        return positions, velocities, accelerations
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:

@@ -28,15 +28,14 @@ from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSetti
 from calib.procedure.measuring import prediction
 from calib.procedure.measuring.measuring_run import write_run
 from calib.procedure.robot_kinds import Mechanism, stage_of
-from calib.records import as_subclass, plain
+from calib.records import Floats, as_subclass, plain
 from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain, like_joints
 from calib.workers.extras import available
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
-    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
-
+    from calib.api.result_table import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -54,7 +53,7 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
     tab = "q chain selection outlook run notes plot save save_run to_dict to_dataframe"
 
     @property
-    def q(self) -> np.ndarray:
+    def q(self) -> Floats:
         """Joint values (m, n) of the poses [rad or m]."""
         return np.asarray(self.selection.q)
 
@@ -141,8 +140,8 @@ class PredictedPoses(NamedTuple):
     Of one pose, asked for by joint values (n,): (4, 4) and (2,).
     """
 
-    pose: np.ndarray
-    sigma: np.ndarray
+    pose: Floats
+    sigma: Floats
 
 
 class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
@@ -193,7 +192,7 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         return PredictedPoses(like_joints(q, tool_poses), like_joints(q, sigma))
 
     @one_blas_thread()
-    def position_sigma(self, q: ArrayLike, tool: int = 0) -> np.ndarray:
+    def position_sigma(self, q: ArrayLike, tool: int = 0) -> Floats:
         """Return the standard deviation (m,) [m] of the tool position error (norm over the axes) at given poses.
 
         It contains the parameters' covariance and unmodelled effects. It is estimated on held-out rows, and grows with
@@ -290,7 +289,8 @@ def select_poses(
             joint values (m, n) [rad or m]; None for no such poses.
         candidates: poses to choose from: a CSV with the joints' columns, joint values (N, n) [rad or m], or a function
             of a number of poses that returns joint values; those that break the constraints are left out, and
-            ``selection.indices`` are the rows of the chosen ones. None draws ``settings.candidates`` poses at random.
+            ``selection.indices`` are the rows of the chosen ones, of which a joint may be turned by whole turns where
+            that shortens the run. None draws ``settings.candidates`` poses at random.
         workers: number of local processes, or the address of a Dask scheduler.
         progress: called with texts on the progress; None for no report.
 

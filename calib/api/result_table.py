@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, TypeAlias
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -12,11 +12,13 @@ from calib.errors import UsageError, one_of
 from calib.workers.extras import needing
 
 if TYPE_CHECKING:
-    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
+    import pandas  # pyright: ignore[reportMissingImports]
 
-# Lines that ``print`` shows of a table, and the width of its cells [characters].
+    DataFrame: TypeAlias = pandas.DataFrame
+
+# Rows and columns that ``print`` shows of a table.
 SHOWN_ROWS = 10
-CELL_WIDTH = 12
+SHOWN_COLUMNS = 12
 
 
 class ResultTable:
@@ -55,12 +57,12 @@ class ResultTable:
     def __iter__(self) -> Iterator[tuple[object, ...]]:
         return iter(self.to_numpy().tolist())
 
-    def __array__(self, dtype: DTypeLike = None, copy: bool | None = None) -> np.ndarray:
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> np.ndarray:
         return np.asarray(self.to_numpy(), dtype=dtype)
 
     def to_numpy(self) -> np.ndarray:
         """Return the rows as a structured array (m,), whose fields are the columns."""
-        fields = [(name, self._arrays[name].dtype) for name in self.columns]
+        fields = [(name, values.dtype) for name, values in self._arrays.items()]
         array = np.empty(len(self), dtype=fields)
         for name in self.columns:
             array[name] = self._arrays[name]
@@ -84,28 +86,32 @@ class ResultTable:
     def __str__(self) -> str:
         rows: list[tuple[object, ...]] = [self.columns]
         rows += list(self)[:SHOWN_ROWS]
-        lines = []
-        for row in rows:
-            cells = [_shown(cell) for cell in row]
-            lines.append("  ".join(cells).rstrip())
-        if len(self) > SHOWN_ROWS:
-            lines.append(f"… {len(self)} rows")
+        columns = []
+        for cells in list(zip(*rows))[:SHOWN_COLUMNS]:
+            texts = [_shown(cell) for cell in cells]
+            width = max(map(len, texts))
+            columns.append([text.ljust(width) for text in texts])
+        lines = ["  ".join(cells).rstrip() for cells in zip(*columns)]
+        if len(self) > SHOWN_ROWS or len(self.columns) > SHOWN_COLUMNS:
+            lines.append(f"… {len(self)} rows, {len(self.columns)} columns")
         return "\n".join(lines)
 
 
 def _column(values: Sequence[object]) -> np.ndarray:
-    """Return the cells of a column as an array of str if any is a text, else of float, with NaN for None."""
-    if any(isinstance(value, str) and value for value in values):
-        return np.array([str(value) for value in values])
-    numbers = [np.nan if value is None or value == "" else value for value in values]
-    return np.array(numbers, dtype=float)
+    """Return the cells of a column as an array of str if any is a text, else of float, with NaN for None and ""."""
+    texts = [value for value in values if isinstance(value, str)]
+    if len(texts) == len(values) or any(texts):
+        return np.array(values, dtype=str)
+    numbers = np.full(len(values), np.nan)
+    for number, value in enumerate(values):
+        if value is not None and value != "":
+            numbers[number] = value
+    return numbers
 
 
 def _shown(cell: object) -> str:
-    """Return a cell as a text of at least `CELL_WIDTH` characters."""
-    if isinstance(cell, float):
-        return f"{cell:<{CELL_WIDTH}.6g}"
-    return f"{cell!s:<{CELL_WIDTH}}"
+    """Return a cell as a text, with six digits of a number."""
+    return f"{cell:.6g}" if isinstance(cell, float) else str(cell)
 
 
 def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:

@@ -104,6 +104,8 @@ def identify_dynamics(
 ) -> None:
     """Identify ROBOT's dynamics from recordings, and judge them. What counts is how well other motion is predicted.
 
+    Of standing poses (one row each, no stamps) or a log that stands, gravity and payloads are identified.
+
     Example: calib identify fit log.csv --out dynamics
 
     Args:
@@ -119,6 +121,8 @@ def identify_dynamics(
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.report.dynamics_section import read_lines
 
+    if _gravity(robot, recordings, validate or [], out, options, base, tip, seed):
+        return
     check_destination("identify", robot, out, [options, *recordings, *(validate or [])])
 
     def read(inputs: "IdentificationInputs") -> None:
@@ -149,6 +153,30 @@ def identify_dynamics(
         if (excitation / prediction.NAME).is_file():
             comparison = [prediction.compared_with_identification(excitation, result)]
     say_written([*result.renderables(), *comparison], out, result.verdict.level)
+
+
+def _gravity(
+    robot: Path,
+    recordings: list[str],
+    validate: list[str],
+    out: Path,
+    options: Path | None,
+    base: str | None,
+    tip: str | None,
+    seed: int,
+) -> bool:
+    """Identify gravity and write it, if all files are standing poses; return whether they are."""
+    from calib.procedure.dynamic_stage import standing_poses
+    from calib.procedure.robot_kinds import stage_of
+
+    named = [*recordings, *validate]
+    if stage_of(robot, "identify") is not None or not standing_poses.stand(robot, named, options, base, tip):
+        return False
+    standing_poses.check_target(out, [options, *named])
+    result = standing_poses.identify_gravity(robot, recordings, validate, options, base, tip, seed)
+    result.write(out)
+    say_written(result.lines(), out, result.verdict.level)
+    return True
 
 
 @command(app, "Motion")

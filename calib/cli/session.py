@@ -103,7 +103,7 @@ def formats(topic: Annotated[str | None, typer.Argument(autocompletion=topics)] 
     Args:
         topic: measurements, instruments, robodk, join, images, descriptions, moveit, ros2, targets, programs, frames,
             logs, identify-options, options, identified, exports, constraints, mdh, parallel, robot, session, limits,
-            waypoints, excitation, study or recordings
+            waypoints, excitation, study, pairs or recordings
         schema: the JSON schema of a TOML file, for editors that complete its keys
     """
     from calib.procedure import formats as documents

@@ -1,13 +1,13 @@
 """Robot controllers, as declared in ``controllers.toml``: joint values, programs, accepted settings.
 
 For the joints q of a robot description, a controller displays s_i = sign_i · (q_i + Σ way · q_j), with signs and
-coupled axes (a FANUC's J3 is measured from the horizontal). The table is valid for descriptions of ROS-Industrial or
-the maker. If a description defines another zero of a joint, written programs would be wrong: play them in the
-controller's simulation first.
+coupled axes (a FANUC's J3 is measured from the horizontal); `calib.controllers.axes` applies this to the arm's axes.
+The table is valid for descriptions of ROS-Industrial or the maker. If a description defines another zero of a joint,
+written programs would be wrong: play them in the controller's simulation first.
 """
 
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from calib.config import parse, strict
-from calib.errors import UsageError, one_of, require
+from calib.errors import UsageError, one_of
 from calib.files import shipped_text
-from calib.units import ANGLES, LENGTHS
+from calib.units import LENGTHS
 
 
 @strict
@@ -49,11 +49,16 @@ class Controller:
     mastered: bool = True
     pulses: bool = False
     axes: tuple[int, ...] = ()
+    external: int = 0
+    scara: bool = False
+    rail_group: int = 2
     suffixes: tuple[str, ...] = ()
     saved: tuple[str, ...] = ()
     signs: tuple[int, ...] = ()
     coupled: tuple[tuple[int, int, int], ...] = ()
     joints: str = ""
+    extra: str = ""
+    beside: str = ""
     pose: str = ""
     numbered: str = ""
     moves: str = ""
@@ -70,18 +75,6 @@ class Controller:
             if max(axis, partner) <= n:
                 coupling[axis - 1, partner - 1] = sign
         return np.array(self.signs or [1] * n)[:, None] * coupling
-
-    def shown(self, q: np.ndarray) -> np.ndarray:
-        """Return a description's joint values q (…, n) [rad] as the controller displays them, in
-        the controller's unit.
-        """
-        return q @ self.matrix(q.shape[-1]).T / ANGLES[self.unit]
-
-    def described(self, controller_values: np.ndarray) -> np.ndarray:
-        """Return a description's joint values (…, n) for joint values that the controller displays, in the controller's
-        unit.
-        """
-        return controller_values @ np.linalg.inv(self.matrix(controller_values.shape[-1])).T
 
     @property
     def metres(self) -> float:
@@ -111,26 +104,6 @@ def controller_named(name: str) -> Controller:
     return controllers()[one_of(name, controllers(), "controller", UsageError)]
 
 
-def check_controller(name: str, axes: int, pulses: Sequence[float] = ()) -> None:
-    """Check that a controller supports an arm.
-
-    Args:
-        name: name of the controller.
-        axes: number of joints of the arm.
-        pulses: encoder pulses per degree of each axis; empty: not stated.
-
-    Raises:
-        UsageError: for an unknown name, an unsupported number of joints, or missing pulses per degree.
-    """
-    controller = controller_named(name)
-    allowed = " or ".join(map(str, controller.axes))
-    require(not allowed or axes in controller.axes, f"{axes} joints; {controller.title} takes {allowed}", UsageError)
-    message = (
-        f"{controller.title} needs the pulses per degree of each of {axes} axes: give them by calib program --pulse"
-    )
-    require(not controller.pulses or (len(pulses) == axes and all(pulses)), message, UsageError)
-
-
 def controller_of(path: Path, name: str = "") -> Controller:
     """Return the controller of a robot program.
 
@@ -148,16 +121,6 @@ def controller_of(path: Path, name: str = "") -> Controller:
             return controller
     suffixes = ", ".join(suffix for controller in controllers().values() for suffix in controller.suffixes)
     raise UsageError(f"{path}: no program of a known controller: expected a suffix of {suffixes}")
-
-
-def as_described(name: str, controller_values: np.ndarray) -> np.ndarray:
-    """Return a description's joint values or velocities (…, n) for those that a controller displays, in the same unit.
-
-    Args:
-        name: name of the controller.
-        controller_values: (…, n) displayed values.
-    """
-    return controller_named(name).described(controller_values)
 
 
 def motors_as_described(name: str, controller_values: np.ndarray) -> np.ndarray:

@@ -1,3 +1,8 @@
 OFFERS = {
-    "exports": ("recordings.controller_logs:translated", "recordings.ros_texts:translated", "poses.exports:translated")
+    "exports": (
+        "recordings.controller_logs:translated",
+        "recordings.ros_texts:translated",
+        "poses.exports:translated",
+        "recordings.controller_logs:with_decimal_points",
+    )
 }

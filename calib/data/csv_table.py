@@ -1,13 +1,15 @@
 """CSV tables: headers with units, columns converted to SI, errors with row and column.
 
 The separator is tab, semicolon, comma or bar (the first of these that the header contains). It is blanks if the first
-row of numbers, split at blanks, has as many cells as the header. Files are UTF-8 with or without a byte order mark, and
-the decimal mark is a point. Lines that begin with ``#`` are comments, except for a spreadsheet's error (``#REF!``). If
-only a comment names the columns (numpy's savetxt), the last comment before the numbers is the header.
+row of numbers, split at blanks, has as many cells as the header. Files are UTF-8 with or without a byte order mark, or
+Windows-1252 (ANSI); the decimal mark is a point. Lines that begin with ``#`` are comments, except for a spreadsheet's
+error (``#REF!``). If only a comment names the columns (numpy's savetxt), the last comment before the numbers is the
+header.
 """
 
 from __future__ import annotations
 
+import codecs
 import csv
 import math
 import re
@@ -56,6 +58,8 @@ _ERROR = re.compile(r"#(REF!|N/A|NUM!|DIV/0!|VALUE!|NAME\?|NULL!)", re.I)
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
 # Rows read at a time.
 _CHUNK = 20_000
+# Bytes of a file by which its encoding is told (our choice).
+HEAD = 1 << 16
 # Letters of a line (our choice).
 LONGEST = 1 << 20
 # A row this many times as wide as the header probably has decimal commas.
@@ -263,7 +267,9 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
     """
     try:
         check_regular(path)
-        raw = open(path, encoding="utf-8-sig", newline="")  # noqa: SIM115 (closed below)
+        with open(path, "rb") as beginning:
+            encoding = encoding_of(beginning.read(HEAD))
+        raw = open(path, encoding=encoding, newline="")  # noqa: SIM115 (closed below)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         reason = getattr(error, "strerror", None) or error
         raise MeasurementError(f"cannot be read: {reason}", path) from error
@@ -272,6 +278,23 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
         if export is not None:
             file = export
         yield file, *_first_line(file, path, headed)
+
+
+def encoding_of(head: bytes) -> str:
+    """Return the encoding of a text file: UTF-8, UTF-16 by its mark, else Windows-1252 ('ANSI', contains Latin-1).
+
+    Args:
+        head: the first bytes of the file.
+    """
+    if head[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return "utf-16"
+    if b"\0" in head or head[:2] == b"PK":
+        return "utf-8-sig"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8-sig"
 
 
 def _as_our_text(path: str | Path) -> IO[str] | None:
@@ -509,14 +532,14 @@ def _read_cells(
                     is_last = index == len(chunk) - 1 and next(rows, None) is None
                     refuse_data(path, _ragged(row, names, separator, is_last), row=row_count + index + 1)
             for part, column in zip(parts, zip(*chunk)):
-                part.append(_convert(column))
+                part.append(as_column(column))
             row_count += len(chunk)
     except csv.Error as error:
         raise MeasurementError(f"is no CSV: {error}", path, row_count + 1) from error
     return parts
 
 
-def _convert(column: Sequence[str]) -> np.ndarray:
+def as_column(column: Sequence[str]) -> np.ndarray:
     """Return a column's cells as floats if all of them are numbers or empty, else as texts."""
     joined = "".join(column)
     try:

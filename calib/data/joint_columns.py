@@ -9,38 +9,26 @@ many; otherwise the names do not tell which joints they are.
 """
 
 import re
+import tomllib
 import unicodedata
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import filterfalse
+from operator import attrgetter
+from pathlib import Path
 
 from calib.data.csv_table import Table
 from calib.errors import listing
 
-# words for a joint, in languages of pendants and teaching programs
-JOINT_WORDS = frozenset(
-    "q j jt jnt joint joints a ax axis axes rax theta th θ motor servo achse gelenk axe articulation eje articulacion "
-    "articulación junta eixo asse giunto oś os as led kloub eksen mafsal сустав ось 关节 轴 軸 関節 관절 축".split()
-)
-# words for a position of a joint
-POSITION_WORDS = frozenset("q pos position positions qpos angle angles deg winkel angulo ángulo angolo 角度".split())
-# words for another quantity of a joint
-OTHER_WORDS = frozenset(
-    "v vel velocity velocities speed dq qd qvel geschwindigkeit acc acceleration ddq qdd tau torque torques effort "
-    "efforts moment force load i current currents strom voltage temperature temp error sigma time name names limit "
-    "min max lower upper raw pwm duty power".split()
-)
-# words that say nothing about the quantity
-PLAIN_WORDS = frozenset(
-    "actual act measured meas state states ist istwert observation field value robot robax data feedback deg rad mm "
-    "degrees".split()
-)
-# words for a position that was to be reached, not one that was measured
-COMMANDED_WORDS = frozenset(
-    "cmd command commanded target ref reference des desired action goal soll sollwert setpoint set nominal plan "
-    "planned".split()
-)
-# words for an axis outside the arm, beside the arm's numbered axes
-EXTERNAL_WORDS = frozenset("e eax ext extax external zusatzachse".split())
+# words in names of columns, by what they mean
+_WORDS = tomllib.loads(Path(__file__).with_name("column_words.toml").read_text(encoding="utf-8"))
+JOINT_WORDS = frozenset(_WORDS["joint"].split())
+POSITION_WORDS = frozenset(_WORDS["position"].split())
+OTHER_WORDS = frozenset(_WORDS["other"].split())
+PLAIN_WORDS = frozenset(_WORDS["plain"].split())
+COMMANDED_WORDS = frozenset(_WORDS["commanded"].split())
+EXTERNAL_WORDS = frozenset(_WORDS["external"].split())
 # joints that a pendant shows by letters or names, in the order of the arm
 PENDANTS = (
     ("s", "l", "u", "r", "b", "t"),
@@ -48,7 +36,7 @@ PENDANTS = (
     ("base", "shoulder", "elbow", "wrist1", "wrist2", "wrist3"),
 )
 # first words of columns that are no joints
-TARGET_WORDS = [(word,) for word in ("x", "y", "z", "t", "time", "nr", "no", "row", "tag", "name", "point", "punkt")]
+TARGET_WORDS = frozenset(("x", "y", "z", "t", "time", "nr", "no", "row", "tag", "name", "point", "punkt"))
 _BREAK = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])")
 _WORD = re.compile(r"[^\W\d_]+|\d+")
 
@@ -59,34 +47,39 @@ class JointSeries:
 
     Attributes:
         columns: n names of columns, in the robot's order.
-        words: words that all names have beside the joint.
-        named: whether the columns have the joints' names, not only numbers.
+        terms: words that all names have beside the joint.
+        by_name: whether the columns have the joints' names, not only numbers.
     """
 
     columns: tuple[str, ...]
-    words: tuple[str, ...]
-    named: bool = False
+    terms: tuple[str, ...]
+    by_name: bool = False
 
     @property
     def is_position(self) -> bool:
         """Whether the words may mean a position; numbers alone count where a word for joints stands beside them."""
-        words = set(self.words)
-        if words & OTHER_WORDS and not words & (POSITION_WORDS - {"q"}):
+        terms = set(self.terms)
+        if terms & OTHER_WORDS and not terms & (POSITION_WORDS - {"q"}):
             return False
-        if self.named and words <= PLAIN_WORDS:
+        if self.by_name and terms <= PLAIN_WORDS:
             return True
-        return bool(words & (JOINT_WORDS | POSITION_WORDS))
+        return bool(terms & (JOINT_WORDS | POSITION_WORDS))
 
     @property
     def is_commanded(self) -> bool:
         """Whether a word means that the position was commanded, not measured."""
-        return bool(COMMANDED_WORDS.intersection(self.words))
+        return bool(COMMANDED_WORDS.intersection(self.terms))
 
 
 def words_of(name: str) -> tuple[str, ...]:
     """Return the words and numbers in a column's name, in lower case: (joint, 1, pos) for ``Joint1.pos``."""
     text = _BREAK.sub(" ", unicodedata.normalize("NFKC", name))
-    return tuple(word.casefold() for word in _WORD.findall(text))
+    return tuple(_WORD.findall(text.casefold()))
+
+
+def parted(terms: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the numbers among the terms of a name, and the words."""
+    return tuple(filter(str.isdigit, terms)), tuple(filterfalse(str.isdigit, terms))
 
 
 def joint_series(header: Sequence[str], joints: Sequence[str], kinds: Sequence[str] = ()) -> list[JointSeries]:
@@ -97,12 +90,12 @@ def joint_series(header: Sequence[str], joints: Sequence[str], kinds: Sequence[s
         joints: names of the robot's n joints.
         kinds: URDF type of each joint, which tells external axes apart; (): all revolute.
     """
-    result = _by_names(header, [words_of(joint) for joint in joints])
+    result = _by_names(header, list(map(words_of, joints)))
     if not result:
         result = _by_names(header, _short_names(joints))
     for pendant in PENDANTS:
         if len(pendant) == len(joints):
-            result += _by_names(header, [words_of(name) for name in pendant])
+            result += _by_names(header, list(map(words_of, pendant)))
     kinds = kinds or ["revolute"] * len(joints)
     numbered = _numbered(header)
     result += _by_numbers(numbered, len(joints))
@@ -121,17 +114,17 @@ def series_named_in_cells(table: Table, joints: Sequence[str]) -> list[JointSeri
     for columns in numbered.values():
         for number, column in columns.items():
             cells = table.cells[table.header.index(column)]
-            texts = set(cells.tolist()) if cells.dtype == object else set()
-            if len(texts) == 1:
+            texts = set(cells.tolist())
+            if cells.dtype == object and len(texts) == 1:
                 number_of[texts.pop()] = number
-    if any(joint not in number_of for joint in joints):
+    if not number_of.keys() >= set(joints):
         return []
-    numbers = [number_of[joint] for joint in joints]
+    numbers = list(map(number_of.__getitem__, joints))
     result = []
-    for words, columns in numbered.items():
-        if all(number in columns for number in numbers):
-            names = tuple(columns[number] for number in numbers)
-            result.append(JointSeries(names, words, named=True))
+    for terms, columns in numbered.items():
+        if columns.keys() >= set(numbers):
+            names = tuple(map(columns.__getitem__, numbers))
+            result.append(JointSeries(names, terms, by_name=True))
     return result
 
 
@@ -141,9 +134,9 @@ def position_series(series: Sequence[JointSeries]) -> list[JointSeries]:
     Args:
         series: all series of a table.
     """
-    positions = [entry for entry in series if entry.is_position]
-    positions = [entry for entry in positions if entry.named] or positions
-    return [entry for entry in positions if not entry.is_commanded] or positions
+    positions = list(filter(attrgetter("is_position"), series))
+    positions = list(filter(attrgetter("by_name"), positions)) or positions
+    return list(filterfalse(attrgetter("is_commanded"), positions)) or positions
 
 
 def joints_in(header: Sequence[str], joints: Sequence[str]) -> list[str]:
@@ -153,11 +146,11 @@ def joints_in(header: Sequence[str], joints: Sequence[str]) -> list[str]:
         header: names of the columns.
         joints: names of joints.
     """
-    columns = [words_of(name) for name in header]
+    columns = list(map(words_of, header))
     result = []
     for joint in joints:
-        words = words_of(joint)
-        if any(_without(column, words) is not None for column in columns):
+        remainders = map(partial(_without, part=words_of(joint)), columns)
+        if set(remainders) - {None}:
             result.append(joint)
     return result
 
@@ -178,7 +171,7 @@ def proposed_line(header: Sequence[str], series: Sequence[JointSeries], n: int) 
     """
     if series:
         return mapping_line(series[0])
-    columns = [column for column in header if words_of(column)[:1] not in TARGET_WORDS]
+    columns = [column for column in header if TARGET_WORDS.isdisjoint(words_of(column)[:1])]
     columns += ["..."] * n
     return mapping_line(JointSeries(tuple(columns[:n]), ()))
 
@@ -188,17 +181,17 @@ def described(series: JointSeries) -> str:
     return listing(series.columns, 8)
 
 
-def _without(words: tuple[str, ...], part: tuple[str, ...]) -> tuple[str, ...] | None:
+def _without(terms: tuple[str, ...], part: tuple[str, ...]) -> tuple[str, ...] | None:
     """Return `words` without the words of `part`, which stand together; None if they do not.
 
     Args:
-        words: words of a column's name.
+        terms: words of a column's name.
         part: words of a joint's name.
     """
-    for start in range(len(words) - len(part) + 1):
+    for start in range(len(terms) - len(part) + 1):
         stop = start + len(part)
-        if words[start:stop] == part:
-            return words[:start] + words[stop:]
+        if terms[start:stop] == part:
+            return terms[:start] + terms[stop:]
     return None
 
 
@@ -213,16 +206,16 @@ def _by_names(header: Sequence[str], names: Sequence[tuple[str, ...]]) -> list[J
     # the longest name first: wrist_roll is not the joint wrist
     longest = sorted(filter(None, names), key=len, reverse=True)
     for column in header:
-        words = words_of(column)
+        terms = words_of(column)
         for name in longest:
-            rest = _without(words, name)
-            if rest is not None:
-                by_words.setdefault(rest, {}).setdefault(name, column)
+            remainder = _without(terms, name)
+            if remainder is not None:
+                by_words.setdefault(remainder, {}).setdefault(name, column)
                 break
     result = []
-    for rest, columns in by_words.items():
-        if all(name in columns for name in names):
-            result.append(JointSeries(tuple(columns[name] for name in names), rest, named=True))
+    for remainder, columns in by_words.items():
+        if columns.keys() >= set(names):
+            result.append(JointSeries(tuple(map(columns.__getitem__, names)), remainder, by_name=True))
     return result
 
 
@@ -234,14 +227,16 @@ def _short_names(joints: Sequence[str]) -> list[tuple[str, ...]]:
     Args:
         joints: names of the joints.
     """
-    names = [words_of(joint) for joint in joints]
+    names = list(map(words_of, joints))
     common = set(names[0]).intersection(*names) | {"joint"}
     short = []
     for name in names:
-        words = tuple(word for word in name if word not in common)
-        is_number = all(word.isdigit() for word in words)
-        short.append(() if is_number else words)
-    return short if len(set(short)) == len(short) else [()] * len(short)
+        terms = tuple(filterfalse(common.__contains__, name))
+        has_name = not "".join(terms).isdigit()
+        short.append(terms * has_name)
+    if len(set(short)) < len(short):
+        return [()] * len(short)
+    return short
 
 
 def _numbered(header: Sequence[str]) -> dict[tuple[str, ...], dict[int, str]]:
@@ -252,12 +247,12 @@ def _numbered(header: Sequence[str]) -> dict[tuple[str, ...], dict[int, str]]:
     """
     result: dict[tuple[str, ...], dict[int, str]] = {}
     for column in header:
-        words = words_of(column)
-        places = [place for place, word in enumerate(words) if word.isdigit()]
-        if places:
-            place = places[-1]
-            beside = words[:place] + words[place + 1 :]
-            result.setdefault(beside, {}).setdefault(int(words[place]), column)
+        terms = words_of(column)
+        indices = [index for index, term in enumerate(terms) if term.isdigit()]
+        if indices:
+            index = indices[-1]
+            beside = terms[:index] + terms[index + 1 :]
+            result.setdefault(beside, {}).setdefault(int(terms[index]), column)
     return result
 
 
@@ -269,10 +264,10 @@ def _by_numbers(numbered: Mapping[tuple[str, ...], Mapping[int, str]], n: int) -
         n: number of the robot's joints.
     """
     result = []
-    for words, columns in numbered.items():
+    for terms, columns in numbered.items():
         numbers = sorted(columns)
         if len(numbers) == n and numbers[0] in (0, 1) and numbers[-1] - numbers[0] == n - 1:
-            result.append(JointSeries(tuple(columns[number] for number in numbers), words))
+            result.append(JointSeries(tuple(map(columns.__getitem__, numbers)), terms))
     return result
 
 
@@ -287,15 +282,13 @@ def _with_external(numbered: Mapping[tuple[str, ...], Mapping[int, str]], kinds:
     turning = [index for index, kind in enumerate(kinds) if kind != "prismatic"]
     if not sliding or not turning:
         return []
-    external = []
-    for series in _by_numbers(numbered, len(sliding)):
-        if EXTERNAL_WORDS.intersection(series.words):
-            external.append(series)
+    series = _by_numbers(numbered, len(sliding))
+    external = [entry for entry in series if EXTERNAL_WORDS.intersection(entry.terms)]
     result = []
     for arm in _by_numbers(numbered, len(turning)):
-        for outside in external:
+        for rail in external:
             columns = [""] * len(kinds)
-            for index, column in zip((*turning, *sliding), (*arm.columns, *outside.columns)):
+            for index, column in zip((*turning, *sliding), (*arm.columns, *rail.columns)):
                 columns[index] = column
-            result.append(JointSeries(tuple(columns), arm.words))
+            result.append(JointSeries(tuple(columns), arm.terms))
     return result

@@ -13,6 +13,7 @@ import numpy as np
 from calib.errors import MeasurementError
 
 # Types of YAML values, as OpenCV and Python's dumper write them.
+_HEADER = re.compile(r"^%YAML.*$", re.MULTILINE)
 _TAG = re.compile(r"(?<=[:\-,\[{] )!!?[\w./:\-]+")
 
 
@@ -44,10 +45,9 @@ def _of_yaml(text: str, path: Path) -> object:
     from ruamel.yaml.error import YAMLError
 
     # OpenCV's header is no directive of YAML, and its tags (as Python's) are types, not values
-    lines = [line for line in text.splitlines() if not line.startswith("%YAML")]
-    plain = _TAG.sub("", "\n".join(lines))
+    plain = _TAG.sub("", _HEADER.sub("", text))
     try:
-        documents = [document for document in YAML(typ="safe", pure=True).load_all(plain) if document is not None]
+        documents = list(filter(None, YAML(typ="safe", pure=True).load_all(plain)))
     except (YAMLError, ValueError, RecursionError) as error:
         raise MeasurementError(f"cannot be read as YAML ({str(error).splitlines()[0]})", path) from error
     if len(documents) == 1:
@@ -69,13 +69,12 @@ def _of_xml(text: str, path: Path) -> object:
 def _of_element(element: ET.Element) -> object:
     """Return the content of an XML element: table, list, number, numbers, or text."""
     children = list(element)
-    if children and all(child.tag == "_" for child in children):
-        return [_of_element(child) for child in children]
+    if {child.tag for child in children} == {"_"}:
+        return list(map(_of_element, children))
     if children:
         return {child.tag: _of_element(child) for child in children}
-    words = (element.text or "").split()
     try:
-        numbers = [float(word) for word in words]
+        numbers = list(map(float, (element.text or "").split()))
     except ValueError:
         return (element.text or "").strip().strip('"')
     if len(numbers) == 1 and element.tag not in ("data", "_"):
@@ -90,7 +89,7 @@ def _with_matrices(node: object) -> object:
             return _matrix(node)
         return {str(key): _with_matrices(value) for key, value in node.items()}
     if isinstance(node, (list, tuple)):
-        return [_with_matrices(value) for value in node]
+        return list(map(_with_matrices, node))
     return node
 
 

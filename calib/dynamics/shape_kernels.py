@@ -69,36 +69,36 @@ def _band(acts, t, x, v):
 
 
 @njit(**OPTIONS)
-def _tabulated(acts, t, place):
-    """Return value and slope of a table at a place: the cubic between two knots, constant beyond them (Hermite).
+def _tabulated(acts, t, argument):
+    """Return value and slope of a table: the cubic between two knots, constant beyond them (Hermite).
 
     Args:
         acts: array of settings, one row per shape.
         t: row of this shape.
-        place: position or velocity [rad or m, per s].
+        argument: position or velocity [rad or m, per s].
     """
     first = int(acts[t, 2])
     low = 0
     high = int(acts[t, 1]) - 1
-    if not place > acts[t, first]:
+    if not argument > acts[t, first]:
         return acts[t, first + 1], 0.0
-    if not place < acts[t, first + 3 * high]:
+    if not argument < acts[t, first + 3 * high]:
         return acts[t, first + 3 * high + 1], 0.0
     while high - low > 1:
         middle = (low + high) // 2
-        if place < acts[t, first + 3 * middle]:
+        if argument < acts[t, first + 3 * middle]:
             high = middle
         else:
             low = middle
-    left = first + 3 * low
-    right = left + 3
-    width = acts[t, right] - acts[t, left]
-    s = (place - acts[t, left]) / width
-    rise = acts[t, right + 1] - acts[t, left + 1]
-    start = acts[t, left + 2] * width - rise
-    stop = rise - acts[t, right + 2] * width
+    start_knot = first + 3 * low
+    end_knot = start_knot + 3
+    width = acts[t, end_knot] - acts[t, start_knot]
+    s = (argument - acts[t, start_knot]) / width
+    rise = acts[t, end_knot + 1] - acts[t, start_knot + 1]
+    start = acts[t, start_knot + 2] * width - rise
+    stop = rise - acts[t, end_knot + 2] * width
     bend = start * (1.0 - s) + stop * s
-    value = acts[t, left + 1] + s * rise + s * (1.0 - s) * bend
+    value = acts[t, start_knot + 1] + s * rise + s * (1.0 - s) * bend
     slope = rise + (1.0 - 2.0 * s) * bend + s * (1.0 - s) * (stop - start)
     return value, slope / width
 

@@ -13,7 +13,8 @@ identification (infinite if not given). Beyond the edge, friction changes only b
 
 The shapes ``velocity_table`` and ``position_table`` are any function of v or x, given by its value and slope at knots,
 between which it is the cubic with these values and slopes (Hermite); beyond the knots it is constant. Their settings
-are the knots, one after the other: place, value, slope. `calib.dynamics.tables` makes them of a function.
+are the knots, one after the other: place, value, slope. Friction functions of
+scripts become such tables (`calib.identification.friction.function_tables`).
 """
 
 import math

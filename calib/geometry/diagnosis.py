@@ -293,6 +293,25 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
     chain = nominal.chain
     n = chain.n
     changes: list[Change] = []
+    if not chain.is_free_flyer:
+        changes = _joint_changes(chain)
+    if mirrored and any(isinstance(block, Positions) for block in blocks):
+        changes.append(Change("left-handed", _mirrored, max_left=MAX_LEFT))
+    changes += row_shifts(nominal, blocks, MAX_LEFT)
+    changes += two_targets(nominal, _few(blocks), MAX_LEFT)
+    return best_changes(
+        blocks,
+        changes,
+        lambda changed: _mean_square(nominal, _few(changed)),
+        lambda changed: least_error(nominal, _few(changed)),
+        n,
+    )
+
+
+def _joint_changes(chain: Chain) -> list[Change]:
+    """Return the changes of joint columns that are tried: signs, couplings, exchanges, zeros."""
+    n = chain.n
+    changes: list[Change] = []
     for joint in range(n):
         make = _of_joints(reversal(n, joint))
         changes.append(Change("joint-sign", make, (joint,), max_left=MAX_LEFT_SIGN))
@@ -306,23 +325,13 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
     for first, second in combinations(range(n), 2):
         make = _of_joints(exchange(n, first, second))
         changes.append(Change("joints-exchanged", make, (first, second), max_left=MAX_LEFT))
-    if mirrored and any(isinstance(block, Positions) for block in blocks):
-        changes.append(Change("left-handed", _mirrored, max_left=MAX_LEFT))
     for joint in range(n):
         if chain.joints[joint].kind == "prismatic":
             continue
         for angle in QUARTERS:
             make = partial(_turned, joint, angle)
             changes.append(Change("joint-zero", make, (joint,), {"angle": angle}, MAX_LEFT))
-    changes += row_shifts(nominal, blocks, MAX_LEFT)
-    changes += two_targets(nominal, _few(blocks), MAX_LEFT)
-    return best_changes(
-        blocks,
-        changes,
-        lambda changed: _mean_square(nominal, _few(changed)),
-        lambda changed: least_error(nominal, _few(changed)),
-        n,
-    )
+    return changes
 
 
 def wrong_angles(nominal: Installation, blocks: Blocks) -> Explanation | None:

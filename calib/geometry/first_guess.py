@@ -21,7 +21,6 @@ arm's S A_i X.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import singledispatch
 from typing import TYPE_CHECKING
 
@@ -63,10 +62,6 @@ MIN_ANGLE = 20.0
 # positions' spread
 MAX_ANGLE = 5.0
 MAX_MISFIT = 0.1
-# largest median misfit of poses read as their inverse, as a share of the positions' spread, and largest ratios of their
-# misfits to those of the poses as they are (our choice)
-MAX_INVERSE_MISFIT = 0.3
-INVERSE_RATIO = 0.5
 # readings of orientations that are tried: text for the user, and order and signs of the quaternions as read
 READINGS = (
     (
@@ -262,38 +257,8 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
             )
 
 
-def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurements:
-    """Return poses of the target in the instrument's frame, inverted if they are those of the instrument in the target.
-
-    The first is a tracker's convention, and that of a camera beside the arm; a camera on the arm measures the second:
-    the board in its own frame. The reading is taken that agrees with the arm; a note says so where it is the second.
-
-    Args:
-        chain: the nominal arm.
-        block: measurements of any kind; only full poses are tried both ways.
-    """
-    if not isinstance(block, Poses) or block.lever is not None or block.base is not None:
-        return block
-    rows = checked_rows(block)
-    if len(rows) < MIN_CHECKED_ROWS:
-        return block
-    arm = forward(chain, block.q[rows])
-    inverse = block.inverted()
-    angle, distance = _misfit(arm, block.position[rows], block.quaternion[rows])
-    inverse_angle, inverse_distance = _misfit(arm, inverse.position[rows], inverse.quaternion[rows])
-    if not inverse_distance < MAX_INVERSE_MISFIT or not inverse_angle < MAX_ANGLE:
-        return block
-    if inverse_distance > INVERSE_RATIO * distance or inverse_angle > INVERSE_RATIO * angle:
-        return block
-    note = (
-        f"the poses agree with the arm as their inverse ({inverse_angle:.2g}° instead of {angle:.2g}°, median), so "
-        "they are read as poses of what stands (board) in the frame of what the arm carries (camera)"
-    )
-    return replace(inverse, notes=(*block.notes, note))
-
-
 def checked_rows(block: Poses) -> np.ndarray:
-    """Return the indices of the rows by which orientations are checked, all of one tool."""
+    """Return the indices of the rows by which a block's orientations are checked: of the target with most rows."""
     rows = np.flatnonzero(block.tool == np.argmax(np.bincount(block.tool)))
     return rows[evenly(len(rows), CHECKED_ROWS)]
 
@@ -308,7 +273,6 @@ def contradiction(chain: Chain, block: PoseMeasurements) -> float:
         chain: the nominal arm.
         block: positions or poses; infinite for another kind, or too few rows.
     """
-    block = as_seen_by_instrument(chain, block)
     if isinstance(block, Poses):
         rows = checked_rows(block)
         if len(rows) < MIN_CHECKED_ROWS:

@@ -53,8 +53,11 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     use_range = true                 # follow the file's own use_range
     samples = 600000                 # used of a longer recording, in pieces spread over it
     lag = 0.0                        # by which torques and currents come later than the positions of their row [s]
-    names = { torque = "tau_m" }     # our name = the file's
+    names = { torque = "tau_m" }     # our name = the file's; [columns] says the same, and joint by joint
     units = { q = "deg" }            # of columns that state none
+    [columns]                        # of recordings: our name = the file's
+    q = "/states/{joint}/position"   # {joint} stands for each joint's name or number
+    torque_1 = "Axis A load"         # or joint by joint: q1, torque_1, i1, or a joint's name for its position
     [[coupling]]                     # a motor that turns with the sum of two joints: Iam Fvm Fcm
     joints = [5, 6]                  # the two joints, from 1
     label = "6"                      # ends the names of its parameters
@@ -158,6 +161,7 @@ class FileSettings:
     payload: Names = ()
     gains: Gains | None = None
     reference: Name = ""
+    columns: Mapping[str, Name] = field(default_factory=dict)
 
 
 @strict
@@ -198,6 +202,7 @@ class IdentifySettings(Choices):
     accept: tuple[Annotated[str, OneOf(FINDINGS)], ...] = ()
     gain_identification: GainPair | None = None
     recording: RecordingOptions = field(default_factory=RecordingOptions)
+    columns: Mapping[str, Name] = field(default_factory=dict)
     filter: FilterOptions = field(default_factory=FilterOptions)
     gains: Gains | None = None
     files: Mapping[str, FileSettings] = field(default_factory=dict)
@@ -234,8 +239,14 @@ class IdentifyOptions:
         settings = own_table(self.files, parse_cut(str(path))[0]) or self.every
         rows = self.settings.torque_rows
         samples = settings.recording.samples or USED
+        columns = {**settings.recording.columns, **settings.columns}
         recording = replace(
-            settings.recording, samples=samples, rows=rows.name, motors=rows.driven, sensors=rows.sensed
+            settings.recording,
+            samples=samples,
+            columns=columns,
+            rows=rows.name,
+            motors=rows.driven,
+            sensors=rows.sensed,
         )
         return replace(settings, recording=recording)
 
@@ -303,7 +314,7 @@ def options_of(keys: IdentifySettings, source: str = "settings") -> IdentifyOpti
     )
     for name, file in keys.files.items():
         check_keys(dict.fromkeys(file.payload), keys.payload, f'{source}: files."{name}".payload')
-    every = FileSettings(keys.recording, keys.filter, gains=keys.gains)
+    every = FileSettings(keys.recording, keys.filter, gains=keys.gains, columns=keys.columns)
     return IdentifyOptions(
         settings=settings,
         every=every,

@@ -8,9 +8,10 @@ constraint holds: its zeros in ``covariance.csv`` are the constraint's, and what
 
 ``unit`` in ``dynamics.json`` and ``metrics.json`` is "N m", or "A of joint 2" where currents had no gains: export,
 plan and excite refuse such a model. Gains that were identified stand in ``drive_gains.csv`` (joint, gain [N m per A],
-sigma, told) and under ``drive_gains`` in both; state them as ``gains`` to use them again. ``told`` is ``told``, the
-``reference`` that the others are relative to (1, without a sigma), or ``not told``: then gain and sigma are empty, and
-the joint's torque, friction and motor inertia are in amperes of its own motor, in every table.
+sigma, status) and under ``drive_gains`` in both; state them as ``gains`` to use them again. A gain is identified (in
+JSON ``told``), the ``reference`` that the others are relative to (1, without a sigma), or not identified (``not
+told``): then gain and sigma are empty, and the joint's torque, friction and motor inertia are in amperes of its own
+motor, in every table.
 
 ``torques_N.csv``: ``t [s]``, then ``measured_joint1 [N m]`` ... and predicted_ ... of each torque row and the joints
 ``q_joint1 [rad]`` ..., then sigma_ ... of each torque row, the standard deviation expected of measured - predicted

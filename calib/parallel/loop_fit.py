@@ -50,8 +50,7 @@ from calib.robot import calibrated
 from calib.robot.calibrated import ROBOT
 
 if TYPE_CHECKING:
-    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
-
+    from calib.api.result_table import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 

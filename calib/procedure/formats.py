@@ -16,6 +16,7 @@ FORMATS: Point[Mapping[str, tuple[str, str, str]]] = Point(
 # topic -> short description, and the modules whose docstrings document the topic
 TOPICS: Mapping[str, tuple[str, str]] = {
     "measurements": ("CSV files of measured poses, positions, distances", "calib.data.poses.pose_files"),
+    "pairs": ("pairs of poses (robot and board) without joints, for calib hand-eye", "calib.data.pose_pairs"),
     "options": ("the TOML file of calib fit --options", "calib.data.poses.fit_options"),
     "identify-options": (
         "the TOML file of calib identify --options",
@@ -49,12 +50,13 @@ TOPICS: Mapping[str, tuple[str, str]] = {
     ),
     "images": (
         "a folder of images of a board, its board.toml, camera.yaml, corners.csv",
-        "calib.data.images.image_folders calib.data.images.board calib.data.images.lens calib.data.images.pixels "
-        "calib.data.images.image_bags",
+        "calib.data.images.image_folders calib.data.images.board calib.data.images.lens calib.data.images.lens_files "
+        "calib.data.images.pixels calib.data.images.image_bags",
     ),
     "logs": (
         "logs of robot controllers, by brand, and ROS bags",
-        "calib.data.recordings.controller_logs calib.data.recordings.bags",
+        "calib.data.recordings.controller_logs calib.data.recordings.ros_texts calib.data.recordings.bags "
+        "calib.data.recordings.datasets",
     ),
     "descriptions": (
         "robots as xacro, MJCF and a UR's calibration.conf",

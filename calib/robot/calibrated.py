@@ -46,7 +46,7 @@ from numpy.typing import ArrayLike
 from calib.config_types import ParsedTable
 from calib.errors import CalibError, RobotError, one_of, refuse_robot
 from calib.folders import read_covariance, write_covariance
-from calib.records import frozen, shaped
+from calib.records import Floats, frozen, shaped
 from calib.robot import description
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, gravity_torques, joint_frames, sweep, tip_jacobian
@@ -286,7 +286,7 @@ class CalibratedChain:
         """Whether the nominal arm is known and the calibration changed one of its element values."""
         return self.nominal is not None and not np.array_equal(self.nominal.values, self.chain.values)
 
-    def forward(self, q: ArrayLike, torque: np.ndarray | None = None) -> np.ndarray:
+    def forward(self, q: ArrayLike, torque: np.ndarray | None = None) -> Floats:
         """Return the tip's poses in the base frame [m]: (m, 4, 4) at joint values (m, n), (4, 4) at (n,).
 
         If the robot has joint corrections, they are applied to the geometry that was fitted with them.
@@ -307,7 +307,7 @@ class CalibratedChain:
         poses = forward(self.complete, values, extra_displacements(self.complete, self.deflection, values, bases))
         return like_joints(q, poses)
 
-    def jacobian(self, q: ArrayLike) -> np.ndarray:
+    def jacobian(self, q: ArrayLike) -> Floats:
         """Return the tip's Jacobians [v; ω] in the base frame: (m, 6, n) at joint values (m, n), (6, n) at (n,).
 
         v is the velocity of the tip, ω its angular velocity, per unit joint velocity. The derivatives of joint

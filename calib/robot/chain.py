@@ -25,6 +25,8 @@ MIN_LIMIT = 1e-6
 MAX_GRAVITY = 100.0
 # Largest plausible mass, moment or length [SI] (our choice).
 MAX_NUMBER = 1e12
+# Names of the joints of a robot that is only known by the poses of its tip: coordinates, and angles about z, y, x.
+POSE_JOINTS = ("x", "y", "z", "c", "b", "a")
 # Least length [m] that a stretched arm counts as.
 MIN_STRETCHED_LENGTH = 0.1
 
@@ -177,6 +179,11 @@ class Chain:
     @property
     def joint_names(self) -> tuple[str, ...]:
         return tuple(joint.name for joint in self.joints)
+
+    @property
+    def is_free_flyer(self) -> bool:
+        """Whether the joints are the coordinates of the tip's pose, since the real joints are not known."""
+        return self.joint_names == POSE_JOINTS
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -270,6 +270,15 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, object] | None = N
 
     Args:
         path: the file.
+        chain, extra, source: as of `content`.
+    """
+    return files.write(path, content(chain, extra, source))
+
+
+def content(chain: Chain, extra: Mapping[str, object] | None = None, source: str = "") -> str:
+    """Return the text of a file from which `read` returns exactly the same chain.
+
+    Args:
         chain: any chain.
         extra: further tables by name (those named in `EXTRA`), written unchanged; None for no such tables.
         source: source of the numbers, written as a comment.
@@ -283,7 +292,7 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, object] | None = N
     head = {key: value for key, value in table.items() if key == "gravity" or not isinstance(value, (list, dict))}
     if source:
         head["source"] = source
-    return files.write(path, tables.dumps(head | table | dict(extra or {})))
+    return tables.dumps(head | table | dict(extra or {}))
 
 
 def from_elements(table: Mapping[str, object], where: str) -> Chain:

@@ -24,6 +24,7 @@ from calib.data.poses.measurements import Poses, Positions
 from calib.data.poses.pose_lists import read_poses
 from calib.data.recordings.recording import Recording
 from calib.data.schema import Joints
+from calib.errors import UsageError, require
 from calib.geometry.installation import Installation, see
 from calib.records import FieldValues, shaped
 from calib.robot.calibrated import evaluate
@@ -60,6 +61,12 @@ class SimulatedInstrument:
     outlier_size: float = 5e-3
     encoder_sigma: float = 1e-5
     base_frame: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name not in ("name", "base_frame") and value is not None:
+                wrong = isinstance(value, str) or not 0.0 <= value < np.inf
+                require(not wrong, f"SimulatedInstrument: {name} = {value!r}: expected 0 or more", UsageError)
 
 
 @dataclass(frozen=True, eq=False)

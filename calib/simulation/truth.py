@@ -15,6 +15,7 @@ from calib.geometry.accuracy import errors
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
+from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import gravity_torques
 from calib.simulation.cell import Cell, true_poses
@@ -52,14 +53,14 @@ def position_errors(cell: Cell, calibrated: Installation, urdf: Chain) -> tuple[
         station=calibrated.station_names[0],
         tool_names=calibrated.tool_names[:1],
     )
-    nominal_arm = _placed(cell.nominal, block)
-    urdf_arm = _placed(urdf, block)
+    nominal_arm = placed(cell.nominal, block)
+    urdf_arm = placed(urdf, block)
     return _rms(nominal_arm, block), _rms(calibrated, block), _rms(urdf_arm, block)
 
 
-def _placed(chain: Chain, block: Poses) -> Installation:
-    """Return an arm with its best station and tool for the poses of a block."""
-    guess = install(chain, [block])
+def placed(chain: Chain, block: Poses, deflection: Deflection | None = None) -> Installation:
+    """Return an arm, with its deflection if any, with its best station and tool for the poses of a block."""
+    guess = install(chain, [block], deflection)
     return polish_frames(guess, [block]).cell
 
 

@@ -93,7 +93,9 @@ class MovingArm:
         return model + self.unmodelled.cable_torques(q, self.effort)
 
 
-def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors = UNMODELLED) -> MovingArm:
+def moving_arm(
+    cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors = UNMODELLED, masses: float = 1.0
+) -> MovingArm:
     """Return the simulated real arm of a cell, with its dynamics, controller and sensors.
 
     Args:
@@ -101,15 +103,16 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
         robot: name of the robot in the library.
         seed: seed of the errors of the nominal masses.
         unmodelled: torques that no model describes.
+        masses: scale of the errors of the nominal masses.
 
     Raises:
-        CalibError: if the library has no masses for the robot.
+        CalibError: if the robot's description has no masses.
     """
     nominal = cell.nominal
     if nominal.inertias is None:
-        raise CalibError(f"the library has no masses for {robot}, so that its motion cannot be simulated")
+        raise CalibError(f"the description of {robot} has no masses, so that its motion cannot be simulated")
     rng = np.random.default_rng([seed, 71])
-    bodies = [_perturbed(row, rng) for row in nominal.inertias]
+    bodies = [_perturbed(row, rng, masses) for row in nominal.inertias]
     chain = replace(cell.truth.chain, inertias=np.array(bodies))
     effort = np.array([joint.effort for joint in chain.joints])
     effort = np.where(np.isfinite(effort), effort, DEFAULT_EFFORT)
@@ -142,8 +145,8 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
     if sensors:
         noise = f"{SIGMA_MOTOR:.1%} (motors) and {SIGMA_LINK:.1%} (sensors)"
     note = (
-        f"masses off their nominal by {2 * MASS:.0%}, centres by {1e3 * SHIFT:g} mm (1 sigma); {source}; torque noise "
-        f"{noise} of the limits{unmodelled.note}"
+        f"masses off their nominal by {2 * MASS * masses:.0%}, centres by {1e3 * SHIFT * masses:g} mm (1 sigma); "
+        f"{source}; torque noise {noise} of the limits{unmodelled.note}"
     )
     return MovingArm(
         chain=chain,
@@ -297,15 +300,15 @@ def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, s
     return np.column_stack(columns), source
 
 
-def _perturbed(parameters: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return the ten standard parameters of a body after random changes of shape, centre and mass.
+def _perturbed(parameters: np.ndarray, rng: np.random.Generator, scale: float) -> np.ndarray:
+    """Return the ten standard parameters of a body after random changes of shape, centre and mass, times `scale`.
 
     T P Tᵀ of the pseudo-inertia P (`calib.dynamics.pseudo_inertia`) is positive definite where P is.
     """
     transform = np.eye(4)
-    transform[:3, :3] += STRETCH * rng.standard_normal((3, 3))
-    transform[:3, 3] = SHIFT * rng.standard_normal(3)
-    mass_scale = (1.0 + MASS * rng.standard_normal()) ** 2
+    transform[:3, :3] += scale * STRETCH * rng.standard_normal((3, 3))
+    transform[:3, 3] = scale * SHIFT * rng.standard_normal(3)
+    mass_scale = (1.0 + scale * MASS * rng.standard_normal()) ** 2
     pseudo_inertia = from_standard(parameters)
     perturbed = mass_scale * transform @ pseudo_inertia @ transform.T
     return to_standard(perturbed)

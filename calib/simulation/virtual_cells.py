@@ -1,10 +1,13 @@
 """Simulated cells: the LWR4+ of the paper, and robots of the library with random geometric errors."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib.arguments import checked
+from calib.config_types import Real
 from calib.geometry.installation import Installation
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
@@ -27,10 +30,42 @@ OFFSET = 3e-3
 COMPLIANCE = 2e-5
 AMPLITUDE = 6e-4
 HIDDEN_SEED = 2
+# Hidden deflections of a perturbed arm as a share of those of the LWR4+ (our choice).
+SHARE = 0.2
 # Scale of the hidden deflections where `UNMODELLED` errors are added.
 MODELLED = 0.7
 # Sizes of the errors that no model describes (our choice).
 UNMODELLED = PositionErrors(gear=4e-4, backlash=5e-5, growth=5e-5, droop=5e-5, seed=2)
+# A size of planted errors.
+NOT_NEGATIVE = Real(least=0.0)
+
+
+@checked
+@dataclass(frozen=True)
+class PlantedErrors:
+    """Standard deviations and sizes of the errors that are planted in an arm; 0 for none of a kind.
+
+    The defaults are as large as those of real arms (`virtual_cell`).
+
+    Attributes:
+        length: σ of each length of the chain [m].
+        angle: σ of each angle of the chain [rad].
+        offset: σ of each joint's offset [rad, or m for a prismatic joint].
+        compliance: compliance of each joint under gravity [rad/(N m)], where the masses are known.
+        harmonics: amplitude of each of two harmonics of each joint [rad; 0.3 times that value in m for a prismatic
+            joint].
+        unmodelled: scale of the errors of position and torque that no model describes (`calib.simulation.unmodelled`);
+            1 is our choice for an industrial arm.
+        masses: scale of the errors of the nominal masses (8 %), centres of mass (6 mm) and shapes.
+    """
+
+    length: Annotated[float, NOT_NEGATIVE] = LENGTH
+    angle: Annotated[float, NOT_NEGATIVE] = ANGLE
+    offset: Annotated[float, NOT_NEGATIVE] = OFFSET
+    compliance: Annotated[float, NOT_NEGATIVE] = SHARE * COMPLIANCE
+    harmonics: Annotated[float, NOT_NEGATIVE] = SHARE * AMPLITUDE
+    unmodelled: Annotated[float, NOT_NEGATIVE] = 1.0
+    masses: Annotated[float, NOT_NEGATIVE] = 1.0
 
 
 def deflection(chain: Chain, compliance: np.ndarray, amplitude: np.ndarray, seed: int) -> Deflection:
@@ -70,8 +105,19 @@ def virtual_cell(robot: str = "lwr4plus", seed: int = 0, instrument: SimulatedIn
     """
     if robot == "lwr4plus":
         return lwr4plus_cell(instrument, MODELLED, UNMODELLED)
-    unmodelled = replace(UNMODELLED, gear=0.2 * UNMODELLED.gear)
+    unmodelled = industrial(1.0)
     return perturbed_cell(load(robot), seed, instrument, unmodelled=unmodelled)
+
+
+def industrial(scale: float) -> PositionErrors:
+    """Return `UNMODELLED` errors of an industrial arm, whose gears have a fifth of the LWR4+'s, times a scale."""
+    return PositionErrors(
+        gear=SHARE * UNMODELLED.gear * scale,
+        backlash=UNMODELLED.backlash * scale,
+        growth=UNMODELLED.growth * scale,
+        droop=UNMODELLED.droop * scale,
+        seed=UNMODELLED.seed,
+    )
 
 
 def lwr4plus_cell(
@@ -110,7 +156,7 @@ def perturbed_cell(
     instrument: SimulatedInstrument = CMM,
     *,
     size: float = 1.0,
-    hidden: float = 0.2,
+    hidden: float = SHARE,
     unmodelled: PositionErrors = NO_ERRORS,
 ) -> Cell:
     """Return a cell whose true arm differs from the nominal arm by normal random errors.
@@ -123,41 +169,55 @@ def perturbed_cell(
         hidden: scale of the hidden deflections, relative to those of the LWR4+.
         unmodelled: errors that no model describes.
     """
+    planted = PlantedErrors(size * LENGTH, size * ANGLE, size * OFFSET, hidden * COMPLIANCE, hidden * AMPLITUDE)
+    return planted_cell(nominal, seed, instrument, planted, unmodelled)
+
+
+def planted_cell(
+    nominal: Chain, seed: int, instrument: SimulatedInstrument, planted: PlantedErrors, unmodelled: PositionErrors
+) -> Cell:
+    """Return a cell whose true arm has planted errors.
+
+    Args:
+        nominal: the arm as it is described.
+        seed: seed of the errors, of the placements of instrument and tool, and of the harmonics' phases.
+        instrument: the instrument.
+        planted: sizes of the errors.
+        unmodelled: errors that no model describes.
+    """
     rng = np.random.default_rng(seed)
-    true = _perturbed(nominal, rng, size)
+    true = _perturbed(nominal, rng, planted)
     zero_pose = forward(nominal, np.zeros((1, nominal.n)))[0]
     span = float(np.linalg.norm(zero_pose[:3, 3])) + 0.5
     station = _random_pose(rng, 3.0 * span)
     tool = _random_pose(rng, 0.12)
 
-    compliance = np.full(true.n, hidden * COMPLIANCE)
-    amplitude = np.full(true.n, AMPLITUDE)
+    compliance = np.full(true.n, planted.compliance)
+    amplitude = np.full(true.n, planted.harmonics)
     for j, joint in enumerate(true.joints):
         if joint.kind != "revolute":
-            amplitude[j] = 0.3 * AMPLITUDE
-    hidden_deflection = deflection(true, compliance, hidden * amplitude, seed)
+            amplitude[j] = 0.3 * planted.harmonics
+    hidden_deflection = deflection(true, compliance, amplitude, seed)
     truth = Installation(true, station[None], tool[None], deflection=hidden_deflection)
     note = (
-        f"simulated {nominal.name}: errors per element of {size * LENGTH * 1e3:g} mm or "
-        f"{size * ANGLE * 1e3:g} mrad, joint offsets of {size * OFFSET * 1e3:g} mrad (1 sigma), plus hidden deflections"
+        f"simulated {nominal.name}: errors per element of {planted.length * 1e3:g} mm or {planted.angle * 1e3:g} mrad, "
+        f"joint offsets of {planted.offset * 1e3:g} mrad (1 sigma), plus hidden deflections"
         f"{unmodelled.note}"
     )
     return Cell(nominal, truth, instrument, note, unmodelled)
 
 
-def _perturbed(chain: Chain, seed: int | np.random.Generator, size: float = 1.0) -> Chain:
-    """Return the chain with normal random errors (`LENGTH`, `ANGLE`; `OFFSET` for joint offsets) in all elements."""
-    rng = np.random.default_rng(seed)
+def _perturbed(chain: Chain, rng: np.random.Generator, planted: PlantedErrors) -> Chain:
+    """Return the chain with normal random errors in all elements, of the sizes `planted`."""
     sigmas = []
     for element in chain.elements:
         if element.unit == "m":
-            sigmas.append(LENGTH)
+            sigmas.append(planted.length)
         elif element.joint is not None:
-            sigmas.append(OFFSET)
+            sigmas.append(planted.offset)
         else:
-            sigmas.append(ANGLE)
-    sigma = size * np.array(sigmas)
-    errors = sigma * rng.standard_normal(len(sigmas))
+            sigmas.append(planted.angle)
+    errors = np.array(sigmas) * rng.standard_normal(len(sigmas))
     return chain.with_values(chain.values + errors)
 
 

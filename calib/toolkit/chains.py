@@ -1,11 +1,12 @@
 """Robots: kinematic chains, calibrated chains, the library of arms, descriptions and controllers."""
 
-from calib.controllers.table import Controller, check_controller, controller_named, controller_of, controllers
+from calib.controllers.axes import Axes, PlainJoint, as_described, axes_of, check_controller, check_pulses, named_axis
+from calib.controllers.table import Controller, controller_named, controller_of, controllers
 from calib.robot.calibrated import ROBOT as ROBOT_FILE
 from calib.robot.calibrated import CalibratedChain, Deflection, Term, evaluate, nominal_of
 from calib.robot.calibrated import read as read_calibrated
 from calib.robot.calibrated import write as write_calibrated
-from calib.robot.chain import AXES, Chain, Element, Joint, joint_kinds, random_joints
+from calib.robot.chain import AXES, POSE_JOINTS, Chain, Element, Joint, joint_kinds, random_joints
 from calib.robot.collision import find_mesh, urdf_meshes
 from calib.robot.formats.urdf_tree import UrdfTree, is_urdf
 from calib.robot.formats.urdf_tree import numbers as read_numbers
@@ -17,19 +18,27 @@ from calib.robot.library import load, load_calibrated, resolve
 from calib.robot.library import names as robot_names
 from calib.robot.tables import dumps as toml_text
 from calib.robot.tables import load as toml_table
+from calib.units import NamedJoint
 
 __all__ = [
     "AXES",
+    "POSE_JOINTS",
     "ROBOT_FILE",
+    "Axes",
     "CalibratedChain",
     "Chain",
     "Controller",
     "Deflection",
     "Element",
     "Joint",
+    "NamedJoint",
+    "PlainJoint",
     "Term",
     "UrdfTree",
+    "as_described",
+    "axes_of",
     "check_controller",
+    "check_pulses",
     "controller_named",
     "controller_of",
     "controllers",
@@ -42,6 +51,7 @@ __all__ = [
     "joint_kinds",
     "load",
     "load_calibrated",
+    "named_axis",
     "nominal_of",
     "random_joints",
     "read_calibrated",

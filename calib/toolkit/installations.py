@@ -1,7 +1,8 @@
 """Geometry: installations of robots and instruments, observation models, fits, inverse kinematics."""
 
+from calib.geometry.checks.pose_direction import direction, median_misfit
 from calib.geometry.error_model import Discrepancy, ErrorModel, outside
-from calib.geometry.first_guess import check_scale, chordal_turns, install, misfit, place_pose
+from calib.geometry.first_guess import check_scale, chordal_turns, install
 from calib.geometry.fit import PLAUSIBLE, plausible_deviation
 from calib.geometry.fit import fit as fit_installation
 from calib.geometry.installation import FRAME_AXES, Installation, NoOptics, read_arms, see
@@ -39,18 +40,18 @@ __all__ = [
     "chordal_turns",
     "conditions",
     "differences",
+    "direction",
     "families",
     "fit_installation",
     "held_back",
     "install",
     "layout",
     "layout_counts",
-    "misfit",
+    "median_misfit",
     "nearest",
     "observe",
     "outside",
     "parameter_values",
-    "place_pose",
     "plausible_deviation",
     "pose_sigmas",
     "prepare",

@@ -1,6 +1,12 @@
 """Recordings: joint positions and torques over time, the motions filtered from recordings, and planned motions."""
 
+from calib.data.joint_columns import words_of
+from calib.data.recordings.datasets import dataset_table, is_dataset
+from calib.data.recordings.log_columns import families, series_of, time_column
 from calib.data.recordings.recording import Recording
+from calib.data.recordings.recording_options import SYNONYMS
+from calib.data.recordings.stamps import likely_unit
+from calib.data.recordings.topics import at_times
 from calib.data.signals.bandwidth import USABLE
 from calib.data.signals.filtering import design_decimator
 from calib.data.signals.motion import FilterOptions, make_motion
@@ -18,11 +24,20 @@ __all__ = [
     "PLANNED_FILE",
     "RUN_FILE",
     "SAMPLES_FILE",
+    "SYNONYMS",
     "TRAJECTORY_FILE",
     "USABLE",
     "FilterOptions",
     "Recording",
+    "at_times",
+    "dataset_table",
     "design_decimator",
+    "families",
+    "is_dataset",
+    "likely_unit",
     "make_motion",
     "read_trajectory",
+    "series_of",
+    "time_column",
+    "words_of",
 ]

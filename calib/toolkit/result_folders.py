@@ -13,6 +13,8 @@ from calib.procedure.kinematic_stage.fit_tables import read_covariance
 from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.inputs import read_file as read_measured_file
+from calib.procedure.kinematic_stage.mastering import NoOffsets
+from calib.procedure.kinematic_stage.mastering import read as read_mastering
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import joints_of, stage_of
@@ -37,6 +39,7 @@ __all__ = [
     "GeometryFit",
     "IdentificationFolder",
     "Measured",
+    "NoOffsets",
     "Note",
     "Played",
     "Progress",
@@ -66,6 +69,7 @@ __all__ = [
     "prediction",
     "read_covariance",
     "read_exported",
+    "read_mastering",
     "read_measured_file",
     "saved",
     "sentence",

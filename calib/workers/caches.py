@@ -70,15 +70,24 @@ def _temporary(name: str) -> Path:
     import shutil
     import tempfile  # slow to load
 
-    parent = Path(tempfile.gettempdir()) / FOLDER.format(user=os.getuid())
+    parent = Path(tempfile.gettempdir()) / FOLDER.format(user=_user())
     with suppress(FileExistsError):
         parent.mkdir(mode=0o700)
     # compiled code is loaded from there: nobody else may have written it
     status = parent.lstat()
-    private = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077
+    private = stat.S_ISDIR(status.st_mode)
+    if sys.platform != "win32":  # there a user's temporary folder is the user's own
+        private = private and status.st_uid == os.getuid() and not status.st_mode & 0o077
     if not private:
         parent = Path(tempfile.mkdtemp(prefix="calib-cache-"))
         atexit.register(shutil.rmtree, parent, ignore_errors=True)
     folder = parent / name
     folder.mkdir(exist_ok=True)
     return folder
+
+
+def _user() -> str:
+    """Return what distinguishes this user in the name of a folder."""
+    if sys.platform == "win32":
+        return "windows"
+    return str(os.getuid())

@@ -37,6 +37,7 @@ PACKAGES = {
     "cvxpy": Package("constraints", "constraints as CVXPY expressions"),
     "rosbags": Package("bags", "ROS bags"),
     "mujoco": Package("mujoco", "MJCF files as robots"),
+    "pyarrow": Package("parquet", "LeRobot data sets and Parquet files"),
     "pandas": Package("pandas", "data frames"),
     "distributed": Package("cluster", "a Dask scheduler"),
     "starlette": Package("serve", "calib serve"),

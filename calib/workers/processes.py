@@ -13,7 +13,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing import connection, get_context, parent_process, resource_tracker
@@ -168,6 +168,19 @@ GRACE = 3.0  # [s] that tasks have to hand back what they found after Ctrl-C (ou
 ATTEMPTS = 3  # processes that a task may take along before it is given up (our choice)
 
 
+@contextmanager
+def _without_interrupt() -> Iterator[None]:
+    """Hold Ctrl-C back within the block, also from processes that are started in it; Windows has no such mask."""
+    if sys.platform == "win32":
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 class _Process:
     """A spawned process that runs one task at a time; if the process dies, it is known which task was lost."""
 
@@ -178,13 +191,13 @@ class _Process:
         self.ready, self.number, self.call = False, -1, b""
 
     def start(self) -> None:
-        resource_tracker.ensure_running()  # else the process's start does, and lets Ctrl-C through
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # inherited until `_serve` can deal with it
+        if sys.platform != "win32":
+            resource_tracker.ensure_running()  # else the process's start does, and lets Ctrl-C through
         try:
-            self.process.start()
+            with _without_interrupt():  # inherited until `_serve` can deal with it
+                self.process.start()
         finally:
             self.theirs.close()
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def run(self, number: int, call: bytes) -> None:
         self.number, self.call = number, call
@@ -197,8 +210,8 @@ class _Process:
         self.call = b""
 
     def interrupt(self) -> None:
-        if self.process.is_alive() and self.process.pid is not None:
-            os.kill(self.process.pid, signal.SIGINT)
+        if self.process.is_alive() and self.process.pid is not None and sys.platform != "win32":
+            os.kill(self.process.pid, signal.SIGINT)  # on Windows, Ctrl-C reaches all processes of a console by itself
 
 
 class Processes:
@@ -312,7 +325,8 @@ def _serve(pipe: connection.Connection) -> None:
     Thread(target=end_with_parent, daemon=True).start()
     sys.unraisablehook = _unheard
     hush()
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
+    if sys.platform != "win32":
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT])
     with suppress(EOFError, OSError, KeyboardInterrupt):  # the last where one more came before `hush`
         pipe.send((b"ready", False))
         while True:

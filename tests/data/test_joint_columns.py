@@ -27,8 +27,27 @@ def columns_read(header, joints, kinds=()):
 
 @pytest.mark.parametrize(
     "form",
-    ["A{}", "a{}", "J{}", "JT{}", "Joint{}", "joint {}", "theta{}", "θ{}", "rax_{}", "Achse{}", "Gelenk {} (Ist)"]
-    + ["Eje {}", "关节{}", "field.position{}", "axis[{}]", "Joint{}Angle", "actual_q_{}", "J{} pos", "Axe-{}"],
+    [
+        "A{}",
+        "a{}",
+        "J{}",
+        "JT{}",
+        "Joint{}",
+        "joint {}",
+        "theta{}",
+        "θ{}",
+        "rax_{}",
+        "Achse{}",
+        "Gelenk {} (Ist)",
+        "Eje {}",
+        "关节{}",
+        "field.position{}",
+        "axis[{}]",
+        "Joint{}Angle",
+        "actual_q_{}",
+        "J{} pos",
+        "Axe-{}",
+    ],
 )
 @pytest.mark.parametrize("first", [0, 1])
 def test_numbered_joints_in_any_order_of_columns(form, first):

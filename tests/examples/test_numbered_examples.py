@@ -25,9 +25,9 @@ def figures(pattern: str, said: str) -> list[float]:
     return [float(each) for each in re.findall(pattern, said)]
 
 
-def test_eight_examples_read_in_a_minute():
-    """There are eight examples, and each is read in a minute."""
-    assert [path.name[:2] for path in NUMBERED] == [f"0{k}" for k in range(1, 9)]
+def test_nine_examples_read_in_a_minute():
+    """There are nine examples, and each is read in a minute."""
+    assert [path.name[:2] for path in NUMBERED] == [f"0{k}" for k in range(1, 10)]
     for path in NUMBERED:
         lines = path.read_text(encoding="utf-8").splitlines()
         assert len(lines) <= 25 and lines[0].startswith('"""') and path.name in "\n".join(lines[:5]), path.name
@@ -95,3 +95,13 @@ def test_08_certificate_and_fleet(tmp_path):
     said = run("08_certificate_and_fleet.py", tmp_path)
     assert said.count(": waits, ") == 2 and said.count("done, pass") == 2
     assert all((tmp_path / f"cell{k}/certificate.html").is_file() for k in (1, 2))
+
+
+@pytest.mark.slow
+def test_09_study_on_planted_arms(tmp_path, capsys):
+    """On each arm both robust losses come nearer to the hidden truth than none."""
+    said = run_here(EXAMPLES / "09_study_on_planted_arms.py", tmp_path, capsys=capsys)
+    errors = {loss: figures(rf"{loss} +([\d.]+)", said) for loss in ("none", "huber", "cauchy")}
+    assert [len(values) for values in errors.values()] == [3, 3, 3]
+    for plain, huber, cauchy in zip(*errors.values()):
+        assert max(huber, cauchy) < plain

@@ -10,10 +10,10 @@ import pytest
 import calib
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
-from calib.dynamics.tables import knots_of
 from calib.errors import UsageError
 from calib.identification.closed_loop import controllers
 from calib.identification.closed_loop.simulation import Plant, Sensing, simulate
+from calib.identification.friction.function_tables import knots_of
 from calib.identification.model_file import read_dynamics
 from calib.simulation import known_robots
 

@@ -19,8 +19,11 @@ from calib.identification.identify import identify
 from calib.identification.physical_consistency.solve import Contradiction, contradiction
 from calib.identification.rows import Case, make_case
 from calib.identification.settings import IdentificationSettings
-from calib.procedure.dynamic_stage.plausibility import described, findings, impossible, wrong_joints
-from calib.procedure.findings import Verdict, level_of, settle
+from calib.procedure.dynamic_stage.hypotheses import tare_findings
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs, gather
+from calib.procedure.dynamic_stage.plausibility import described, findings, impossible, sampling_findings, wrong_joints
+from calib.procedure.findings import Verdict, level_of, lines_of, settle
+from calib.robot.calibrated import CalibratedChain
 from calib.robot.library import load
 from calib.simulation.known_robots import random_fourier
 
@@ -38,6 +41,11 @@ def recorded(late: float = 0.0, clock: float = 1.0, seed: int = 0, **series: np.
 
 def case_of(recording: Recording) -> Case:
     return make_case("log", make_motion(recording, FilterOptions(cutoff=30.0, band=10.0)))
+
+
+def inputs_of(recording: Recording) -> IdentificationInputs:
+    """Return the inputs of an identification of the planted arm from one recording, checked as a file is."""
+    return gather(CalibratedChain(ARM, source="planted"), [recording])
 
 
 def found(recording: Recording, gravity: tuple[float, ...] | None = None) -> list[Finding]:
@@ -216,6 +224,34 @@ def test_jumping_encoder_is_named_with_rows() -> None:
     assert level_of(one) == "marginal" and one.values == {"file": "log", "jump": jumping.jumps[0]}
 
 
+def test_jitter_of_stamps_is_no_jump():
+    """Stamps that jitter by a third of a step make no encoder jump."""
+    log = recorded()
+    jitter = 1.6e-3 * np.random.default_rng(0).uniform(-1.0, 1.0, len(log))
+    fast = replace(log, t=log.t / 4.0 + jitter / 4.0, v=None)
+    assert check_recording(fast).jumps == ()
+
+
+def test_jitter_and_lost_samples_are_noted() -> None:
+    log, rng = recorded(), np.random.default_rng(0)
+    jittered = replace(log, t=log.t + 1.2e-3 * rng.uniform(-1.0, 1.0, len(log)), v=None)
+    (jitter,) = sampling_findings([case_of(jittered)])
+    assert jitter.code == "stamps-jitter" and 0.15 < jitter.values["jitter"] < 0.4
+    (missing,) = sampling_findings([case_of(log.take(rng.random(len(log)) > 0.08))])
+    assert missing.code == "samples-missing" and missing.values["share"] == pytest.approx(0.08, abs=0.02)
+    assert sampling_findings([case_of(log)]) == []
+
+
+@pytest.mark.parametrize("kind", ["average", "start"])
+def test_tared_torques_are_named(kind):
+    """Torques zeroed over the log, or at its start, are named; offsets of friction are not."""
+    tau = recorded().effort
+    zero = tau.mean(axis=0) if kind == "average" else tau[:20].mean(axis=0)
+    told = tare_findings(inputs_of(recorded(tau=tau - zero)), None)
+    assert [(one.code, one.values["kind"]) for one in told] == [("torques-tared", kind)]
+    assert tare_findings(inputs_of(recorded()), None) == []
+
+
 @pytest.mark.parametrize("clock, level", [(1.0, None), (1.2, None), (2.0, "fail"), (0.5, "fail"), (3.0, "fail")])
 def test_a_clock_is_told_without_velocities(clock: float, level: str | None) -> None:
     """Of a robot whose masses are not known, too: lengths suffice."""
@@ -308,6 +344,22 @@ def test_contradicting_dates_have_both_rates(clock: float, speed: float) -> None
     assert level_of(one) == ("fail" if not 0.6 < clock * speed < 1.5 else "marginal")
     assert one.values["rate"] == pytest.approx(200.0 / clock, rel=0.01)
     assert one.values["counted"] == pytest.approx(200.0 * speed, rel=0.01)
+
+
+@pytest.mark.parametrize(("factor", "unit"), [(30.0 / np.pi, "rpm"), (1e3, "mrad/s or mm/s"), (2.0, None)])
+def test_unit_of_velocities_is_named(factor: float, unit: str | None) -> None:
+    v = recorded().v
+    assert v is not None
+    (told,) = coded(found(recorded(v=factor * v)), "velocities-scaled")
+    assert told.values["unit"] == unit and (unit is None or unit in "; ".join(lines_of([told])))
+
+
+def test_frozen_position_is_asked_for() -> None:
+    """A joint that alone never moves, although its torque varies, may have a frozen column."""
+    q = np.array(recorded().q)
+    q[:, 1] = q[0, 1]
+    (note,) = check_recording(replace(recorded(), q=q, v=None)).notes
+    assert "joint2 never moves" in note and "is its position column frozen?" in note
 
 
 def test_inertias_tell_stamps_or_velocities() -> None:

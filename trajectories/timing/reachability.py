@@ -235,7 +235,8 @@ def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
         from toppra.algorithm import TOPPRA
     except ImportError as error:
         raise BadInput(
-            "timing needs toppra: pip install 'armature-calib[timing]' (on macOS and Windows: pip install toppra, from source)"
+            "timing needs toppra: pip install 'armature-calib[timing]' (on macOS and Windows: pip install toppra, from "
+            "source)"
         ) from error
     sizes = np.abs(rows.b)
     size = sizes.max(axis=(0, 2), initial=1e-12)

@@ -1,6 +1,5 @@
 """The demonstration: a calibration session on a simulated cell, then a comparison with the hidden true parameters."""
 
-import resource
 import sys
 import time
 from collections.abc import Sequence
@@ -99,7 +98,7 @@ class DemoResult:
         asks: instructions to the engineer where the demonstration stopped; else empty.
         nominal, calibrated: rms position errors of the nominal and of the calibrated arm against the hidden truth [mm];
             NaN where the demonstration stopped.
-        memory: peak memory use of the process (largest resident set) [MB].
+        memory: peak memory use of the process (largest resident set) [MB]; 0 on Windows.
     """
 
     session: Session
@@ -185,9 +184,7 @@ def run(
         from calib.apps.cell_demo.picture import draw
 
         draw(session)
-    # the system counts in bytes on macOS, in kB on Linux
-    unit = 2.0**20 if sys.platform == "darwin" else 2.0**10
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
+    memory = _peak_memory()
     seconds = time.perf_counter() - started
     verdict = session.verdicts().level
     return DemoResult(session, verdict, seconds, (), before, after, memory)
@@ -415,3 +412,14 @@ def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
             noise = np.random.default_rng([seed, noise_seed, number])
             recorded = record(loaded, reference, noise, running + number * PAYLOAD_RUNNING)
             write_log(recorded, session.path(f"7-recorded/{log_name(name, label)}"))
+
+
+def _peak_memory() -> float:
+    """Return the largest resident set of this process [MB]; 0 on Windows, where it is not asked for."""
+    if sys.platform == "win32":
+        return 0.0
+    import resource
+
+    # the system counts in bytes on macOS, in kB on Linux
+    unit = 2.0**20 if sys.platform == "darwin" else 2.0**10
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit

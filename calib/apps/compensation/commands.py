@@ -28,6 +28,8 @@ def compensate(
     start: str | None = None,
     tolerance: Annotated[str, typer.Option(metavar="MM,MRAD")] = "0.001,0.01",
     controller: str = "",
+    external: list[str] | None = None,
+    pulses: Annotated[str | None, typer.Option("--pulse", metavar="NUMBERS")] = None,
     partial: bool = False,
     overwrite: bool = False,
     seed: Seed = 0,
@@ -60,6 +62,8 @@ def compensate(
         start: q1,...,qn [rad, m] initial guess for targets without joints
         tolerance: largest error of a command by the calibrated model
         controller: whose program it is, if not as its suffix says: calib program --list
+        external: program: joint that is an external axis, where names and kinds do not tell; repeatable
+        pulses: program: pulses per degree or mm of each axis, the arm's first (Yaskawa)
         partial: write the reached targets even if others are not reached
     """
     from calib import files
@@ -76,7 +80,8 @@ def compensate(
     program = None
     suffix = ".csv"
     if controller or is_program(targets):
-        program = read_program(targets, controller)
+        counts = numbers(pulses, fitted.nominal.chain.n, "--pulse") if pulses else ()
+        program = read_program(targets, controller, fitted.nominal.chain.joints, external or (), counts)
         suffix = targets.suffix
     if program is not None and targets.suffix.lower() in program.controller.saved:
         message = "contains saved registers, not a program: compensate the program, or use calib program --for csv"

@@ -150,12 +150,7 @@ def compensated(
     """
     statements = statements or Statements()
     joints, poses = program.of("joints"), program.of("pose")
-    n = fitted.nominal.chain.n
-    if joints and len(program.targets[joints[0]].values) != n:
-        axes = len(program.targets[joints[0]].values)
-        raise UsageError(
-            f"{program.path}: its targets have {axes} axes, but the robot has {n} joints: is it for another robot?"
-        )
+    _check_arm(fitted, program)
     groups, notes = (), ()
     if poses:
         placement = placed(fitted, program, frame, statements)
@@ -167,9 +162,31 @@ def compensated(
         targets = Targets(program.joints(), file=str(program.path))
         tool = tool_in_tip(fitted, program.controller, statements)
         commands = computed(fitted, targets, tool=tool, **options)
-        parts.append(Part(tuple(joints), commands, program.controller.shown(commands.q)))
+        parts.append(Part(tuple(joints), commands, program.shown(commands.q)))
     parts += [_compensated_group(fitted, program, group, start, options) for group in groups]
     return CompensatedProgram(program, tuple(parts), notes)
+
+
+def _check_arm(fitted: Fitted, program: Program) -> None:
+    """Raise UsageError for joint targets of another robot, or poses of a robot on external axes.
+
+    Args:
+        fitted: the calibrated arm.
+        program: the program.
+    """
+    chain = fitted.nominal.chain
+    axes = len(program.axes.joints)
+    if program.of("joints") and axes != chain.n:
+        raise UsageError(
+            f"{program.path}: its targets have {axes} axes, but the robot has {chain.n} joints: "
+            "is it for another robot?"
+        )
+    lines = [program.targets[k].line for k in program.of("pose")]
+    if lines and program.controller.axes and chain.n > max(program.controller.axes):
+        raise UsageError(
+            f"{program.path}: line {listing(lines, 3)}: poses of an arm with external axes are not compensated, since "
+            "the frame in which they stand may move with these axes: give joint targets, or a CSV of targets"
+        )
 
 
 def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], start: Sequence[float] | None) -> None:

@@ -58,9 +58,9 @@ def program(
         out = poses.with_name(poses.name.partition(".")[0])
     texts = program_files(poses, out, controller, settings, source)
     if source or is_program(poses):
-        warning = read_program(poses, source).unread
-        if warning:
-            say(warning)
+        program = read_program(poses, source, None, settings.external, settings.pulses)
+        remarks = [remark for remark in (*program.notes, program.unread) if remark]
+        say(*remarks)
     with files.results([(path, ()) for path in texts], [poses], overwrite):
         written = [files.write(path, text) for path, text in texts.items()]
         say(*(f"written to {path}" for path in written))
@@ -72,6 +72,7 @@ def deliver(
     controller: Annotated[str, typer.Option("--for", metavar="NAME")],
     world: Annotated[str | None, typer.Option(metavar="POSE")] = None,
     flange: Annotated[str | None, typer.Option(metavar="POSE")] = None,
+    external: list[str] | None = None,
     out: Path | None = None,
     overwrite: bool = False,
 ) -> None:
@@ -87,6 +88,7 @@ def deliver(
         controller: the robot's controller: calib program --list
         world: x,y,z[,roll,pitch,yaw] [m, rad] of the controller's base frame in the arm's, if the URDF does not say it
         flange: the same of the controller's flange (its all-zero tool) in the arm's tip
+        external: joint that is an external axis (rail, positioner), where names and kinds do not tell; repeatable
         out: text file; by default it is printed
     """
     from calib import files
@@ -96,7 +98,7 @@ def deliver(
     from calib.toolkit.result_folders import geometry_results
 
     statements = stated_frame(world, "--world"), stated_frame(flange, "--flange")
-    text = delivery_text(folder, controller_named(controller), *statements)
+    text = delivery_text(folder, controller_named(controller), *statements, external or ())
     if out is None:
         say(text, result=True)
         return

@@ -2,23 +2,24 @@
 
 A controller that keeps its nominal geometry accepts a tool frame and the instrument's frame; those with which the
 nominal arm fits the measurements best are printed. A controller whose axes can be mastered anew accepts joint offsets,
-and the frames that were fitted together with them. These are taken from a fit with ``--model offsets``, since the joint
-offsets of a model with more parameters are not the best ones when used alone.
+and the frames that were fitted together with them. These are of a fit of offsets alone to the same measurements, since
+the joint offsets of a model with more parameters are not the best ones when used alone.
 
 Each frame is relative to the controller's base or flange (`calib.apps.controller_programs.frames`), which is printed
 too. Where the pose of that base or flange is not known, no numbers are printed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from calib.apps.controller_programs.frames import ControllerFrame, Description, base_frame, flange_frame
 from calib.apps.controller_programs.targets import number, pose_values
-from calib.toolkit.chains import CalibratedChain, Controller, nominal_of
+from calib.errors import UsageError
+from calib.toolkit.chains import Axes, Chain, Controller, axes_of
 from calib.toolkit.installations import Installation, read_arms
-from calib.toolkit.result_folders import open_result, read_exported
+from calib.toolkit.result_folders import NoOffsets, open_result, read_exported, read_mastering
 from calib.transforms import invert
 
 # of frames, by the unit of lengths
@@ -26,7 +27,11 @@ DECIMALS = {"m": 7, "mm": 4}
 
 
 def delivery_text(
-    folder: Path, controller: Controller, world: np.ndarray | None = None, flange: np.ndarray | None = None
+    folder: Path,
+    controller: Controller,
+    world: np.ndarray | None = None,
+    flange: np.ndarray | None = None,
+    external: Sequence[str] = (),
 ) -> str:
     """Return the numbers of a fit that a controller accepts, as text for the person who enters them.
 
@@ -35,6 +40,7 @@ def delivery_text(
         controller: the controller.
         world, flange: (4, 4) poses of the controller's base in the arm's base, and of its flange in the arm's tip, as
             the user specifies them; None: known from the robot's description, or from the controller's rule.
+        external: names of joints that are external axes, where names and kinds do not tell.
 
     Raises:
         UsageError: a folder without a fit.
@@ -44,8 +50,9 @@ def delivery_text(
     fit_folder = result.fit
     fit = folder if fit_folder is None else fit_folder.path
     robot = read_exported(fit, "deliver")
-    cell, nominal = read_arms(fit)
-    arm = Description.of_fit(fit, nominal.chain)
+    _, nominal = read_arms(fit)
+    axes = _axes(controller, nominal.chain, external)
+    arm = Description.of_fit(fit, nominal.chain, axes)
     frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)
     verdicts = open_result(fit, "deliver").verdicts
     lines = [f"{controller.title}: calibration of {robot.chain.name}", str(verdicts), ""]
@@ -58,14 +65,8 @@ def delivery_text(
         ]
     if not controller.mastered:
         lines.append("Users cannot master the axes of this controller.")
-    elif fit_folder is not None and fit_folder.metrics().model == "offsets":
-        lines += [
-            "Mastering, with frames that belong to it:",
-            *_mastering(robot, controller),
-            *_frames(cell, controller, *frames),
-        ]
     else:
-        lines.append("Mastering offsets: fit with --model offsets, and deliver that fit.")
+        lines += _mastering(fit, controller, frames, axes)
     lines.append("")
     for frame in frames:
         if frame.warning:
@@ -73,6 +74,22 @@ def delivery_text(
     lines.append(f"{controller.base}, {controller.flange}: {controller.frames}.")
     lines.append("A tool's angles are nominal where only its position was measured.")
     return "\n".join([*lines, ""])
+
+
+def _axes(controller: Controller, chain: Chain, external: Sequence[str]) -> Axes:
+    """Return an arm's joints as a controller's axes; all of them as the arm's, where none is coupled to another.
+
+    Args:
+        controller: the controller.
+        chain: the arm.
+        external: names of joints that are external axes, where names and kinds do not tell.
+    """
+    try:
+        return axes_of(controller, chain.joints, external)
+    except UsageError:
+        if controller.coupled or external:
+            raise
+        return Axes.plain(chain.joints)
 
 
 def _frames(arm: Installation, controller: Controller, base: ControllerFrame, flange: ControllerFrame) -> Iterator[str]:
@@ -115,18 +132,26 @@ def _written(form: str, controller: Controller, pose: np.ndarray, index: int) ->
     return form.format(*numbers, n=index)
 
 
-def _mastering(robot: CalibratedChain, controller: Controller) -> Iterator[str]:
-    """Yield one line per axis with the offset to add to the displayed angle, in the controller's unit.
+def _mastering(
+    fit: Path, controller: Controller, frames: tuple[ControllerFrame, ControllerFrame], axes: Axes
+) -> Iterator[str]:
+    """Yield one line per axis with the offset to add to the displayed value, in the controller's unit, and the frames.
 
     Args:
-        robot: the calibrated arm with its nominal description.
+        fit: folder of the fit.
         controller: the controller.
+        frames: the controller's base and flange, located in the arm's base and tip.
+        axes: the arm's joints as its axes.
     """
-    chain, nominal = robot.chain, nominal_of(robot)
-    offsets = []
-    for k in chain.moving:
-        change = chain.elements[k].value - nominal.elements[k].value
-        offsets.append(change / chain.elements[k].ratio)
-    for axis, value in enumerate(controller.shown(np.array(offsets)), 1):
+    try:
+        mastering = read_mastering(fit)
+    except NoOffsets as reason:
+        yield f"Mastering offsets are left out: {reason}."
+        return
+    yield f"Mastering {mastering}, with frames that belong to it:"
+    shown = axes.shown(controller, mastering.offset)
+    for label, unit, value in zip(axes.labels(), axes.units(controller.unit), shown):
         note = "" if value else " (kept at nominal)"
-        yield f"  axis {axis}: true angle = shown angle {value:+.5f} {controller.unit}{note}"
+        quantity = "angle" if unit == controller.unit else "position"
+        yield f"  {label}: true {quantity} = shown {quantity} {value:+.5f} {unit}{note}"
+    yield from _frames(mastering.cell, controller, *frames)

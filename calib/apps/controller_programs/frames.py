@@ -12,6 +12,7 @@ at the height of axis 2, a UR's Base is base_link turned by 180° about z. What 
 What none of these says is not known, and no number is given in it.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -19,7 +20,17 @@ from typing import Self
 import numpy as np
 
 from calib.errors import UsageError
-from calib.toolkit.chains import AXES, Chain, Controller, UrdfTree, description_text, forward, joint_frames, read_tree
+from calib.toolkit.chains import (
+    AXES,
+    Axes,
+    Chain,
+    Controller,
+    UrdfTree,
+    description_text,
+    forward,
+    joint_frames,
+    read_tree,
+)
 from calib.toolkit.result_folders import FitFolder
 from calib.transforms import from_xyz_rpy, invert, rotation_vector, to_xyz_rpy
 from calib.units import plain_number
@@ -61,24 +72,34 @@ class Description:
     Attributes:
         chain: the nominal arm.
         tree: links and joints of its URDF; None without a URDF.
+        axes: its joints as axes of the controller; None: all are the arm's.
     """
 
     chain: Chain
     tree: UrdfTree | None = None
+    axes: Axes | None = None
+
+    @property
+    def arm(self) -> tuple[int, ...]:
+        """Indices of the joints that are the arm's axes."""
+        if self.axes is None:
+            return tuple(range(self.chain.n))
+        return self.axes.arm
 
     @classmethod
-    def of_fit(cls, folder: Path, chain: Chain) -> Self:
+    def of_fit(cls, folder: Path, chain: Chain, axes: Axes | None = None) -> Self:
         """Return the description of a fit's nominal arm, with the links of the fitted URDF if the fit has one.
 
         Args:
             folder: the fit's folder.
             chain: the nominal arm.
+            axes: its joints as axes of the controller; None: all are the arm's.
         """
         path = FitFolder(folder).urdf
         if not path.is_file():
-            return cls(chain)
+            return cls(chain, None, axes)
         xml, *_ = description_text(path)
-        return cls(chain, read_tree(xml, str(path)))
+        return cls(chain, read_tree(xml, str(path)), axes)
 
     @property
     def prefix(self) -> str:
@@ -227,7 +248,7 @@ def flange_frame(controller: Controller, arm: Description, statement: np.ndarray
         if pose is None:
             return ControllerFrame(name, None, f"not known: link '{link}' is not fixed to '{chain.tip}'; {state}")
         pose = pose @ from_xyz_rpy(NO_SHIFT, np.radians(turn or NO_TURN))
-        if _off_axis(chain, pose) > STRAIGHT:
+        if _off_axis(chain, arm.arm[-1], pose) > STRAIGHT:
             basis = f"not known: z of link '{link}' is not along the last axis, as a flange's is; {state}"
             return ControllerFrame(name, None, basis)
         basis = f"link {link}"
@@ -252,7 +273,7 @@ def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | Non
     if placed is None:
         return None, f"link '{start}' is not fixed to '{arm.chain.base}'"
     if controller.base_at == "axis 2":
-        height = _height_of_axis_2(arm.chain, placed)
+        height = _height_of_axis_2(arm.chain, arm.arm, placed)
         if height is None:
             return None, f"{controller.base} is at the height of axis 2, which this arm does not determine"
         rule = f"by rule at the height of axis 2, {height:.6g} m above {start}"
@@ -265,22 +286,24 @@ def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | Non
     return placed, f"by rule at {foot}"
 
 
-def _height_of_axis_2(chain: Chain, foot: np.ndarray) -> float | None:
+def _height_of_axis_2(chain: Chain, joints: Sequence[int], foot: np.ndarray) -> float | None:
     """Return the height of axis 2 above the frame with pose `foot` (4, 4) in the arm's base [m].
 
     None where axis 1 is not the frame's z axis, or axis 2 is not horizontal.
 
     Args:
         chain: the arm.
+        joints: indices of the arm's axes among its joints.
         foot: pose of the frame.
     """
-    if chain.n < 2:
+    if len(joints) < 2:
         return None
+    first, second = joints[:2]
     # both axes in the frame
     T_foot_base = invert(foot)
     turn, shift = T_foot_base[:3, :3], T_foot_base[:3, 3]
-    point_1, axis_1 = _line(chain, 0)
-    point_2, axis_2 = _line(chain, 1)
+    point_1, axis_1 = _line(chain, first)
+    point_2, axis_2 = _line(chain, second)
     axis_1, axis_2 = turn @ axis_1, turn @ axis_2
     point_1, point_2 = turn @ point_1 + shift, turn @ point_2 + shift
 
@@ -305,16 +328,17 @@ def _line(chain: Chain, joint: int) -> tuple[np.ndarray, np.ndarray]:
     return frame[:3, 3], element.sign * frame[:3, column]
 
 
-def _off_axis(chain: Chain, pose: np.ndarray) -> float:
+def _off_axis(chain: Chain, joint: int, pose: np.ndarray) -> float:
     """Return the angle [rad] between the arm's last axis and the z axis of a frame.
 
     Args:
         chain: the arm.
+        joint: index of the arm's last axis.
         pose: (4, 4) pose of the frame in the tip.
     """
     (tip,) = forward(chain, np.zeros((1, chain.n)))
     z = (tip @ pose)[:3, 2]
-    _, last_axis = _line(chain, chain.n - 1)
+    _, last_axis = _line(chain, joint)
     return float(np.linalg.norm(np.cross(z, last_axis)))
 
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from calib.apps.controller_programs.targets import formatted
 from calib.errors import UsageError
-from calib.toolkit.chains import Controller
+from calib.toolkit.chains import Axes, Controller, NamedJoint, PlainJoint
 from calib.toolkit.pose_data import read_header, read_table
 from calib.toolkit.result_folders import open_result
+from calib.units import LENGTHS
 
 PREFIX = "q_"
 
@@ -34,8 +35,8 @@ def is_motion(path: Path) -> bool:
     return "t" in read_header(path)[0]
 
 
-def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]]:
-    """Return the setpoints (k, n) [rad] of a motion, interpolated at a controller's cycle, and the joints' names.
+def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[NamedJoint]]:
+    """Return the setpoints (k, n) [rad or m] of a motion, interpolated at a controller's cycle, and the joints.
 
     Args:
         path: CSV file of the motion.
@@ -53,7 +54,14 @@ def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]
     if not columns:
         raise UsageError(f"{path}: no positions ({PREFIX}joint1 [rad]); found {', '.join(table.header)}")
     t = table.numbers("t", None)
-    q = np.column_stack([table.numbers(name, "angle") for name in columns])
+    q = np.column_stack([table.numbers(name, "joint") for name in columns])
+    joints: list[NamedJoint] = []
+    for name in columns:
+        unit = table.units[table.index(name)].lower()
+        kind = "revolute"
+        if unit in LENGTHS:
+            kind = "prismatic"
+        joints.append(PlainJoint(name.removeprefix(PREFIX), kind))
     rising = np.all(np.diff(t) > 0.0)
     if len(t) <= 3 or not rising:
         raise UsageError(f"{path}: expected at least four rows of rising t")
@@ -61,12 +69,15 @@ def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]
     times = t[0] + controller.cycle * np.arange(count + 1)
     # a rounded number of cycles may end behind the motion
     times = np.minimum(times, t[-1])
-    return CubicSpline(t, q)(times), [name.removeprefix(PREFIX) for name in columns]
+    return CubicSpline(t, q)(times), joints
 
 
-def stream_values(controller: Controller, q: np.ndarray) -> dict[str, object]:
-    """Return the variables of a controller's stream template for setpoints q (k, n) [rad], by name."""
-    controller_values = controller.shown(q)
+def stream_values(controller: Controller, axes: Axes, q: np.ndarray) -> dict[str, object]:
+    """Return the variables of a controller's stream template for setpoints q (k, n) [rad or m], by name."""
+    controller_values = axes.shown(controller, q)
+    headings = []
+    for label, unit in zip(axes.labels(), axes.units(controller.unit)):
+        headings.append((label.replace(" ", "_"), unit))
     rows = formatted(controller_values, controller.decimals)
     relative = formatted(controller_values - controller_values[0], controller.decimals)
-    return {"rows": rows, "relative": relative, "cycle": controller.cycle, "unit": controller.unit}
+    return {"rows": rows, "relative": relative, "cycle": controller.cycle, "headings": headings}

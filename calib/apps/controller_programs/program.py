@@ -8,10 +8,16 @@ rounded, and the arm stops only near them.
 A program that was edited by hand is read again, ``calib program EDITED.src --for csv``, and so are the joints that a
 KUKA keeps in its ``.dat`` file. `calib compensate FIT PROGRAM` corrects the targets inside a program.
 
+A rail or a positioner beside the arm is an external axis, and a SCARA has four axes, of which the third slides
+(`calib.controllers.axes`); sliding axes are in mm.
+KRL has external axes as E1, RAPID as extax; TP as a second group, or with
+``--external-group 1`` as E1 of the arm's; INFORM as a base axis if they slide, else as a station.
+
 No program was run on a real controller. Run it first at low override, beam and cables off, one pose at a time.
 """
 
 import re
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -21,67 +27,79 @@ import numpy as np
 from calib import files
 from calib.apps.controller_programs.motion_streams import is_motion, setpoints, stream_values
 from calib.apps.controller_programs.program_settings import CSV, ProgramSettings
-from calib.apps.controller_programs.targets import formatted, is_program, read_program
+from calib.apps.controller_programs.targets import Program, formatted, is_program, read_program
 from calib.errors import UsageError
-from calib.toolkit.chains import Controller, check_controller, controller_named
-from calib.toolkit.pose_data import OURS, Table, read_poses, read_table
+from calib.toolkit.chains import Axes, Controller, NamedJoint, PlainJoint, axes_of, check_pulses, controller_named
+from calib.toolkit.pose_data import OURS, Joints, Table, read_poses, read_table
 from calib.toolkit.report_pages import read_template
-from calib.units import ANGLES, LENGTHS
+from calib.units import ANGLES, JOINT, LENGTHS
 
 
-def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
-    """Return joint values (m, n) [rad] from a CSV of poses or from a program, and the joints' names.
+def joints_in(
+    path: Path, source: str = "", settings: ProgramSettings | None = None
+) -> tuple[np.ndarray, list[NamedJoint]]:
+    """Return joint values (m, n) [rad or m] from a CSV of poses or from a program, and the joints.
 
-    In a CSV, the joints are the columns whose header has the unit of an angle (``joint1 [deg]``).
+    In a CSV, the joints are the columns whose header has the unit of an angle or, for sliding joints, of a length
+    (``joint1 [deg]``, ``rail [mm]``).
 
     Args:
         path: the file.
         source: the controller of a program, where its suffix does not determine it; empty otherwise.
+        settings: external axes and pulses of a program; None: the defaults.
 
     Raises:
-        UsageError: prismatic joints, a program whose targets are poses, or no column of joint angles.
+        UsageError: a program whose targets are poses, or no column of joint values.
     """
     if source or is_program(path):
-        program = read_program(path, source)
+        program = _read(path, source, settings)
         if not program.of("joints"):
             raise UsageError(f"{path}: its targets are poses of the tool; give a list or program of joint values")
-        q = program.joints()
-        return q, [f"q{number}" for number in range(1, q.shape[1] + 1)]
+        return program.joints(), list(program.axes.joints)
 
     table = read_table(path)
-    names, sliding = [], []
+    joints: list[NamedJoint] = []
     for name, unit in zip(table.header, table.units):
         if name in OURS:
             continue
         if unit.lower() in LENGTHS:
-            sliding.append(name)
+            joints.append(PlainJoint(name, "prismatic"))
         elif unit.lower() in ANGLES:
-            names.append(name)
-    if sliding:
-        raise UsageError(f"{path}: programs are for revolute joints only, not lengths: {', '.join(sliding)}")
-    if not names:
+            joints.append(PlainJoint(name))
+    if not joints:
         columns = ", ".join(table.header)
         raise UsageError(f"{path}: no column of joint angles with its unit, as 'joint1 [deg]'; found {columns}")
-    return read_poses(path, names), names
+    names, kinds = zip(*((joint.name, joint.kind) for joint in joints))
+    return read_poses(path, Joints(names, kinds)), joints
 
 
-def joints_table(path: Path, source: str = "") -> Table:
-    """Return the joint values in a file as a table [deg], with a column ``pose`` where all targets are numbered.
+def _read(path: Path, source: str, settings: ProgramSettings | None) -> Program:
+    """Return the program at `path`, read with the external axes and pulses of the settings."""
+    settings = settings or ProgramSettings()
+    return read_program(path, source, None, settings.external, settings.pulses)
+
+
+def joints_table(path: Path, source: str = "", settings: ProgramSettings | None = None) -> Table:
+    """Return the joint values in a file as a table [deg or mm], with a column ``pose`` where all targets are numbered.
 
     Args:
         path: CSV of poses, program, or file to which a controller wrote joint values: a UR's log, a KUKA's ``.dat``, a
             FANUC's ``POSREG.VA``.
         source: the controller of a program, where its suffix does not determine it; empty otherwise.
+        settings: external axes and pulses of a program; None: the defaults.
 
     Raises:
         UsageError: as for `joints_in`.
     """
-    q, names = joints_in(path, source)
-    header = list(names)
-    units = ["deg"] * len(names)
-    columns = list((q / ANGLES["deg"]).T)
+    q, joints = joints_in(path, source, settings)
+    header = [joint.name for joint in joints]
+    units, columns = [], []
+    for joint, values in zip(joints, q.T):
+        factor, unit = JOINT[joint.kind]
+        units.append(unit)
+        columns.append(values * factor)
     if source or is_program(path):
-        program = read_program(path, source)
+        program = _read(path, source, settings)
         numbers = np.array([program.targets[k].number for k in program.of("joints")])
         if numbers.all():
             header.insert(0, "pose")
@@ -110,7 +128,7 @@ def program_files(
     """
     settings = settings or ProgramSettings()
     if name == CSV:
-        return {out: _csv_text(joints_table(path, source))}
+        return {out: _csv_text(joints_table(path, source, settings))}
     controller = controller_named(name)
     stem = out.stem
     if not re.fullmatch(controller.names, stem):
@@ -119,22 +137,22 @@ def program_files(
 
     moving = not (source or is_program(path)) and is_motion(path)
     if moving:
-        q, names = setpoints(path, controller)
+        q, joints = setpoints(path, controller)
     else:
-        q, names = joints_in(path, source)
-    check_controller(name, q.shape[1], settings.pulses)
+        q, joints = joints_in(path, source, settings)
+    axes = axes_of(controller, joints, settings.external)
+    check_pulses(controller, axes, settings.pulses)
     if settings.output is not None and not controller.outputs:
         raise UsageError(f"--output: in programs for {controller.title} the operator presses a key; leave it out")
     values: dict[str, object]
     if moving:
         templates = controller.stream
-        values = {**stream_values(controller, q)}
+        values = {**stream_values(controller, axes, q)}
     else:
         templates = controller.files
-        values = {"poses": _poses(controller, q, settings)}
+        values = _poses(controller, axes, q, settings)
     values["name"] = stem
-    values["joints"] = names
-    values["head"] = _head(controller, names, moving)
+    values["head"] = _head(controller, axes, moving)
     values["settle"] = settings.settle
     values["speed"] = settings.speed
     values["output"] = settings.output
@@ -176,50 +194,98 @@ def _targets(out: Path, names: list[str], controller: Controller) -> list[Path]:
     return usual
 
 
-def write_program(path: Path, out: Path, name: str) -> list[Path]:
+def write_program(path: Path, out: Path, name: str, external: Sequence[str] = ()) -> list[Path]:
     """Write the program that drives a session's planned poses, and return the paths of its files.
 
     Args:
         path: CSV of the planned poses.
         out: the output path.
         name: name of a controller.
+        external: names of the external axes; empty: those that the joints show.
     """
-    texts = program_files(path, out, name)
+    texts = program_files(path, out, name, ProgramSettings(external=tuple(external)))
     return [files.write(target, text) for target, text in texts.items()]
 
 
-def _poses(controller: Controller, q: np.ndarray, settings: ProgramSettings) -> list[list[str]]:
-    """Return joint values (m, n) [rad] as texts in a controller's units and number of decimals.
+def _poses(controller: Controller, axes: Axes, q: np.ndarray, settings: ProgramSettings) -> dict[str, object]:
+    """Return the variables of a template with poses q (m, n) [rad or m], by name.
+
+    They are the numbers of the arm's axes (``poses``) and of the external ones (``external``) in the controller's units
+    and number of decimals, and what the axes are.
 
     Args:
         controller: the controller.
-        q: joint values.
-        settings: settings of the program, of which the pulses per degree are used.
+        axes: its axes.
+        q: joint values, in the description's order.
+        settings: settings of the program: pulses, and group of the external axes.
     """
-    values = controller.shown(q)
+    values = axes.shown(controller, q)
     if controller.pulses:
         values = values * np.array(settings.pulses)
-    return formatted(values, controller.decimals)
+    texts = formatted(values, controller.decimals)
+    count = len(axes.arm)
+    units = axes.units(controller.unit)
+    names = [axes.joints[index].name for index in axes.order]
+    poses, external = [], []
+    for row in texts:
+        poses.append(row[:count])
+        external.append(row[count:])
+    return {
+        "poses": poses,
+        "external": external,
+        "group": _group(controller, axes, settings),
+        "joints": names,
+        "units": units,
+        "scara": axes.scara,
+    }
 
 
-def _head(controller: Controller, names: list[str], moving: bool) -> list[str]:
+def _group(controller: Controller, axes: Axes, settings: ProgramSettings) -> int:
+    """Return the group of the external axes: 1, the arm's, or 2, their own; 0 without external axes."""
+    if not axes.external:
+        return 0
+    if settings.external_group is not None:
+        return settings.external_group
+    if any(axes.turning[index] for index in axes.external):
+        return 2
+    return controller.rail_group
+
+
+def _head(controller: Controller, axes: Axes, moving: bool) -> list[str]:
     """Return the comment lines at a program's head: safety notes and the joints' names.
 
     Args:
         controller: the controller.
-        names: names of the joints.
+        axes: its axes; in the line of joints, external ones have their label, and sliding ones their unit.
         moving: whether the program plays a motion rather than a list of poses.
     """
-    joints = f"Joints: {', '.join(names)}"
-    for axis, partner, sign in controller.coupled:
+    units = dict(zip(axes.order, axes.units(controller.unit)))
+    labels = dict(zip(axes.order, axes.labels()))
+    names = []
+    for index, joint in enumerate(axes.joints):
+        remarks = []
+        if index in axes.external:
+            remarks = [labels[index], units[index]]
+        elif not axes.turning[index]:
+            remarks = [units[index]]
+        name = joint.name
+        if remarks:
+            name += f" ({', '.join(remarks)})"
+        names.append(name)
+    joints = [f"Joints: {', '.join(names)}."]
+    arm_names = [axes.joints[index].name for index in axes.arm]
+    coupled = controller.coupled
+    if axes.scara:
+        coupled = ()
+    for axis, partner, sign in coupled:
         operator = {1: "+", -1: "-"}[sign]
-        joints += f"; axis {axis} = {names[axis - 1]} {operator} {names[partner - 1]}"
+        joints.append(f"Axis {axis} = {arm_names[axis - 1]} {operator} {arm_names[partner - 1]}.")
     if moving:
-        return ["Not run on a real controller.", "Simulate first, then run at low override.", f"{joints}."]
+        return ["Not run on a real controller.", "Simulate first, then run at low override.", *joints]
     head = [
         f"Not run on a real controller; checked by {controller.checked}.",
         "Simulate first, then run at low override, one pose at a time.",
-        f"{joints}.",
+        *joints,
     ]
     if controller.keeps:
         head.append(f"Joints read at each pose: {controller.keeps}.")

@@ -49,6 +49,11 @@ class Joined:
     poses: np.ndarray
     notes: tuple[str, ...]
 
+    @property
+    def rows(self) -> str:
+        """What the rows are, for messages."""
+        return "measured poses"
+
     def write(self, path: Path) -> Path:
         """Write the table as CSV with the notes as comments above it, and return its path."""
         header = []

@@ -11,6 +11,7 @@ by time             a column ``t``, ``time`` or ``timestamp`` in both (a number,
 by row              as many rows in both
 by geometry         with a robot: the order in which the nominal arm explains the points
 by motion           with a robot: points measured while the arm moves, by a clock of their own, and a log over time
+logs                two logs of one motion (positions, torques): one recording for `calib identify`, by time or row
 ==================  ===================================================================================================
 
 Several readings of one pose are averaged; their pooled scatter becomes ``sigma_x``, ``_y``, ``_z`` of the mean where it
@@ -32,7 +33,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
-from datetime import datetime
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,13 +41,15 @@ from scipy.spatial.distance import pdist
 
 from calib.apps.controller_programs.program import joints_table
 from calib.apps.controller_programs.targets import is_program
-from calib.apps.joining.joined import CLOCKS, NAMES, Joined, column_of
+from calib.apps.joining.joined import NAMES, Joined, column_of
+from calib.apps.joining.logs import clock_of, is_log, join_logs, seconds
+from calib.apps.joining.mapping import JoinOptions, mapped, read_mapping, with_options
 from calib.apps.joining.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_order
 from calib.apps.joining.stated import check_columns, stated
 from calib.apps.joining.streams import join_streams
 from calib.arguments import checked
 from calib.errors import MeasurementError, UsageError, counted, finding, listing, one_of, refuse_data
-from calib.toolkit.chains import CalibratedChain, Chain, controllers, load_calibrated
+from calib.toolkit.chains import CalibratedChain, Chain, as_described, controllers, load_calibrated
 from calib.toolkit.installations import check_scale
 from calib.toolkit.pose_data import (
     POSITION,
@@ -55,11 +58,12 @@ from calib.toolkit.pose_data import (
     PoseMeasurements,
     Sheet,
     Table,
+    positions_by_shape,
     read_fit_options,
     read_table,
 )
+from calib.toolkit.recordings import dataset_table, is_dataset
 from calib.toolkit.result_folders import joints_of, lines_of
-from calib.units import TIMES
 
 METHODS = ("name", "time", "row", "geometry", "motion")
 # requirements of each method except motion, for messages
@@ -119,28 +123,63 @@ def join(
     joints_file, points_file = Path(joints), Path(points)
     if isinstance(robot, str | Path):
         robot = load_calibrated(robot, base, tip)
-    if not isinstance(options, FitOptions):
-        options = read_fit_options(options)
     if by == "motion":
         if robot is None:
             raise UsageError("joining by motion needs the nominal arm's path: give --robot")
-        return join_streams(joints_file, points_file, robot.complete, options)
+        return join_streams(joints_file, points_file, robot.complete, _pose_options(options))
     chain = None if robot is None else robot.complete
-    point_table = read_table(points)
+    point_table = _table(points_file)
     if is_program(joints_file):
         joint_table = joints_table(joints_file)
+        options = _pose_options(options)
         check_columns(options, [joint_table, point_table], chain)
     else:
-        joint_table = read_table(joints)
+        joint_table = _table(joints_file)
+        tables = (joint_table, point_table)
+        mapping = _mapping(options)
+        if _are_logs(*(with_options(table, mapping) for table in tables)):
+            (first, second), notes = mapped(tables, mapping)
+            joined: Joined = join_logs(first, second, by)
+            return replace(joined, notes=(*notes, *joined.notes))
+        options = _pose_options(options)
         check_columns(options, [joint_table, point_table], chain)
         joint_table = stated(joint_table, options.for_file(joints_file), chain, holds_joints=True)
     point_table = stated(point_table, options.for_file(points_file), chain, holds_points=True)
     return _joined(joint_table, point_table, by, chain)
 
 
+def _table(path: Path) -> Table:
+    """Return a CSV file, or a LeRobot data set, as a table."""
+    return dataset_table(path) if is_dataset(path) else read_table(path)
+
+
+def _pose_options(options: str | Path | FitOptions | None) -> FitOptions:
+    """Return the options by which joint values and points are read."""
+    return options if isinstance(options, FitOptions) else read_fit_options(options)
+
+
+def _mapping(options: str | Path | FitOptions | None) -> JoinOptions:
+    """Return names and units of columns, as the options state them for two logs."""
+    if isinstance(options, FitOptions):
+        return JoinOptions(options.columns, options.units)
+    return read_mapping(None if options is None else Path(options))
+
+
+def _are_logs(first: Table, second: Table) -> bool:
+    """Return whether two tables are logs of one motion, the second without measured points."""
+    return not _has_points(second) and is_log(first) and is_log(second)
+
+
+def _has_points(table: Table) -> bool:
+    """Return whether a table has columns of measured positions, by their names or the shape of these."""
+    first_target = [f"{name}1" for name in POSITION.names]
+    is_named = not {*POSITION.names, *first_target}.isdisjoint(table.header)
+    return is_named or bool(positions_by_shape(table.header))
+
+
 def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joined:
     name_columns = [column_of(joints, NAMES), column_of(points, NAMES)]
-    time_columns = [column_of(joints, CLOCKS), column_of(points, CLOCKS)]
+    time_columns = [clock_of(joints), clock_of(points)]
     possible = {
         "name": all(name_columns),
         "time": all(time_columns),
@@ -249,7 +288,12 @@ def _refuse_shown(
     for name, controller in controllers().items():
         if not controller.coupled:
             continue
-        if find_order(chain, controller.described(q), measured, candidates) is not None:
+        try:
+            described = as_described(name, q, chain.joints)
+        except UsageError:
+            # this controller has no such arm
+            continue
+        if find_order(chain, described, measured, candidates) is not None:
             refuse_data(
                 points.file,
                 f"its points fit the joints as {controller.title} shows them, not as the description counts them: "
@@ -438,8 +482,8 @@ def _at_times(
         joints, points: tables of joint values and of points, with times of one clock.
         joint_column, point_column: names of the columns of times.
     """
-    t = _seconds(joints, joint_column)
-    point_times = _seconds(points, point_column)
+    t = seconds(joints, joint_column)
+    point_times = seconds(points, point_column)
     not_after = np.flatnonzero(np.diff(t) <= 0.0)
     if len(not_after):
         joints.fail("the times do not increase", joint_column, int(not_after[0]) + 1)
@@ -485,17 +529,3 @@ def _interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.nd
         values: (N, k) the series.
     """
     return np.column_stack([np.interp(times, t, column) for column in values.T])
-
-
-def _seconds(table: Table, name: str) -> np.ndarray:
-    """Return the column `name` of a table as times (m,) [s].
-
-    The column contains numbers in the header's unit, or ISO 8601 dates and times.
-    """
-    column = table.index(name)
-    if table.cells[column].dtype == float:
-        return table.numbers(name, None) * table.factor(column, TIMES, "")
-    try:
-        return np.array([datetime.fromisoformat(text).timestamp() for text in table.texts(name)])
-    except ValueError as error:
-        table.fail(f"{error}: expected seconds, or a date and time as 2026-11-27T08:15:30.250", name)

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.apps.joining.joined import CLOCKS, column_of
+from calib.apps.joining.mapping import JoinOptions, with_options
 from calib.errors import MeasurementError, counted, listing, refuse_data, refused_as
 from calib.toolkit.pose_data import Table, opened, plain_rows, split_units
 from calib.toolkit.recordings import GAP
@@ -137,8 +138,13 @@ def _reasons(dropped: Counter[str]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
 
 
-def read_stream(path: Path, kind: Kind) -> Stream:
+def read_stream(path: Path, kind: Kind, options: JoinOptions | None = None) -> Stream:
     """Return the usable rows of the file at `path`; `kind` describes how they are read.
+
+    Args:
+        path: the file.
+        kind: how its values are read and checked.
+        options: names and units of columns; None: as the header says.
 
     Raises:
         MeasurementError: a file without times, a file measured at stops rather than as a stream, a clock that was
@@ -152,7 +158,7 @@ def read_stream(path: Path, kind: Kind) -> Stream:
     read = 0
     largest, latest = -np.inf, np.nan
     for table in _pieces(path):
-        t, values, sound = _piece(table, kind)
+        t, values, sound = _piece(with_options(table, options or JoinOptions()), kind)
         read += len(t)
 
         # a row is late unless its time is after all times before

@@ -19,6 +19,7 @@ import numpy as np
 from calib.apps.joining.clock_steps import Step, find_step
 from calib.apps.joining.clocks import Clock, Run, begin, fitted, residuals, velocities
 from calib.apps.joining.joined import Joined
+from calib.apps.joining.mapping import clock_names
 from calib.apps.joining.stream_files import Kind, Stream, read_stream
 from calib.errors import Finding, finding, refuse_data
 from calib.records import evenly
@@ -96,8 +97,9 @@ def join_streams(log_file: Path, file: Path, chain: Chain, options: FitOptions) 
     Raises:
         MeasurementError: the files are no streams, the arm moves too little, or the files are not of the same motion.
     """
-    log = read_stream(log_file, _joints(chain, options.for_file(log_file)))
-    stream = _fresh(read_stream(file, _target(options.for_file(file))))
+    clocks = clock_names(options.columns)
+    log = read_stream(log_file, _joints(chain, options.for_file(log_file)), clocks)
+    stream = _fresh(read_stream(file, _target(options.for_file(file)), clocks))
     _check_motion(log, chain.n, "")
     _check_motion(stream, 3, " m")
     positions = stream.values[:, :3]

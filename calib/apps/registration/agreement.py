@@ -20,27 +20,24 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import refuse_data
 from calib.records import evenly
-from calib.toolkit.installations import misfit, place_pose
+from calib.toolkit.installations import direction, median_misfit
 from calib.toolkit.pose_pairs import PoseList, PosePairs, poses_of
 from calib.transforms import invert
-from calib.units import DEG
+from calib.units import DEG, LENGTHS
 
 # Largest number of samples by which readings are compared.
 MAX_ROWS = 60
 # Fewest samples that tell open conventions apart.
 MIN_ROWS = 5
-# Largest median difference of relative rotations [rad] with which a stated convention is not questioned: a detector's
-# orientations of small boards are that wrong.
-STATED_GAP = 3.0 * DEG
 # Largest difference of relative rotations [rad], and largest ratio to the smallest, of readings that are placed.
 MAX_GAP = 1.0 * DEG
 GAP_RATIO = 3.0
 # Largest number of readings that are placed.
 MAX_PLACED = 24
-# Length by which angles are multiplied to compare them with distances [m/rad].
-LEVER = 0.3
 # Smallest ratio of misfits at which the better of two readings is taken.
 CLEAR_RATIO = 2.5
+# Units in which lengths may be meant.
+UNITS = ("m", "cm", "mm", "in")
 # Difference of orientations [rad] below which two readings are one.
 SAME = 1e-6
 
@@ -50,23 +47,21 @@ class Reading:
     """One reading of pairs of poses.
 
     Attributes:
-        robot, seen: (m, 4, 4) poses of the robot and of what was seen.
+        robot, camera: (m, 4, 4) poses of the robot and of what was camera.
         conventions: conventions of both orientations; empty where there is nothing to choose.
-        inverse: whether the poses that were seen agree as their inverse.
         misfit: median misfit, angles included [m].
     """
 
     robot: np.ndarray
-    seen: np.ndarray
+    camera: np.ndarray
     conventions: tuple[str, str]
-    inverse: bool
     misfit: float
 
-    def equals(self, other: Reading) -> bool:
+    def equals(self, reading: Reading) -> bool:
         """Return whether two readings are one, in other words."""
-        same_robot = np.abs(self.robot - other.robot).max() < SAME
-        same_seen = np.abs(self.seen - other.seen).max() < SAME
-        return bool(same_robot and same_seen)
+        same_robot = np.abs(self.robot - reading.robot).max() < SAME
+        same_camera = np.abs(self.camera - reading.camera).max() < SAME
+        return bool(same_robot and same_camera)
 
 
 def agreed(pairs: PosePairs) -> tuple[Reading, list[str]]:
@@ -79,35 +74,59 @@ def agreed(pairs: PosePairs) -> tuple[Reading, list[str]]:
         MeasurementError: several conventions agree about as well, and the file states none.
     """
     robot_position, robot_note = pairs.robot.metres()
-    seen_position, seen_note = pairs.seen.metres()
-    notes = [note for note in (robot_note, seen_note) if note]
+    camera_position, camera_note = pairs.camera.metres()
+    best = _best_reading(pairs, robot_position, camera_position)
+    if not pairs.camera.length_unit and len(pairs) >= MIN_ROWS and not direction(best.robot, best.camera).agrees:
+        for unit in UNITS:
+            reading = _best_reading(pairs, robot_position, pairs.camera.position * LENGTHS[unit])
+            agreement = direction(reading.robot, reading.camera)
+            if agreement.agrees and agreement.is_inverse is not None:
+                best = reading
+                reason = "with which the poses agree (no unit is stated)"
+                camera_note = f"{pairs.camera.title}: the lengths are read as {unit}, {reason}"
+                break
+    notes = list(filter(None, (robot_note, camera_note)))
+    for poses, convention in zip((pairs.robot, pairs.camera), best.conventions):
+        if convention and convention != poses.convention:
+            note = f"{poses.title}: the orientation is read as {convention}, with which the poses agree"
+            if poses.convention:
+                note += f" ({poses.convention} is stated)"
+            notes.append(note)
+    return best, notes
+
+
+def _best_reading(pairs: PosePairs, robot_position: np.ndarray, camera_position: np.ndarray) -> Reading:
+    """Return the reading of the orientations in which poses agree; the stated one unless another agrees clearly better.
+
+    Args:
+        pairs: m pairs of poses.
+        robot_position, camera_position: (m, 3) their positions [m].
+    """
     rows = evenly(len(pairs), MAX_ROWS)
     robot_turns = dict(pairs.robot.readings())
-    seen_turns = dict(pairs.seen.readings())
-    choices = list(_choices(robot_turns, seen_turns, rows))
-    stated = pairs.robot.convention, pairs.seen.convention
-    is_stated = _states(pairs.robot) and _states(pairs.seen)
-    if is_stated and choices[0][0] < STATED_GAP:
-        choices = choices[:1]
+    camera_turns = dict(pairs.camera.readings())
+    choices = list(_choices(robot_turns, camera_turns, rows))
     smallest = min(gap for gap, _ in choices)
     limit = max(MAX_GAP, GAP_RATIO * smallest)
     likely = sorted((choice for choice in choices if choice[0] <= limit), key=lambda choice: choice[0])
     readings = []
-    for _, names in likely[:MAX_PLACED]:
+    for _, names in dict.fromkeys([choices[0], *likely[:MAX_PLACED]]):
         robot = poses_of(robot_position, robot_turns[names[0]])
-        seen = poses_of(seen_position, seen_turns[names[1]])
-        readings.append(_placed(robot, seen, names, rows))
+        camera = poses_of(camera_position, camera_turns[names[1]])
+        readings.append(_placed(robot, camera, names, rows))
+    stated_reading = readings[0]
     readings.sort(key=lambda reading: reading.misfit)
     best = readings[0]
-    others = [reading for reading in readings[1:] if not reading.equals(best)]
-    if others and not is_stated:
-        _check_clear(pairs, best, others[0])
-    for poses, convention, name in zip((pairs.robot, pairs.seen), best.conventions, stated):
-        if convention and convention != name:
-            notes.append(
-                f"{poses.name or 'poses'}: the orientation is read as {convention}, with which the poses agree"
-            )
-    return best, notes
+    has_conventions = _states(pairs.robot) and _states(pairs.camera)
+    if has_conventions and stated_reading.misfit <= CLEAR_RATIO * best.misfit:
+        return stated_reading
+    if has_conventions:
+        return best
+    for reading in readings[1:]:
+        if not reading.equals(best):
+            _check_clear(pairs, best, reading)
+            break
+    return best
 
 
 def _states(poses: PoseList) -> bool:
@@ -116,14 +135,14 @@ def _states(poses: PoseList) -> bool:
 
 
 def _choices(
-    robot: dict[str, np.ndarray], seen: dict[str, np.ndarray], rows: np.ndarray
+    robot: dict[str, np.ndarray], camera: dict[str, np.ndarray], rows: np.ndarray
 ) -> Iterator[tuple[float, tuple[str, str]]]:
     """Yield for each choice of conventions the median difference of relative rotations [rad], and the conventions."""
     robot_angles = {name: _relative_angles(turns[rows]) for name, turns in robot.items()}
-    seen_angles = {name: _relative_angles(turns[rows]) for name, turns in seen.items()}
-    for robot_name, seen_name in product(robot_angles, seen_angles):
-        difference = np.abs(robot_angles[robot_name] - seen_angles[seen_name])
-        yield float(np.median(difference)), (robot_name, seen_name)
+    camera_angles = {name: _relative_angles(turns[rows]) for name, turns in camera.items()}
+    for robot_name, camera_name in product(robot_angles, camera_angles):
+        difference = np.abs(robot_angles[robot_name] - camera_angles[camera_name])
+        yield float(np.median(difference)), (robot_name, camera_name)
 
 
 def _relative_angles(turns: np.ndarray) -> np.ndarray:
@@ -136,36 +155,25 @@ def _relative_angles(turns: np.ndarray) -> np.ndarray:
     return np.concatenate(angles)
 
 
-def _placed(robot: np.ndarray, seen: np.ndarray, names: tuple[str, str], rows: np.ndarray) -> Reading:
-    """Return a reading with the direction of the poses seen in which they agree better."""
-    direct = median_misfit(robot[rows], seen[rows])
-    inverse = median_misfit(robot[rows], invert(seen[rows]))
-    return Reading(robot, seen, names, inverse < direct, min(direct, inverse))
-
-
-def median_misfit(robot: np.ndarray, seen: np.ndarray) -> float:
-    """Return the median misfit [m] of poses B_i = S A_i X with the best S and X, angles included.
-
-    Args:
-        robot: (m, 4, 4) A_i.
-        seen: (m, 4, 4) B_i.
-    """
-    return float(np.median(misfit(robot, seen, *place_pose(robot, seen), LEVER)))
+def _placed(robot: np.ndarray, camera: np.ndarray, names: tuple[str, str], rows: np.ndarray) -> Reading:
+    """Return a reading with its misfit in the direction of the poses camera in which they agree better."""
+    direct = median_misfit(robot[rows], camera[rows])
+    inverse = median_misfit(robot[rows], invert(camera[rows]))
+    return Reading(robot, camera, names, min(direct, inverse))
 
 
 def _check_clear(pairs: PosePairs, best: Reading, second: Reading) -> None:
     """Raise MeasurementError if two readings agree about as well, or if there are too few samples to choose."""
     if len(pairs) >= MIN_ROWS and second.misfit > CLEAR_RATIO * best.misfit:
         return
-    words = []
+    texts = []
     for reading in (best, second):
-        names = [
-            f"{poses.name or 'poses'} {name}" for poses, name in zip((pairs.robot, pairs.seen), reading.conventions)
-        ]
-        words.append(f"{' and '.join(names)} ({1e3 * reading.misfit:.3g} mm)")
+        robot_convention, camera_convention = reading.conventions
+        names = f"{pairs.robot.title} {robot_convention} and {pairs.camera.title} {camera_convention}"
+        texts.append(f"{names} ({1e3 * reading.misfit:.3g} mm)")
     refuse_data(
         pairs.file,
         f"the file does not say how its orientations are meant, and {len(pairs)} pairs agree about as well as "
-        f"{words[0]} or as {words[1]}: state the convention in the options (euler = 'vector', 'zyx moving' …), or give "
+        f"{texts[0]} or as {texts[1]}: state the convention in the options (euler = 'vector', 'zyx moving' …), or give "
         "quaternions",
     )

@@ -7,6 +7,7 @@ geometry is not changed. The three differ in the frames that are printed.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,7 +15,6 @@ import numpy as np
 
 from calib.apps.controller_programs.frames import stated_frame
 from calib.apps.registration.frames import Placed, description_of, in_controller, urdf_with
-from calib.apps.registration.pairs import JOINTS as PAIR_JOINTS
 from calib.apps.registration.pairs import measured_pairs
 from calib.apps.registration.settings import DEFAULT_PLACEMENT, PlacementSettings
 from calib.errors import UsageError
@@ -135,13 +135,24 @@ class HandEye(Placements):
     @property
     def transforms(self) -> tuple[Placed, ...]:
         """Camera and board: the carried one in the arm's tip, the standing one in its base."""
-        names = (self.carried, STANDING[self.carried])
-        return tuple(frame for frame in self.placed if frame.frame in names)
+        standing = STANDING[self.carried]
+        frames = [frame for frame in self.placed if frame.frame in (self.carried, standing)]
+        is_open = any(bool(np.isnan(frame.sigma).any()) for frame in frames)
+        if is_open:
+            # what is not identifiable of one position moves the other
+            unknown = np.array([*np.full(3, np.nan), *np.zeros(3)])
+            frames = [replace(frame, sigma=frame.sigma + unknown) for frame in frames]
+        return tuple(frames)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a component of a placement is not identifiable, so that numbers of both frames depend on a choice."""
+        return any(bool(np.isnan(frame.sigma).any()) for frame in self.transforms)
 
     @property
     def is_of_pairs(self) -> bool:
         """Whether it was fitted to pairs of poses, whose robot's joints are coordinates of its poses."""
-        return self.inputs.chain.joint_names == PAIR_JOINTS
+        return self.inputs.chain.is_free_flyer
 
     def for_controller(
         self, name: str, source: Path | None = None, world: str | None = None, flange: str | None = None
@@ -176,6 +187,8 @@ class HandEye(Placements):
                 "it is not known whether the arm carries the camera or the board: state [camera] mounting = "
                 f"'{IN_HAND}' (camera) or '{TO_HAND}' (board) in the options, then write the URDF"
             )
+        if self.is_open:
+            raise UsageError("a placement is not identifiable: turn the wrist about a second axis, then write the URDF")
         if self.is_of_pairs and source is None:
             raise UsageError("pairs of poses have no URDF: give the robot's before the file")
         return urdf_with(resolve(source or self.inputs.source), self.transforms)
@@ -188,8 +201,14 @@ class HandEye(Placements):
         yield str(self.verdict)
         for frame in self.transforms:
             yield str(frame)
-            yield f"URDF: {frame.urdf_origin}"
-            yield f"ROS: {frame.ros_command}"
+            if not self.is_open:
+                yield f"URDF: {frame.urdf_origin}"
+                yield f"ROS: {frame.ros_command}"
+        if self.is_open:
+            yield (
+                "the poses turn about one axis only: positions of camera and board along it are not identifiable, only "
+                "their sum, so no frames are printed for use; turn the wrist by 90° and more about a second axis"
+            )
         if "or" in self.carried.split():
             tip = self.robot.chain.tip
             yield (

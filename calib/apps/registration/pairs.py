@@ -5,24 +5,24 @@ So the fit, its checks, its verdict and its result are those of every other meas
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.apps.registration.agreement import Reading, agreed, median_misfit
+from calib.apps.registration.agreement import Reading, agreed
 from calib.errors import refuse_data
-from calib.toolkit.chains import CalibratedChain, Chain, Element, Joint
-from calib.toolkit.installations import chordal_turns
+from calib.toolkit.chains import POSE_JOINTS, CalibratedChain, Chain, Element, Joint
+from calib.toolkit.installations import chordal_turns, direction
 from calib.toolkit.pose_pairs import FIXED_WORDS, IN_HAND, LENS_WORDS, ROBOT_WORDS, TO_HAND, PosePairs, Poses
 from calib.transforms import invert, pose, to_quaternion
 
 # Fewest pairs that determine both placements.
 MIN_PAIRS = 3
-# Names of the joints, and their elementary transforms in their order.
-JOINTS = ("x", "y", "z", "c", "b", "a")
+# Elementary transforms of the joints, in their order.
 JOINT_AXES = ("tx", "ty", "tz", "rz", "ry", "rx")
+# Names under which easy_handeye stores poses of the board in the camera.
+EASY_HANDEYE = ("optical", "opt")
 # Words for the boards that detectors find.
 BOARD_WORDS = frozenset(
     [
@@ -70,50 +70,37 @@ def measured_pairs(pairs: PosePairs, mounting: str, robot: Chain | None) -> tupl
     if reason:
         arm = invert(arm)
         notes.append(f"the robot's poses are read as its base in its tool: {reason}")
-    direct = median_misfit(arm, reading.seen)
-    inverse = median_misfit(arm, invert(reading.seen))
     chain, q = free_flyer(arm, pairs, robot)
+    agreement = direction(arm, reading.camera)
+    if agreement.agrees and agreement.is_inverse is None:
+        refuse_data(
+            pairs.file,
+            f"{count} pairs agree both as they are ({1e3 * agreement.direct:.3g} mm) and as their inverse "
+            f"({1e3 * agreement.inverse:.3g} mm), so they do not determine the placements: measure 12 poses, with the "
+            "wrist turned by 90° and more about two axes between them",
+        )
     block = Poses(
         q,
-        JOINTS,
-        reading.seen[:, :3, 3],
-        to_quaternion(reading.seen),
-        mounting=mounting or _mounting_by_name(pairs, inverse < direct),
+        POSE_JOINTS,
+        reading.camera[:, :3, 3],
+        to_quaternion(reading.camera),
+        mounting=mounting or _mounting_by_name(pairs, bool(agreement.is_inverse)),
         file=pairs.file,
         rows=pairs.rows,
         station=Path(pairs.file).stem,
         notes=(*pairs.notes, *notes),
     )
-    if inverse < direct:
-        block = replace(block.inverted(), notes=(*block.notes, _direction_note(pairs, direct, inverse, mounting)))
     return CalibratedChain(chain, source=f"robot poses of {Path(pairs.file).name}"), block
 
 
-def _direction_note(pairs: PosePairs, direct: float, inverse: float, mounting: str) -> str:
-    """Return the remark that the poses seen agree as their inverse."""
-    name = pairs.seen.name or "poses"
-    note = (
-        f"{name}: agrees with the robot as its inverse ({1e3 * inverse:.3g} mm instead of {1e3 * direct:.3g} mm, "
-        "median misfit), so it is read as the pose of what stands (board) in the frame of what the arm carries (camera)"
-    )
-    if mounting:
-        return note
-    return (
-        f"{note}. If the camera stands and the robot's poses are those of its base in its tool (easy_handeye, eye on "
-        f"base), state [camera] mounting = '{TO_HAND}' in the options"
-    )
-
-
 def _is_board_in_camera(pairs: PosePairs) -> bool | None:
-    """Return whether the poses seen are those of the board in the camera, if their name says so."""
-    of, frame = pairs.seen.frames
+    """Return whether the poses camera are those of the board in the camera, if their name says so."""
+    of, frame = pairs.camera.frames
     if of & BOARD_WORDS and frame & LENS_WORDS:
         return True
     if of & LENS_WORDS and frame & BOARD_WORDS:
         return False
-    if pairs.seen.words & BOARD_WORDS and not of:
-        return True
-    return None
+    return True if pairs.camera.name.lower() in EASY_HANDEYE else None
 
 
 def _mounting_by_name(pairs: PosePairs, inverse: bool) -> str:
@@ -121,7 +108,7 @@ def _mounting_by_name(pairs: PosePairs, inverse: bool) -> str:
 
     Args:
         pairs: the pairs, whose robot poses are those of the tool in the base.
-        inverse: whether the poses seen agree as their inverse.
+        inverse: whether the poses camera agree as their inverse.
     """
     board_in_camera = _is_board_in_camera(pairs)
     if board_in_camera is None:
@@ -134,12 +121,11 @@ def _robot_is_inverse(pairs: PosePairs, reading: Reading, mounting: str) -> str:
     of, frame = pairs.robot.frames
     if of & FIXED_WORDS and frame & ROBOT_WORDS and not frame & FIXED_WORDS:
         return f"so says the name '{pairs.robot.name}'"
-    if not mounting:
+    board_in_camera = _is_board_in_camera(pairs)
+    if not mounting or board_in_camera is None:
         return ""
-    # detectors give the board in the camera
-    board_in_camera = _is_board_in_camera(pairs) is not False
     expected = board_in_camera == (mounting == IN_HAND)
-    if expected == reading.inverse:
+    if expected == bool(direction(reading.robot, reading.camera).is_inverse):
         return ""
     carried = "camera" if mounting == IN_HAND else "board"
     return f"only so the poses agree with an arm that carries the {carried} (easy_handeye stores them like this)"
@@ -161,7 +147,7 @@ def free_flyer(poses: np.ndarray, pairs: PosePairs, robot: Chain | None) -> tupl
     placements = {"x": pose(None, middle), "c": pose(rotation)}
     joints = []
     elements = []
-    for index, (name, axis) in enumerate(zip(JOINTS, JOINT_AXES)):
+    for index, (name, axis) in enumerate(zip(POSE_JOINTS, JOINT_AXES)):
         kind = "prismatic" if axis[0] == "t" else "revolute"
         joints.append(Joint(name, kind))
         elements.append(Element(f"robot.{name}", axis, owner=index, joint=index, placement=placements.get(name)))

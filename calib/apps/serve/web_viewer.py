@@ -53,7 +53,10 @@ class WebViewer:
         if self.process is not None:
             with suppress(ProcessLookupError):
                 # Rerun's command starts its viewer as a process of its own
-                os.killpg(self.process.pid, signal.SIGKILL)
+                if sys.platform == "win32":
+                    self.process.kill()
+                else:
+                    os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait()
 
 

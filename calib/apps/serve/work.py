@@ -6,6 +6,7 @@ that every page, reloaded or in another tab, shows the same progress.
 
 import os
 import signal
+import sys
 import time
 from collections import deque
 from contextlib import suppress
@@ -137,9 +138,11 @@ class Work:
         """Interrupt the job in progress, as Ctrl-C does, and discard queued ones; the session can be resumed."""
         self._waiting.clear()
         if self._process is not None and self._process.is_alive():
-            with suppress(ProcessLookupError):
-                os.kill(self._process.pid, signal.SIGINT)
-            self._process.join(10.0)
+            # Windows has no Ctrl-C for one process: what it wrote is whole all the same
+            if sys.platform != "win32":
+                with suppress(ProcessLookupError):
+                    os.kill(self._process.pid, signal.SIGINT)
+                self._process.join(10.0)
             self._process.kill()
 
 

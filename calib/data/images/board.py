@@ -11,6 +11,7 @@ Squares are counted, not inner corners::
     square = 0.03                    # side of a square (or of a tag) [m], as measured on the print
     marker = 0.021                   # side of a marker [m]; apriltag: the gap between two tags
     dictionary = "5x5_100"           # of the markers: 4x4_50 … 7x7_1000, apriltag_36h11 …
+    legacy = false                   # ChArUco with even rows as OpenCV drew it before 4.6 (setLegacyPattern)
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import numpy as np
 
 from calib import files
 from calib.config import parse, read_toml, strict
-from calib.config_types import OneOf, Real, Whole
+from calib.config_types import Flag, OneOf, Real, Whole
 from calib.data.poses import BOARD
 
 KINDS = ("charuco", "chessboard", "apriltag")
@@ -50,9 +51,10 @@ class Board:
     kind: Annotated[str, OneOf(KINDS)] = "charuco"
     columns: Annotated[int, Whole(2)] = 9
     rows: Annotated[int, Whole(2)] = 7
-    square: Annotated[float, Real(above=0, most=2.0, quantity="length")] = 0.03
-    marker: Annotated[float, Real(least=0, most=2.0, quantity="length")] = 0.0
+    square: Annotated[float, Real(above=0, most=2.0, unit="m", quantity="length")] = 0.03
+    marker: Annotated[float, Real(least=0, most=2.0, unit="m", quantity="length")] = 0.0
     dictionary: Annotated[str, OneOf(tuple(DICTIONARIES))] = "5x5_100"
+    legacy: Flag = False
 
     def __post_init__(self) -> None:
         if max(self.columns, self.rows) > 100:
@@ -68,7 +70,10 @@ class Board:
             )
         if self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0:
             squares = f"{self.columns} x {self.rows} squares"
-            raise ValueError(f"{squares} look the same upside down: take an even and an odd number of squares")
+            raise ValueError(
+                f"{squares} look the same upside down: take an even and an odd number of squares (squares are counted, "
+                "not inner corners)"
+            )
         if self.kind == "chessboard" and min(self.columns, self.rows) < 4:
             raise ValueError("a chessboard needs at least 4 squares in each direction")
         count = DICTIONARIES.get(self.dictionary, self.tags)
@@ -142,4 +147,6 @@ def write_board(board: Board, path: str | Path) -> Path:
         f"marker = {board.marker!r}".ljust(32) + f"# {comment}",
         f'dictionary = "{board.dictionary}"',
     ]
+    if board.legacy:
+        lines.append("legacy = true".ljust(32) + "# pattern of OpenCV before 4.6")
     return files.write(path, "\n".join(lines) + "\n")

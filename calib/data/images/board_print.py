@@ -47,7 +47,9 @@ def charuco(board: Board) -> cv2.aruco.CharucoBoard:
     """Return a board as OpenCV's ChArUco board object, with lengths in metres."""
     size = board.columns, board.rows
     with quiet():
-        return cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary(board.dictionary))
+        result = cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary(board.dictionary))
+        result.setLegacyPattern(board.legacy)
+        return result
 
 
 def dictionary(name: str) -> cv2.aruco.Dictionary:
@@ -63,12 +65,13 @@ def _black(board: Board) -> np.ndarray:
     margin = 0.5 * (side - board.marker)
     rectangles = []
     markers = []
+    first_black = int(board.legacy and board.kind == "charuco" and board.rows % 2 == 0)
     for row, column in product(range(board.rows), range(board.columns)):
         x = column * side
         y = row * side
         if board.kind == "apriltag":
             markers.append((column * pitch, row * pitch, side))
-        elif (row + column) % 2 == 0:
+        elif (row + column) % 2 == first_black:
             rectangles.append(np.array([[x, y, side, side]]))
         elif board.kind == "charuco":
             markers.append((x + margin, y + margin, board.marker))

@@ -7,13 +7,15 @@ bound of the patch around it, n² (Σ g gᵀ)⁻¹ with grey-level noise n and g
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from calib.data.images.board import DICTIONARIES, MIN_CORNERS, Board, corners
+from calib.data.images.board import MIN_CORNERS, Board, corners
 from calib.data.images.board_print import charuco, dictionary
 from calib.data.images.images import quiet, read_image
+from calib.data.images.marker_layout import INNER, OLD_PATTERN, has_two_patterns, layout_words, other_dictionary
 from calib.data.images.pixels import Detection, Detections
 from calib.errors import MeasurementError
 from calib.workers.extras import needing
@@ -21,10 +23,10 @@ from calib.workers.extras import needing
 with needing("cv2"):
     import cv2
 
-# Smallest number of detected markers from which on a dictionary counts as that of the print.
-MIN_MARKERS = 4
 # Lower bound of a corner's sigma [px]; tags' corners move with blur.
 FLOOR = {"charuco": 0.02, "chessboard": 0.02, "apriltag": 0.2}
+# Smallest share of the detected corners that are consistent with a flat board of the stated size.
+MIN_CONSISTENT = 0.6
 # Width of the edges [px] from which on an image is refused.
 BLURRED = 7.0
 # Ratio of the edges' widths in two directions from which on blur is attributed to motion.
@@ -80,7 +82,12 @@ def detect(image: np.ndarray, board: Board, thorough: bool = True) -> Detection:
         reason = _absent(image, coarse, board, len(ids), thorough)
         return Detection(no_pixels, no_sigmas, problem=reason)
 
+    detected_count = len(ids)
     ids, pixels, spacing = _consistent(ids, pixels, table, board)
+    if len(ids) < MIN_CONSISTENT * detected_count:
+        counts = f"{len(ids)} of {detected_count} corners"
+        reason = layout_words(coarse, board) or f"only {counts} lie where board.toml has them"
+        return Detection(no_pixels, no_sigmas, problem=reason)
     ids, pixels = _refined(image, board, ids, pixels, spacing)
     if len(ids) < min_corners:
         reason = f"only {len(ids)} of {len(table)} corners are sharp enough: blurred, or too small"
@@ -322,44 +329,26 @@ def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, tho
         if len(mirrored) >= MIN_CORNERS:
             return "the board is seen mirrored: is the image flipped, or seen in a mirror? Save it unflipped"
     if thorough and board.kind != "chessboard":
-        marker_count = _markers(coarse, board.dictionary)
-        if marker_count >= MIN_MARKERS:
-            return (
-                f"{marker_count} markers of {board.dictionary} are seen, but not where board.toml has them: are "
-                "kind, columns and rows (squares, not inner corners) those of the print?"
-            )
-        dictionary_name = _other_dictionary(coarse, board)
+        layout = layout_words(coarse, board)
+        if layout:
+            return layout
+        dictionary_name = other_dictionary(coarse, board)
         if dictionary_name:
             return (
                 f"no markers of {board.dictionary}, but some of {dictionary_name}: state this dictionary in board.toml"
+            )
+    if thorough and board.kind == "chessboard":
+        with_more = replace(board, columns=board.columns + 1, rows=board.rows + 1)
+        ids, _ = _coarse(coarse, with_more)
+        if len(ids):
+            return (
+                f"a chessboard of {with_more.columns} x {with_more.rows} squares is seen: {INNER}; state columns = "
+                f"{with_more.columns}, rows = {with_more.rows} in board.toml"
             )
     width = _sharpest(coarse)
     if width > UNSHARP:
         return f"no board found; the image's sharpest edges are {width:.0f} px wide: out of focus, or still moving"
     return "no board found: out of view, hidden, blurred or in glare"
-
-
-def _other_dictionary(image: np.ndarray, board: Board) -> str:
-    """Return the name of the dictionary with the most detected markers; "" if hardly any are detected."""
-    family = board.dictionary.split("_")[0]
-    counts = {}
-    for name in DICTIONARIES:
-        is_largest = name.endswith("_100") or name.startswith("apriltag_36h11")
-        if is_largest and name.split("_")[0] != family:
-            counts[name] = _markers(image, name)
-    best = max(counts, key=counts.__getitem__)
-    if counts[best] < MIN_MARKERS:
-        return ""
-    return best
-
-
-def _markers(image: np.ndarray, name: str) -> int:
-    """Return the number of detected markers of a dictionary in an image."""
-    detector = cv2.aruco.ArucoDetector(dictionary(name))
-    _, ids, _ = detector.detectMarkers(image)
-    if ids is None:
-        return 0
-    return len(ids)
 
 
 def _sharpest(image: np.ndarray) -> float:
@@ -381,7 +370,8 @@ def detected(
 ) -> Detections:
     """Return the corners of a board detected in images, by image name.
 
-    Images whose size differs from that of most images are marked as unusable: a lens is valid for one image size.
+    Images whose size differs from that of most images are marked as unusable: a lens is valid for one image size. Of a
+    ChArUco board that differs between versions of OpenCV, the pattern of the first image with a board is taken.
 
     Args:
         images: name of each image, with its file or its grey levels (height, width).
@@ -392,6 +382,10 @@ def detected(
     detections = dict[str, Detection]()
     sizes = dict[str, tuple[int, int]]()
     failures = 0
+    other_pattern = None
+    if has_two_patterns(board):
+        other_pattern = replace(board, legacy=not board.legacy)
+    notes: tuple[str, ...] = ()
     blank = np.full((len(corners(board)), 2), np.nan)
     for number, (name, source) in enumerate(images):
         if progress:
@@ -407,7 +401,17 @@ def detected(
             continue
         height, width = image.shape[:2]
         sizes[name] = width, height
-        detection = detect(image, board, thorough=failures < MAX_EXAMINED)
+        detection = detect(image, board, thorough=False)
+        if detection.problem and other_pattern is not None:
+            other_detection = detect(image, other_pattern, thorough=False)
+            if not other_detection.problem:
+                detection = other_detection
+                board = other_pattern
+                notes = (_pattern_note(board),)
+        if not detection.problem:
+            other_pattern = None
+        elif failures < MAX_EXAMINED:
+            detection = detect(image, board)
         detections[name] = detection
         failures += detection.problem.startswith("no board found")
     if not sizes:
@@ -420,4 +424,11 @@ def detected(
                 hint = "; did a program rotate it?"
             problem = f"{size[0]} x {size[1]} pixels, where most are {usual_size[0]} x {usual_size[1]}{hint}"
             detections[name] = Detection(blank, blank[:, 0], problem)
-    return Detections(detections, usual_size)
+    return Detections(detections, usual_size, notes)
+
+
+def _pattern_note(board: Board) -> str:
+    """Return the remark that images show the other pattern of a ChArUco board than ``board.toml`` states."""
+    value = "true" if board.legacy else "false"
+    words = OLD_PATTERN if board.legacy else "the pattern is that of OpenCV from 4.6"
+    return f"{words}; the images are read so: state legacy = {value} in board.toml"

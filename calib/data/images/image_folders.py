@@ -73,7 +73,7 @@ def read_images(
     names = table.texts("image")
     detection = find_corners(path, board, names, progress)
     rows, detection_notes = _usable(names, detection, path)
-    notes += detection_notes
+    notes += [*detection.notes, *detection_notes]
     lens, lens_stated, lens_notes = _lens_of_folder(path, detection.size, options)
     notes += lens_notes
     pixels = []
@@ -357,4 +357,4 @@ def detection_summary(detection: Detections, board: Board, names: Iterable[str])
     if detection.size[0]:
         all_pixels = np.concatenate(pixels)
         lines.append(coverage_words(all_pixels, detection.size))
-    return [*lines, *problems]
+    return [*lines, *detection.notes, *problems]

@@ -73,7 +73,7 @@ def read_lens(path: str | Path, size: tuple[int, int] = (0, 0)) -> Lens:
             path,
         )
     if len(cameras) > 1:
-        names = ", ".join(name or "the first" for name, _ in cameras)
+        names = ", ".join(dict(cameras))
         raise MeasurementError(f"has {len(cameras)} lenses ({names}): leave that of these images", path)
     ((_, table),) = cameras
     intrinsics = _intrinsics(table, path)
@@ -86,7 +86,7 @@ def read_lens(path: str | Path, size: tuple[int, int] = (0, 0)) -> Lens:
 def _cameras(node: object, name: str = "") -> Iterator[tuple[str, Node]]:
     """Yield name and table of each camera in a tree: each table with a camera matrix or focal lengths."""
     if isinstance(node, Mapping):
-        table = {str(key).lower(): value for key, value in node.items()}
+        table = _by_lower_case(node)
         if _has_focal_lengths(table):
             yield name, table
             return
@@ -101,22 +101,41 @@ def _has_focal_lengths(table: Node) -> bool:
     """Return whether a table (keys in lower case) has a camera matrix, or focal lengths."""
     if "intrinsics" in table and as_numbers(table["intrinsics"]) is not None:
         return True
-    if any(key in table for key in MATRIX_KEYS):
-        return True
-    return any(all(key in table for key in keys) for keys in FOCAL_KEYS)
+    return bool(_key(table, MATRIX_KEYS) or _focal_keys(table))
+
+
+def _by_lower_case(table: Node) -> dict[str, object]:
+    """Return a table with its keys in lower case."""
+    return {str(key).lower(): value for key, value in table.items()}
+
+
+def _key(table: Node, keys: tuple[str, ...]) -> str:
+    """Return the first of some keys that a table has; empty if it has none."""
+    for key in keys:
+        if key in table:
+            return key
+    return ""
+
+
+def _focal_keys(table: Node) -> tuple[str, ...]:
+    """Return the names under which a table has focal lengths and principal point; () if it has none."""
+    for keys in FOCAL_KEYS:
+        if set(keys) <= set(table):
+            return keys
+    return ()
 
 
 def _intrinsics(table: Node, path: Path) -> np.ndarray:
     """Return fx, fy, cx, cy [px] of a camera's table; raise MeasurementError for others."""
-    for keys in FOCAL_KEYS:
-        if all(key in table for key in keys):
-            return _numbers([table[key] for key in keys], "fx, fy, cx, cy", path)
-    key = next((key for key in (*MATRIX_KEYS, "intrinsics") if key in table), MATRIX_KEYS[0])
+    focal_keys = _focal_keys(table)
+    if focal_keys:
+        return _numbers(list(map(table.get, focal_keys)), "fx, fy, cx, cy", path)
+    key = _key(table, (*MATRIX_KEYS, "intrinsics"))
     value = table[key]
     if isinstance(value, Mapping):
         # Zivid: a matrix by the names of its numbers
-        by_name = {str(name).lower(): entry for name, entry in value.items()}
-        if any(all(name in by_name for name in names) for names in FOCAL_KEYS):
+        by_name = _by_lower_case(value)
+        if _focal_keys(by_name):
             return _intrinsics(by_name, path)
     matrix = _numbers(value, key, path)
     if len(matrix) == 4 and key == "intrinsics":
@@ -133,7 +152,7 @@ def _size(table: Node, size: tuple[int, int], path: Path) -> tuple[int, int]:
         if numbers is not None and numbers.size == 2:
             width, height = numbers.astype(int).tolist()
             return width, height
-    if not any(key in table for key in (*WIDTH_KEYS, *HEIGHT_KEYS)) and size[0]:
+    if not _key(table, (*WIDTH_KEYS, *HEIGHT_KEYS)) and size[0]:
         return size
     return _pixel_count(table, WIDTH_KEYS, path), _pixel_count(table, HEIGHT_KEYS, path)
 
@@ -174,8 +193,7 @@ def _model_name(table: Node, path: Path) -> str:
         if key == "camera_model" and name == "pinhole":
             continue
         if name not in MODELS:
-            known = ", ".join(MODELS)
-            message = f"{key} '{name}'{suggestion(name, MODELS)} is unknown; expected one of {known}"
+            message = f"{key} '{name}'{suggestion(name, MODELS)} is unknown; expected one of {', '.join(MODELS)}"
             raise MeasurementError(message, path)
         return name
     return "opencv"
@@ -183,16 +201,18 @@ def _model_name(table: Node, path: Path) -> str:
 
 def _coefficients(table: Node, name: str, path: Path) -> np.ndarray:
     """Return the distortion coefficients of a table, in the order of the lens's values."""
-    key = next((key for key in DISTORTION_KEYS if key in table), "")
+    key = _key(table, DISTORTION_KEYS)
     if not key:
         if name == "none":
             return np.zeros(0)
         return _numbers(None, DISTORTION_KEYS[0], path)
     value = table[key]
     if isinstance(value, Mapping) and "data" not in value:
-        by_name = {str(entry).lower(): number for entry, number in value.items()}
-        names = [entry for entry in NAMES[MODELS[name]][4:] if entry in by_name]
-        return _numbers([by_name[entry] for entry in names], key, path)
+        by_name = _by_lower_case(value)
+        numbers = list(map(by_name.get, NAMES[MODELS[name]][4:]))
+        while numbers and numbers[-1] is None:
+            numbers.pop()
+        return _numbers(numbers, key, path)
     if isinstance(value, list) and not value:
         return np.zeros(0)
     return _numbers(value, key, path)
@@ -200,7 +220,7 @@ def _coefficients(table: Node, name: str, path: Path) -> np.ndarray:
 
 def _pixel_count(table: Node, keys: tuple[str, ...], path: Path) -> int:
     """Return the number of pixels that a table states under one of the keys; raise MeasurementError for others."""
-    value = next((table[key] for key in keys if key in table), None)
+    value = table.get(_key(table, keys))
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     if not isinstance(value, int) or not 0 < value < MAX_SIDE:

@@ -122,10 +122,11 @@ class Detection:
 
 @dataclass(frozen=True, eq=False)
 class Detections:
-    """Detected corners by image name, and the images' width and height [px] (0, 0 if unknown)."""
+    """Detected corners by image name, the images' width and height [px] (0, 0 if unknown), and remarks on the board."""
 
     images: dict[str, Detection]
     size: tuple[int, int] = (0, 0)
+    notes: tuple[str, ...] = ()
 
 
 def write_corners(path: Path, detections: Detections) -> Path:

@@ -104,17 +104,17 @@ class PoseList:
         return len(self.position)
 
     @property
-    def words(self) -> frozenset[str]:
-        """Words of the name."""
-        return frozenset(re.split(r"[^a-z]+", self.name.lower()))
+    def title(self) -> str:
+        """The name, for messages."""
+        return self.name or "poses"
 
     @property
     def is_robot(self) -> bool | None:
         """Whether the name is that of the robot's poses; None where it says neither."""
         text = _direction(self.name)[0] or self.name
-        words = frozenset(re.split(r"[^a-z0-9]+", text.lower()))
-        of_robot = len(words & ROBOT_WORDS)
-        of_camera = len(words & CAMERA_WORDS)
+        parts = frozenset(re.split(r"[^a-z0-9]+", text.lower()))
+        of_robot = len(parts & ROBOT_WORDS)
+        of_camera = len(parts & CAMERA_WORDS)
         if of_robot == of_camera:
             return None
         return of_robot > of_camera
@@ -123,7 +123,7 @@ class PoseList:
     def frames(self) -> tuple[frozenset[str], frozenset[str]]:
         """Words for the frame whose pose this is, and for the frame in which it is; empty where the name says none."""
         of, frame = _direction(self.name)
-        return frozenset(re.split(r"[^a-z]+", of)), frozenset(re.split(r"[^a-z]+", frame))
+        return frozenset(re.findall(r"[a-z]+", of)), frozenset(re.findall(r"[a-z]+", frame))
 
     @property
     def kind(self) -> str:
@@ -137,7 +137,7 @@ class PoseList:
         largest = float(np.abs(self.position).max())
         if largest <= MAX_METRES:
             return self.position, ""
-        note = f"{self.name or 'positions'}: up to {largest:.4g}, read as mm (no unit is stated)"
+        note = f"{self.title}: up to {largest:.4g}, read as mm (no unit is stated)"
         return self.position * LENGTHS["mm"], note
 
     def readings(self, conventions: Sequence[str] = ()) -> Iterator[tuple[str, np.ndarray]]:
@@ -204,7 +204,7 @@ class PosePairs:
 
     Attributes:
         robot: poses of the tool in the base (or of the base in the tool).
-        seen: poses of the board in the camera (or of the camera in the board).
+        camera: poses of the board in the camera (or of the camera in the board).
         file: path of the file.
         rows: (m,) number of each sample, from 1.
         in_hand: whether the arm carries the camera, if the file says so.
@@ -212,7 +212,7 @@ class PosePairs:
     """
 
     robot: PoseList
-    seen: PoseList
+    camera: PoseList
     file: str
     rows: np.ndarray
     in_hand: bool | None = None

@@ -37,19 +37,25 @@ TURN_WORDS = frozenset(
 POSE_WORDS = frozenset(["pose", "poses", "transform", "tf", "frame", "field"])
 # Names of columns → quantity, and number of the component.
 COMPONENTS: dict[str, tuple[str, int]] = {}
-for _number, _axis in enumerate("xyz"):
-    COMPONENTS |= {f"{mark}{_axis}": ("position", _number) for mark in ("t", "p")}
-    COMPONENTS |= {f"r{_axis}": ("angles", _number), f"tvec{_axis}": ("position", _number)}
-    COMPONENTS |= {f"rvec{_axis}": ("vector", _number), f"rotvec{_axis}": ("vector", _number)}
-COMPONENTS |= {f"q{_axis}": ("quaternion", _number) for _number, _axis in enumerate("xyzw")}
-COMPONENTS |= {name: ("xyz fixed", number) for number, name in enumerate(("roll", "pitch", "yaw"))}
-COMPONENTS |= {name: ("zyx moving", number) for number, name in enumerate("abc")}
-COMPONENTS |= {name: ("wpr", number) for number, name in enumerate("wpr")}
-for _row in range(3):
-    for _column in range(3):
-        COMPONENTS[f"r{_row + 1}{_column + 1}"] = ("matrix", 3 * _row + _column)
-        COMPONENTS[f"r{_row}{_column}"] = ("matrix from 0", 3 * _row + _column)
-SIZES = {"position": 3, "quaternion": 4, "matrix": 9, "matrix from 0": 9}
+for _quantity, _names in (
+    ("position", ("tx", "ty", "tz")),
+    ("position", ("px", "py", "pz")),
+    ("position", ("tvecx", "tvecy", "tvecz")),
+    ("angles", ("rx", "ry", "rz")),
+    ("vector", ("rvecx", "rvecy", "rvecz")),
+    ("vector", ("rotvecx", "rotvecy", "rotvecz")),
+    ("quaternion", ("qx", "qy", "qz", "qw")),
+    ("xyz fixed", ("roll", "pitch", "yaw")),
+    ("zyx moving", ("a", "b", "c")),
+    ("wpr", ("w", "p", "r")),
+):
+    for _number, _name in enumerate(_names):
+        COMPONENTS[_name] = (_quantity, _number)
+# r11 to r33, or r00 to r22
+for _row in range(4):
+    for _column in range(4):
+        COMPONENTS[f"r{_row}{_column}"] = ("matrix", 10 * _row + _column)
+SIZES = {"position": 3, "quaternion": 4, "matrix": 9}
 # Quantities whose name says the convention of their angles.
 CONVENTIONS = ("vector", "xyz fixed", "zyx moving", "wpr")
 # Fewest further columns that count as those of joints.
@@ -66,13 +72,15 @@ def read_table_of_pairs(path: Path, options: FileOptions) -> PosePairs | None:
         options: column names and units that the header does not state.
     """
     names, _ = read_header(path)
-    renamed = {heading: name for name, heading in options.columns.items()}
+    renamed = dict(zip(options.columns.values(), options.columns))
     families = _families([renamed.get(name, name) for name in names], names)
     if len(families) != 2:
         return None
     if "" in families:
         # one pose without a name, with another one beside it and joints: measurements at joint values
-        of_poses = sum(len(columns) for family in families.values() for columns in family.values())
+        of_poses = 0
+        for family in families.values():
+            of_poses += sum(map(len, family.values()))
         if len(names) - of_poses >= MIN_JOINTS:
             return None
     table = read_table(path)
@@ -98,7 +106,7 @@ def _families(names: list[str], headings: tuple[str, ...]) -> dict[str, dict[str
         complete = {}
         for quantity, columns in quantities.items():
             if len(columns) == SIZES.get(quantity, 3) or (quantity == "turn" and len(columns) == 4):
-                complete[quantity] = [columns[number] for number in sorted(columns)]
+                complete[quantity] = list(map(columns.__getitem__, sorted(columns)))
         if "position" in complete and len(complete) == 2:
             families[pose] = complete
     # the toolkit's own columns: a target, and the frame on the base that was measured with it
@@ -116,41 +124,41 @@ def component(name: str) -> tuple[str, str, int] | None:
         name: name of a column, without its unit.
     """
     text = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", name).lower()
-    words = [word for word in re.split(r"[^a-z0-9]+", text) if word]
-    if words and words[-1] in UNIT_WORDS:
-        words.pop()
-    if not words:
+    parts = re.findall(r"[a-z0-9]+", text)
+    if parts and parts[-1] in UNIT_WORDS:
+        parts.pop()
+    if not parts:
         return None
-    for last in (len(words) - 1, 0):
-        rest = words[:last] + words[last + 1 :]
-        split = _component_of_word(words[last], rest)
+    for index in dict.fromkeys([len(parts) - 1, *range(len(parts))]):
+        beside = parts[:index] + parts[index + 1 :]
+        split = _component_of_word(parts[index], beside)
         if split is not None:
             quantity, number = split
-            named = [word for word in rest if word not in POSITION_WORDS | TURN_WORDS | POSE_WORDS]
-            return "_".join(named), quantity, number
+            pose_words = [part for part in beside if part not in POSITION_WORDS | TURN_WORDS | POSE_WORDS]
+            return "_".join(pose_words), quantity, number
     return None
 
 
-def _component_of_word(word: str, rest: list[str]) -> tuple[str, int] | None:
+def _component_of_word(part: str, beside: list[str]) -> tuple[str, int] | None:
     """Return quantity and component that a word of a column's name says, beside the other words."""
-    turns = TURN_WORDS.intersection(rest)
-    if word in tuple("xyzw"):
-        number = "xyzw".index(word)
+    turns = TURN_WORDS.intersection(beside)
+    if part in tuple("xyzw"):
+        number = "xyzw".index(part)
         if not turns:
-            return ("position", number) if word != "w" else COMPONENTS["w"]
+            return ("position", number) if part != "w" else COMPONENTS["w"]
         if turns & {"rvec", "rotvec"}:
             return "vector", number
         if turns & {"euler", "rpy", "angle", "angles"}:
             return "angles", number
         return "turn", number
-    if word.isdigit() and len(word) == 1:
-        number = int(word)
+    if part.isdigit() and len(part) == 1:
+        number = int(part)
         if turns & {"rvec", "rotvec"}:
             return "vector", number
-        if POSITION_WORDS.intersection(rest):
+        if POSITION_WORDS.intersection(beside):
             return "position", number
         return None
-    return COMPONENTS.get(word)
+    return COMPONENTS.get(part)
 
 
 def _pose_list(table: Table, name: str, columns: Mapping[str, list[str]], options: FileOptions) -> PoseList:
@@ -162,9 +170,9 @@ def _pose_list(table: Table, name: str, columns: Mapping[str, list[str]], option
         columns: quantity → the file's names of its columns.
         options: units and conventions that the header does not state.
     """
-    (turned,) = (quantity for quantity in columns if quantity != "position")
-    position = np.column_stack([table.numbers(column, None) for column in columns["position"]])
-    turn = np.column_stack([table.numbers(column, None) for column in columns[turned]])
+    (turned,) = set(columns) - {"position"}
+    position = np.column_stack(table.check(columns["position"]))
+    turn = np.column_stack(table.check(columns[turned]))
     convention = turned if turned in CONVENTIONS else ""
     if turn.shape[1] == 4:
         convention = "x y z w"
@@ -186,9 +194,11 @@ def _unit(table: Table, columns: list[str], stated: str) -> str:
     """
     units = set()
     for column in columns:
-        last_word = re.split(r"[^a-z]+", column.lower())[-1]
-        of_name = last_word if last_word in UNIT_WORDS else ""
-        units.add(table.units[table.index(column)] or of_name)
+        unit = table.units[table.index(column)]
+        if not unit:
+            ending = re.split(r"[^a-z]+", column.lower())[-1]
+            unit = ending if ending in UNIT_WORDS else ""
+        units.add(unit)
     if len(units) > 1:
         refuse_data(table.file, f"{', '.join(columns)} have different units: {', '.join(sorted(units))}")
     return units.pop() or stated

@@ -15,6 +15,8 @@ from calib.errors import MeasurementError
 SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".samples")
 # Least number of samples that are a list of poses rather than one pose.
 MIN_SAMPLES = 2
+# Largest number of keys of a table that is a list of poses with a header.
+MAX_KEYS = 2
 # Deepest nesting that is searched.
 MAX_DEPTH = 12
 POSITION_KEYS = ("translation", "position", "trans", "tvec", "t", "xyz", "origin", "p", "pos", "location")
@@ -85,7 +87,8 @@ def _lists_of(node: object, path: Path) -> list[PoseList]:
     """Return the lists of poses that a list of samples, or a table of lists, contains."""
     if isinstance(node, Mapping):
         samples = list(node.values())
-        if len(samples) >= MIN_SAMPLES and all(len(_poses_in(sample)) == 2 for sample in samples):
+        counts = {len(_poses_in(sample)) for sample in samples}
+        if len(samples) >= MIN_SAMPLES and counts == {2}:
             return _of_samples(samples, path)
         return _of_parallel(node)
     if isinstance(node, list) and len(node) >= MIN_SAMPLES and len(_poses_in(node[0])) == 2:
@@ -123,9 +126,8 @@ def _joined(name: str, poses: Sequence[Raw], path: Path) -> PoseList:
     sizes = {len(turn) for _, turn, _ in poses}
     if len(sizes) > 1:
         raise MeasurementError(f"the orientations of '{name}' have different forms in different samples", path)
-    position = np.array([pose[0] for pose in poses])
-    turn = np.array([pose[1] for pose in poses])
-    return PoseList(name, position, turn, poses[0][2])
+    positions, turns, conventions = zip(*poses)
+    return PoseList(name, np.array(positions), np.array(turns), conventions[0])
 
 
 def _of_parallel(node: Mapping[str, object]) -> list[PoseList]:
@@ -133,11 +135,15 @@ def _of_parallel(node: Mapping[str, object]) -> list[PoseList]:
     table = _without_numbers(node)
     lists = []
     parts: dict[str, dict[str, tuple[np.ndarray, str]]] = {}
-    for key, value in table.items():
+    for key, content in table.items():
+        value = content
+        if isinstance(content, Mapping) and len(content) <= MAX_KEYS:
+            # the poses of a PoseArray, with its header beside them
+            for entry in content.values():
+                value = entry if isinstance(entry, list) else value
         if not isinstance(value, list) or len(value) < MIN_SAMPLES:
             continue
-        poses = [pose_of(entry) for entry in value]
-        complete = [pose for pose in poses if pose is not None]
+        complete = list(filter(None, map(pose_of, value)))
         if len(complete) == len(value):
             lists.append(_joined(key, complete, Path(key)))
             continue
@@ -163,17 +169,16 @@ def _without_numbers(node: Mapping[str, object]) -> dict[str, object]:
         else:
             numbered.setdefault(match["stem"], {})[int(match["number"])] = value
     for stem, values in numbered.items():
-        table[stem] = [values[number] for number in sorted(values)]
+        table[stem] = list(map(values.__getitem__, sorted(values)))
     return table
 
 
 def _part(key: str, value: list[object]) -> tuple[str, str, np.ndarray, str] | None:
     """Return name, quantity (position or turn), numbers (m, k) and convention of a list such as ``R_gripper2base``."""
-    rows = [as_numbers(entry) for entry in value]
-    flat = [row.ravel() for row in rows if row is not None]
-    if len(flat) != len(value) or len({len(row) for row in flat}) != 1:
+    numbers = as_numbers(value)
+    if numbers is None:
         return None
-    numbers = np.array(flat)
+    numbers = numbers.reshape(len(value), -1)
     match = _PARALLEL.fullmatch(key) if re.match(r"(?i)[rtq](vecs?)?_", key) else None
     match = match or _PARALLEL_LAST.fullmatch(key) or _PARALLEL.fullmatch(key)
     if match is None:
@@ -195,7 +200,7 @@ def pose_of(node: object) -> Raw | None:
             position and an orientation in a list.
     """
     if isinstance(node, Mapping):
-        return _pose_of_table({str(key).lower(): value for key, value in node.items()})
+        return _pose_of_table(_by_lower_case(node))
     if not isinstance(node, list):
         return None
     if len(node) == 2 and not is_numeric(node):
@@ -211,17 +216,22 @@ def pose_of(node: object) -> Raw | None:
     return None
 
 
+def _by_lower_case(table: Mapping[object, object]) -> dict[str, object]:
+    """Return a table with its keys in lower case."""
+    return {str(key).lower(): value for key, value in table.items()}
+
+
 def _pose_of_two(first: object, second: object) -> Raw | None:
     """Return the pose of a position and an orientation (tf's tuples), or of a matrix and a position."""
-    one = as_numbers(first)
-    other = as_numbers(second)
-    if one is None or other is None:
+    position = as_numbers(first)
+    turn = as_numbers(second)
+    if position is None or turn is None:
         return None
-    if one.size == 3 and other.size in (3, 4, 9):
-        return one.ravel(), other.ravel(), ""
-    if one.size == 9 and other.size == 3:
-        return other.ravel(), one.ravel(), ""
-    return None
+    if position.size == 9 and turn.size == 3:
+        position, turn = turn, position
+    if position.size != 3 or turn.size not in (3, 4, 9):
+        return None
+    return position.ravel(), turn.ravel(), ""
 
 
 def _pose_of_matrix(matrix: np.ndarray) -> Raw | None:
@@ -252,7 +262,7 @@ def _position(table: Mapping[str, object]) -> np.ndarray | None:
         if key in table:
             value = table[key]
             if isinstance(value, Mapping):
-                return _components({str(name).lower(): entry for name, entry in value.items()}, "xyz")
+                return _components(_by_lower_case(value), "xyz")
             numbers = as_numbers(value)
             return numbers.ravel() if numbers is not None and numbers.size == 3 else None
     return _components(table, "xyz")
@@ -264,7 +274,7 @@ def _turn(table: Mapping[str, object]) -> tuple[np.ndarray, str] | None:
         if key in table:
             value = table[key]
             if isinstance(value, Mapping):
-                return _turn_of_components({str(name).lower(): entry for name, entry in value.items()}, "")
+                return _turn_of_components(_by_lower_case(value), "")
             numbers = as_numbers(value)
             if numbers is None or numbers.size not in (3, 4, 9):
                 return None
@@ -276,7 +286,7 @@ def _turn(table: Mapping[str, object]) -> tuple[np.ndarray, str] | None:
 
 def _turn_of_components(table: Mapping[str, object], mark: str) -> tuple[np.ndarray, str] | None:
     """Return the orientation of named numbers: x y z w (after `mark`), roll pitch yaw, rx ry rz, or a b c."""
-    quaternion = _components(table, tuple(f"{mark}{axis}" for axis in "xyzw"))
+    quaternion = _components(table, ("qx", "qy", "qz", "qw") if mark else "xyzw")
     if quaternion is not None:
         return quaternion, "x y z w"
     for names, convention in ((("roll", "pitch", "yaw"), "xyz fixed"), (("rx", "ry", "rz"), ""), ("abc", "zyx moving")):
@@ -291,5 +301,5 @@ def _turn_of_components(table: Mapping[str, object], mark: str) -> tuple[np.ndar
 
 def _components(table: Mapping[str, object], names: Sequence[str]) -> np.ndarray | None:
     """Return the numbers of a table under these names; None if one is missing or no number."""
-    values = [table.get(name) for name in names]
+    values = list(map(table.get, names))
     return as_numbers(values) if None not in values else None

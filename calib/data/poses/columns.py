@@ -7,7 +7,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from calib.controllers.table import as_described
+from calib.controllers.axes import as_described, named_joints
 from calib.data.csv_table import Table
 from calib.data.joint_columns import (
     described,
@@ -143,12 +143,14 @@ class Sheet:
         """Return joint values (m, n) [rad or m], and the file's names of the joint columns.
 
         Args:
-            joints: names of the robot's n joints, in the robot's order, or the joints with their types.
+            joints: the robot's n joints, or only their names (then taken as revolute), in the robot's order.
         """
+        robot = Joints.of(joints)
         names = self.find_joints(joints)
-        q = self.numbers(names, Column(Joints.of(joints).names, "joint", "joints"))
+        q = self.numbers(names, Column(robot.names, "joint", "joints"))
         if self.options.controller:
-            q = as_described(self.options.controller, q)
+            named = named_joints(robot.names, robot.kinds)
+            q = as_described(self.options.controller, q, named, self.options.external)
         return q, names
 
     def check_names(self, joints: Sequence[str]) -> None:
@@ -204,7 +206,7 @@ class Sheet:
         return self._joints_by_words(robot, message, missing[0] if message else None)
 
     def has_our_names(self, columns: Sequence[str], joints: Sequence[str]) -> bool:
-        """Return whether joint columns have the names of the robot's joints or of this toolkit, or the options map them.
+        """Return whether joint columns have names of the robot's joints or of this toolkit, or the options map them.
 
         Args:
             columns: the file's names of the joint columns.
@@ -233,7 +235,7 @@ class Sheet:
         if len(positions) == 1:
             return positions[0].columns
         if len(positions) > 1:
-            choices = " or ".join(described(entry) for entry in positions)
+            choices = " or ".join(map(described, positions))
             self.fail(f"joints may be {choices}: choose by one line in the options: {mapping_line(positions[0])}")
         if not message:
             expected = f"expected q1 to q{n}, or {', '.join(robot.names)}"
@@ -448,7 +450,7 @@ def with_shapes(sheet: Sheet, robot: Joints) -> Sheet:
     """
     _refuse_base_alone(sheet)
     joints = sheet.find_joints(robot)
-    if any(sheet.find(label) for label in LABEL_OF.values()):
+    if any(map(sheet.find, LABEL_OF.values())):
         return sheet
     unread = {*joints, *sheet.options.columns.values()}
     names = [name for name in sheet.table.header if name not in unread]

@@ -19,12 +19,17 @@ import io
 import re
 import tomllib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
+
+from calib.data.csv_table import Table, as_column, encoding_of
 from calib.data.poses.columns import SUFFIXES
 from calib.data.poses.robodk import recognises
+from calib.errors import listing
+from calib.records import frozen
 
 # Letters of a file in which its numbers begin (our choice).
 HEAD = 1 << 16
@@ -32,6 +37,8 @@ HEAD = 1 << 16
 ROWS = 3
 # Lines, without comments, in which the numbers begin (our choice).
 BEGIN = 60
+# Letters of a title that a note quotes.
+TITLE = 40
 # Rows above the numbers that may name columns.
 STACK = 7
 # Least number of numbers in a row, and least share of its cells.
@@ -93,25 +100,25 @@ def presets() -> dict[str, dict[str, str]]:
 def translated(path: str | Path) -> InstrumentExport | None:
     """Return an instrument's file as the text of a CSV table.
 
-    None if the file is a CSV table already, or has no positions.
+    None if the file is a CSV table already, or has no positions and no decimal commas.
 
     Args:
         path: the file.
     """
     with open(path, "rb") as file:
         beginning = file.read(HEAD)
-        is_utf16 = beginning[:2] in (b"\xff\xfe", b"\xfe\xff")
-        encoding = "utf-16" if is_utf16 else "utf-8-sig"
+        encoding = encoding_of(beginning)
         head = beginning.decode(encoding, errors="replace")
         lines = head.splitlines()
         grid = _grid(lines)
         if grid is None:
             return None
         names, units, differs = _columns(grid)
-        if not recognises(names) and not _is_ours(names):
+        has_commas = grid.mark == "," and bool(names)
+        if not recognises(names) and not _is_ours(names) and not has_commas:
             return None
         preset = _preset(lines)
-        is_plain = not preset and grid.mark == "." and not is_utf16 and not differs
+        is_plain = not preset and grid.mark == "." and encoding != "utf-16" and not differs
         if is_plain and _first_content(lines) == grid.first - 1:
             return None
         text = (beginning + file.read()).decode(encoding, errors="replace")
@@ -136,8 +143,35 @@ def translated(path: str | Path) -> InstrumentExport | None:
         note += ", decimal commas"
     if length_unit:
         note += f", lengths in {length_unit}"
-    export.notes = (f"{note}: columns {', '.join(filter(None, names))}",)
+    left_out = () if preset else _left_out(lines, grid)
+    export.notes = (f"{note}: columns {', '.join(filter(None, names))}", *left_out)
     return export
+
+
+def unnamed_table(path: str | Path) -> Table | None:
+    """Return a file of numbers without a row of names as a table with columns ``column 1``, ``column 2`` ….
+
+    None for a file with names.
+
+    Args:
+        path: the file.
+    """
+    with open(path, "rb") as file:
+        content = file.read(HEAD)
+        encoding = encoding_of(content)
+        lines = content.decode(encoding, errors="replace").splitlines()
+        grid = _grid(lines)
+        if grid is None or _headings(grid) or _named_by_comment(lines[: grid.first], grid):
+            return None
+        if any(_number_count(line, grid) for line in lines[: grid.first]):
+            return None
+        content += file.read()
+    lines = content.decode(encoding, errors="replace").splitlines()
+    rows = [row for row in _rows(lines[grid.first :], grid) if len(row) == len(grid.cells)]
+    header = tuple(f"column {number + 1}" for number in range(len(grid.cells)))
+    cells = list(map(as_column, zip(*rows)))
+    numbers = frozen(np.arange(1, len(rows) + 1), int)
+    return Table(str(path), header, ("",) * len(header), tuple(cells), numbers, _left_out(lines, grid))
 
 
 def _preset(lines: Sequence[str]) -> dict[str, str]:
@@ -265,8 +299,8 @@ def _columns(grid: Grid) -> tuple[list[str], list[str], bool]:
     units = [""] * width
     if above and any(above[-1]) and all(cell.lower() in UNITS for cell in above[-1] if cell):
         units = [UNITS[cell.lower()] if cell else "" for cell in above.pop()]
-    headings = above[-1] if above and sum(map(bool, above[-1])) > width / 2 else ()
-    if not headings or sum(_numeric(headings, grid.mark)) > width / 2:
+    headings = _headings(replace(grid, above=tuple(above)))
+    if not headings:
         names, units = _unnamed(grid)
         return names, units, True
     file_names, file_units = [], []
@@ -281,6 +315,75 @@ def _columns(grid: Grid) -> tuple[list[str], list[str], bool]:
     if not recognises(file_names) and not _is_ours(file_names):
         names = _ours(file_names, above[:-1])
     return names, units, names != file_names or units != file_units
+
+
+def _headings(grid: Grid) -> tuple[str, ...]:
+    """Return the row of names above the numbers; () if there is none, or if it is numbers, too.
+
+    Args:
+        grid: position of the numbers in the text, with the cells above them but for a row of units.
+    """
+    if not grid.above:
+        return ()
+    headings = grid.above[-1]
+    width = len(grid.cells)
+    is_named = sum(map(bool, headings)) > width / 2 and sum(_numeric(headings, grid.mark)) <= width / 2
+    return headings * is_named
+
+
+def _named_by_comment(lines: Sequence[str], grid: Grid) -> bool:
+    """Return whether a comment above the numbers has as many words as there are columns (numpy's savetxt).
+
+    Args:
+        lines: lines above the numbers.
+        grid: position of the numbers in the text.
+    """
+    for line in lines:
+        text = line.strip().lstrip("#/%! ")
+        if text and len(_split(text, grid.separator)) == len(grid.cells):
+            return True
+    return False
+
+
+def _left_out(lines: Sequence[str], grid: Grid) -> tuple[str, ...]:
+    """Return notes on the lines above the numbers that name no column: titles, or rows that were run together.
+
+    Args:
+        lines: lines of the text.
+        grid: position of the numbers in the text.
+    """
+    indices = [index for index, line in enumerate(lines[: grid.first]) if _is_content(line)]
+    understood = int(bool(_headings(grid)))
+    if grid.above and all(cell.lower() in UNITS for cell in grid.above[-1] if cell):
+        understood = 2
+    titles = []
+    notes = []
+    for index in indices[: len(indices) - understood]:
+        beginning = lines[index].strip()[:TITLE]
+        count = _number_count(lines[index], grid)
+        if count:
+            notes.append(
+                f"line {index + 1} was left out, with {count} numbers in it: '{beginning} …'; are rows run together, "
+                "or is a line break missing?"
+            )
+        elif not _STATED.search(lines[index]):
+            titles.append(f"{index + 1} ('{beginning}')")
+    if titles:
+        notes.append(f"left out as titles: line(s) {listing(titles, 4)}")
+    return tuple(notes)
+
+
+def _number_count(line: str, grid: Grid) -> int:
+    """Return the number of numbers in a line above the numbers, if it may hold a row of them; else 0.
+
+    Args:
+        line: the line.
+        grid: position of the numbers in the text.
+    """
+    if not _is_content(line):
+        return 0
+    count = sum(_numeric(_split(line, grid.separator), grid.mark))
+    return count * (count >= max(MIN_NUMBERS, sum(grid.numeric)))
 
 
 def _is_ours(names: Sequence[str]) -> bool:

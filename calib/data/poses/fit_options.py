@@ -10,6 +10,7 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
     groups = ["tool_position"]       # columns that, with the socket (plane), name one group
     controller = "fanuc"             # joints are as this controller shows them (signs, axes that count from the
                                      # horizontal): calib program --list
+    external = ["rail"]              # joints that are the controller's external axes, if names and kinds do not tell
     station = "tracker A"            # one name for the instrument placement; by default each file has its own
     tool = "ball"                    # the tool's (reflector's) name
     check_limits = true              # refuse joint values outside the robot's limits
@@ -118,12 +119,14 @@ class FileOptions:
         columns: the toolkit's name of a column → the file's name.
         units: the toolkit's name of a column, or a family of columns → its unit.
         where: column → texts; only rows with one of these texts are used.
+        external: names of joints that are external axes of the controller, where names and kinds do not tell.
         planned: CSV of the poses that were to be measured, for a file without joints.
         base_frame: whether the target is seen from the base frame that the file's columns ``base_`` contain.
     """
 
     kind: Annotated[str, OneOf(tuple(KINDS))] = ""
     controller: Name = ""
+    external: Names = ()
     format: Annotated[str, OneOf(FORMATS)] = ""
     euler: Annotated[str, OneOf(EULER)] = ""
     columns: Mapping[str, Name] = field(default_factory=dict)

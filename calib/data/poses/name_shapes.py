@@ -10,11 +10,13 @@ import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import filterfalse
+from operator import attrgetter
 
 import numpy as np
 
 from calib.data.csv_table import Table
-from calib.data.joint_columns import COMMANDED_WORDS, OTHER_WORDS, words_of
+from calib.data.joint_columns import COMMANDED_WORDS, OTHER_WORDS, parted, words_of
 from calib.data.poses.fit_options import FileOptions
 from calib.data.schema import BOUNDS
 
@@ -28,7 +30,8 @@ PLACE_WORDS = frozenset(("t", "tvec", "trans", "translation", "p", "pos", "posit
 REJECTED_WORDS = (OTHER_WORDS - {"v", "i", "name"}) | {"base", "late", "offset", "std", "cov", "unc"}
 UNIT_WORDS = frozenset(("mm", "cm", "deg", "rad"))
 # three angles by names of their own, in the order of rx ry rz
-ANGLE_NAMES = (("roll", "pitch", "yaw"), ("alpha", "beta", "gamma"), ("phi", "theta", "psi"), ("a", "b", "c"))
+ANGLE_NAMES = (("roll", "pitch", "yaw"), ("alpha", "beta", "gamma"), ("phi", "theta", "psi"))
+ANGLE_NAMES += (("a", "b", "c"), ("o", "a", "t"))
 AXES = "xyz"
 QUATERNION = ("qx", "qy", "qz", "qw")
 ANGLES = ("rx", "ry", "rz")
@@ -45,18 +48,18 @@ class Shape:
 
     Attributes:
         columns: the toolkit's name of a column → the file's name.
-        words: words that the names have in common.
+        terms: words that the names have in common.
         euler: what three angles mean, where their name says it; "" otherwise.
     """
 
     columns: Mapping[str, str]
-    words: tuple[str, ...] = ()
+    terms: tuple[str, ...] = ()
     euler: str = ""
 
     @property
     def is_commanded(self) -> bool:
         """Whether a word means that the quantity was commanded, not measured."""
-        return bool(COMMANDED_WORDS.intersection(self.words))
+        return bool(COMMANDED_WORDS.intersection(self.terms))
 
 
 def positions_by_shape(names: Sequence[str]) -> list[Shape]:
@@ -66,11 +69,11 @@ def positions_by_shape(names: Sequence[str]) -> list[Shape]:
         names: the file's names of the columns that have no other meaning yet.
     """
     shapes = []
-    for (words, _), columns in _by_axis(names).items():
-        if ORIENTATION_WORDS.isdisjoint(words) and "w" not in columns and set(AXES) <= columns.keys():
-            shapes.append(Shape({axis: columns[axis] for axis in AXES}, words))
-    for words, columns in _numbered(names, PLACE_WORDS - {"p", "t", "d"}, 3).items():
-        shapes.append(Shape(dict(zip(AXES, columns)), words))
+    for (terms, _), columns in _by_axis(names).items():
+        if ORIENTATION_WORDS.isdisjoint(terms) and "w" not in columns and set(AXES) <= columns.keys():
+            shapes.append(Shape(_picked(columns, AXES, AXES), terms))
+    for terms, columns in _numbered(names, PLACE_WORDS - {"p", "t", "d"}, 3).items():
+        shapes.append(Shape(dict(zip(AXES, columns)), terms))
     return _measured(shapes)
 
 
@@ -81,13 +84,13 @@ def orientations_by_shape(names: Sequence[str]) -> list[Shape]:
         names: the file's names of the columns that have no other meaning yet.
     """
     shapes = []
-    for (words, _), columns in _by_axis(names).items():
+    for (terms, _), columns in _by_axis(names).items():
         if set("xyzw") <= columns.keys():
-            shapes.append(Shape({f"q{axis}": columns[axis] for axis in "xyzw"}, words))
-        elif set(AXES) <= columns.keys() and not ORIENTATION_WORDS.isdisjoint(words):
-            shapes.append(_angles([columns[axis] for axis in AXES], words))
-    for words, columns in _numbered(names, ORIENTATION_WORDS - QUATERNION_WORDS, 3).items():
-        shapes.append(_angles(columns, words))
+            shapes.append(Shape(_picked(columns, QUATERNION, "xyzw"), terms))
+        elif set(AXES) <= columns.keys() and not ORIENTATION_WORDS.isdisjoint(terms):
+            shapes.append(_angles(columns, AXES, terms))
+    for terms, columns in _numbered(names, ORIENTATION_WORDS - QUATERNION_WORDS, 3).items():
+        shapes.append(_angles(dict(zip(AXES, columns)), AXES, terms))
     for angle_names in ANGLE_NAMES:
         shapes += _named_angles(names, angle_names)
     return _measured(shapes)
@@ -100,9 +103,9 @@ def numbered_quaternions(names: Sequence[str]) -> list[tuple[Shape, Shape]]:
         names: the file's names of the columns that have no other meaning yet.
     """
     pairs = []
-    for words, columns in _numbered(names, ORIENTATION_WORDS, 4).items():
+    for terms, columns in _numbered(names, ORIENTATION_WORDS, 4).items():
         w_first = dict(zip(("qw", "qx", "qy", "qz"), columns))
-        pairs.append((Shape(w_first, words), Shape(dict(zip(QUATERNION, columns)), words)))
+        pairs.append((Shape(w_first, terms), Shape(dict(zip(QUATERNION, columns)), terms)))
     return pairs
 
 
@@ -115,19 +118,18 @@ def matrices_by_shape(table: Table, names: Sequence[str]) -> list[Shape]:
     """
     elements: dict[tuple[str, ...], dict[tuple[int, int], str]] = {}
     for name in names:
-        words = words_of(name)
-        digits = "".join(word for word in words if word.isdigit())
+        numbers, beside = parted(words_of(name))
+        digits = "".join(numbers)
         if len(digits) == 2:
-            beside = tuple(word for word in words if not word.isdigit())
             elements.setdefault(beside, {}).setdefault((int(digits[0]), int(digits[1])), name)
     shapes = []
-    for words, columns in elements.items():
+    for terms, columns in elements.items():
         first = min(min(columns))
         if first in (0, 1):
-            shapes += _matrix({(i - first, j - first): name for (i, j), name in columns.items()}, words)
+            shapes += _matrix({(i - first, j - first): name for (i, j), name in columns.items()}, terms)
     for size, width in FLAT_SIZES.items():
-        for words, columns in _numbered(names, (), size).items():
-            shapes += _flat_matrix(table, columns, width, words)
+        for terms, columns in _numbered(names, (), size).items():
+            shapes += _flat_matrix(table, columns, width, terms)
     return _measured(shapes)
 
 
@@ -139,33 +141,35 @@ def _by_axis(names: Iterable[str]) -> dict[tuple[tuple[str, ...], str], Mapped]:
     """
     result: dict[tuple[tuple[str, ...], str], Mapped] = {}
     for name in names:
-        words = [word for word in words_of(name) if word not in UNIT_WORDS]
-        number = words.pop() if len(words) > 1 and words[-1].isdigit() else ""
-        axis, beside = _axis(words)
+        terms = list(filterfalse(UNIT_WORDS.__contains__, words_of(name)))
+        number = ""
+        if len(terms) > 1 and terms[-1].isdigit():
+            number = terms.pop()
+        axis, beside = _axis(terms)
         if axis and REJECTED_WORDS.isdisjoint(beside):
             result.setdefault((beside, number), {}).setdefault(axis, name)
     return result
 
 
-def _axis(words: Sequence[str]) -> tuple[str, tuple[str, ...]]:
+def _axis(terms: Sequence[str]) -> tuple[str, tuple[str, ...]]:
     """Return the axis that words name, and the words beside it; "" if they name none or several.
 
     Args:
-        words: words of a column's name.
+        terms: words of a column's name.
     """
-    axes = [word for word in words if word in ("x", "y", "z", "w")]
+    axes = list(filter(("x", "y", "z", "w").__contains__, terms))
     if len(axes) == 1:
-        return axes[0], tuple(word for word in words if word != axes[0])
-    if axes or not words:
+        return axes[0], tuple(filterfalse(axes.__contains__, terms))
+    if axes or not terms:
         return "", ()
-    match = _GLUED.fullmatch(words[-1])
+    match = _GLUED.fullmatch(terms[-1])
     if match is None:
         return "", ()
     axis = match["axis"] or match["first"]
     stem = match["stem"] or match["rest"]
     if stem not in ORIENTATION_WORDS | PLACE_WORDS:
         return "", ()
-    return axis, (*words[:-1], stem)
+    return axis, (*terms[:-1], stem)
 
 
 def _numbered(names: Iterable[str], stems: Collection[str], size: int) -> dict[tuple[str, ...], list[str]]:
@@ -178,17 +182,15 @@ def _numbered(names: Iterable[str], stems: Collection[str], size: int) -> dict[t
     """
     numbered: dict[tuple[str, ...], dict[int, str]] = {}
     for name in names:
-        words = words_of(name)
-        digits = [word for word in words if word.isdigit()]
-        beside = tuple(word for word in words if not word.isdigit())
+        digits, beside = parted(words_of(name))
         if len(digits) == 1 and beside and REJECTED_WORDS.isdisjoint(beside):
             numbered.setdefault(beside, {}).setdefault(int(digits[0]), name)
     result = {}
-    for words, columns in numbered.items():
+    for terms, columns in numbered.items():
         numbers = sorted(columns)
         in_sequence = len(numbers) == size and numbers[0] in (0, 1) and numbers[-1] - numbers[0] == size - 1
-        if in_sequence and (not stems or not set(stems).isdisjoint(words)):
-            result[words] = [columns[number] for number in numbers]
+        if in_sequence and (not stems or not set(stems).isdisjoint(terms)):
+            result[terms] = list(map(columns.__getitem__, numbers))
     return result
 
 
@@ -201,31 +203,36 @@ def _named_angles(names: Sequence[str], angle_names: tuple[str, ...]) -> list[Sh
     """
     by_words: dict[tuple[str, ...], Mapped] = {}
     for name in names:
-        words = words_of(name)
-        if len(angle_names[0]) == 1 and not (len(words) == 1 and name.isupper()):
+        terms = words_of(name)
+        if len(angle_names[0]) == 1 and not (len(terms) == 1 and name.isupper()):
             continue
         for angle in angle_names:
-            if words.count(angle) == 1:
-                beside = tuple(word for word in words if word != angle and word not in UNIT_WORDS)
+            if terms.count(angle) == 1:
+                beside = tuple(filterfalse({angle, *UNIT_WORDS}.__contains__, terms))
                 by_words.setdefault(beside, {}).setdefault(angle, name)
     shapes = []
-    for words, columns in by_words.items():
-        if len(columns) == 3 and REJECTED_WORDS.isdisjoint(words):
-            shapes.append(_angles([columns[angle] for angle in angle_names], words))
+    for terms, columns in by_words.items():
+        if len(columns) == 3 and REJECTED_WORDS.isdisjoint(terms):
+            shapes.append(_angles(columns, angle_names, terms))
     return shapes
 
 
-def _angles(columns: Sequence[str], words: tuple[str, ...]) -> Shape:
-    euler = "" if VECTOR_WORDS.isdisjoint(words) else "vector"
-    return Shape(dict(zip(ANGLES, columns)), words, euler)
+def _picked(columns: Mapping[str, str], standard_names: Iterable[str], keys: Iterable[str]) -> Mapped:
+    """Return the toolkit's names → the columns with these keys, in their order."""
+    return dict(zip(standard_names, map(columns.__getitem__, keys)))
 
 
-def _matrix(elements: Mapping[tuple[int, int], str], words: tuple[str, ...]) -> list[Shape]:
+def _angles(columns: Mapping[str, str], keys: Iterable[str], terms: tuple[str, ...]) -> Shape:
+    euler = "" if VECTOR_WORDS.isdisjoint(terms) else "vector"
+    return Shape(_picked(columns, ANGLES, keys), terms, euler)
+
+
+def _matrix(elements: Mapping[tuple[int, int], str], terms: tuple[str, ...]) -> list[Shape]:
     """Return the rotation, and the position if it is there, of a matrix 3x3, 3x4 or 4x4; [] for another set.
 
     Args:
         elements: columns by row and column of the matrix, from 0.
-        words: words that the columns have in common.
+        terms: words that the columns have in common.
     """
     columns: Mapped = {}
     for i in range(3):
@@ -236,10 +243,12 @@ def _matrix(elements: Mapping[tuple[int, int], str], words: tuple[str, ...]) -> 
     for i, axis in enumerate(AXES):
         if (i, 3) in elements:
             columns[axis] = elements[i, 3]
-    return [Shape(columns, words)] if len(columns) in (9, 12) else []
+    if len(columns) not in (9, 12):
+        return []
+    return [Shape(columns, terms)]
 
 
-def _flat_matrix(table: Table, columns: Sequence[str], width: int, words: tuple[str, ...]) -> list[Shape]:
+def _flat_matrix(table: Table, columns: Sequence[str], width: int, terms: tuple[str, ...]) -> list[Shape]:
     """Return the matrix whose elements are numbered, if its numbers are a rotation row by row or column by column.
 
     A rotation alone is read by rows: its transpose is a rotation, too.
@@ -248,7 +257,7 @@ def _flat_matrix(table: Table, columns: Sequence[str], width: int, words: tuple[
         table: the table.
         columns: the file's names of the elements, in order.
         width: number of elements in a row.
-        words: words that the columns have in common.
+        terms: words that the columns have in common.
     """
     cells = [table.cells[table.header.index(name)] for name in columns]
     if any(values.dtype != float for values in cells):
@@ -261,17 +270,17 @@ def _flat_matrix(table: Table, columns: Sequence[str], width: int, words: tuple[
             order = np.arange(len(columns)).reshape(width, rows).T
         matrices = numbers[:, order[:3, :3]]
         defect = np.abs(matrices @ np.swapaxes(matrices, 1, 2) - np.eye(3)).max()
-        last_row = numbers[:, order[3]] if rows == 4 else np.array([0.0, 0.0, 0.0, 1.0])
-        is_pose = np.abs(last_row - [0.0, 0.0, 0.0, 1.0]).max() < BOUNDS.max_norm_error
+        last_row = numbers[:, order[3:].ravel()]
+        is_pose = rows < 4 or np.abs(last_row - [0.0, 0.0, 0.0, 1.0]).max() < BOUNDS.max_norm_error
         if math.isfinite(defect) and defect < 2 * BOUNDS.max_norm_error and is_pose:
             elements = {(i, j): columns[order[i, j]] for i in range(rows) for j in range(width)}
-            return _matrix(elements, words)
+            return _matrix(elements, terms)
     return []
 
 
 def _measured(shapes: Sequence[Shape]) -> list[Shape]:
     """Return the shapes that were not commanded; all of them if there are no others."""
-    return [shape for shape in shapes if not shape.is_commanded] or list(shapes)
+    return list(filterfalse(attrgetter("is_commanded"), shapes)) or list(shapes)
 
 
 def with_shape(options: FileOptions, shape: Shape) -> FileOptions:

@@ -15,6 +15,9 @@ from calib.data.schema import BOUNDS, Column, Joints, Rows, check_travel, joint_
 from calib.errors import MeasurementError, refuse_data, require
 from calib.units import ANGLES, DEG
 
+# offsets of a joint's zero that are tried where values are outside the limits [rad]
+QUARTERS = (math.pi / 2.0, -math.pi / 2.0, math.pi, -math.pi)
+
 
 def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joints) -> tuple[str, ...]:
     """Check joint values (m, n) [rad or m] for plausibility and return notes on unusual but possible values.
@@ -41,20 +44,30 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
             return f"looks like {unit}; if so, name the column '{columns[j]} [{unit}]'"
         return f"the column is read as [{units[j]}]: is it in another unit (counts, grad), or of another joint?"
 
+    remedy = "correct its limits or set check_limits = false in the options"
+    otherwise = f"are joint columns swapped? If the robot reached it, {remedy}"
+
     def says(row: int, j: int) -> str:
         unit, mistaken_unit, factor = joint_unit(kinds[j])
         fault = f"{q[row, j]:g} {unit} is outside the limits {lower[j]:g} to {upper[j]:g} {unit} of {joints[j]}"
         fits_other_unit = not outside(q[:, j] * factor, lower[j], upper[j]).any()
         if units[j] in ("", "rad", "m") and np.abs(q[:, j]).max() > BOUNDS.max_turn and fits_other_unit:
             return f"{fault}: {advice(j, mistaken_unit)}"
-        return (
-            f"{fault}: are joint columns swapped? If the robot reached it, correct its limits or set "
-            "check_limits = false in the options"
-        )
+        turns = _turns_beyond(float(q[row, j]), float(lower[j]), float(upper[j]))
+        if turns and not sliding[j]:
+            there = f"{fault}, {q[row, j] + turns * math.tau:g} rad ({turns:+d} turn) is inside"
+            return f"{there}: was the joint wound, or its turn lost? Then add the turn to these rows. Or {otherwise}"
+        for angle in () if sliding[j] else QUARTERS:
+            if not outside(q[:, j] + angle, lower[j], upper[j]).any():
+                question = (
+                    f"does the controller count {joints[j]} from another zero? With {angle / DEG:+g}° all rows fit"
+                )
+                return f"{fault}: {question}. Or {otherwise}"
+        return f"{fault}: {otherwise}"
 
+    sliding = np.array([kind == "prismatic" for kind in kinds])
     if sheet.options.check_limits:
         refuse(table, outside(q, lower, upper) & bounded, columns, says)
-    sliding = np.array([kind == "prismatic" for kind in kinds])
     free = ~bounded if sheet.options.check_limits else sliding
     check_travel(q, np.where(free, max_travel(kinds), math.inf), table, columns, joints, kinds, advice)
     notes = []
@@ -69,6 +82,39 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
     if in_degrees and np.abs(q[:, turning]).max() < BOUNDS.max_turn * DEG:
         notes.append("all joint values are below 6.6 deg: are they radians instead of degrees?")
     return tuple(notes)
+
+
+def _turns_beyond(value: float, lower: float, upper: float) -> int:
+    """Return the whole turns that bring a joint's value [rad] inside its limits; 0 if no number of turns does."""
+    turns = round(((lower + upper) / 2.0 - value) / math.tau)
+    inside = lower <= value + turns * math.tau <= upper
+    return turns if inside else 0
+
+
+def within_limits(q: np.ndarray, robot: Joints, columns: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return joint values (m, n) [rad or m] with those outside their limits moved by a turn, and notes.
+
+    Controllers show a joint as 0 to 360° or as -180 to 180°. A column is changed only if a turn brings all of its
+    values within the limits.
+
+    Args:
+        q: the joint values.
+        robot: types and limits of the joints.
+        columns: the file's names of the joint columns.
+    """
+    exceeds = outside(q, robot.lower, robot.upper)
+    turns = np.where(q > robot.upper, -1, 1) * 2.0 * math.pi
+    turned = np.where(exceeds, q + turns, q)
+    notes = []
+    result = q.copy()
+    for j in np.flatnonzero(exceeds.any(axis=0) & ~outside(turned, robot.lower, robot.upper).any(axis=0)).tolist():
+        if robot.kinds[j] != "prismatic":
+            result[:, j] = turned[:, j]
+            count = int(exceeds[:, j].sum())
+            notes.append(
+                f"{columns[j]} is outside its limits in {count} of {len(q)} rows, and within them by a turn: read so"
+            )
+    return result, tuple(notes)
 
 
 def outside(q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:

@@ -3,11 +3,16 @@
 Columns by default (a unit in brackets is converted, ``q1 [deg]``, ``x [mm]``; plain headers are SI):
 
 ==================  ===================================================================================================
-joints              the robot's joint names, or ``q_<joint name>``, or ``q1`` to ``qn``
+joints              the robot's joint names, or ``q_<joint name>``, or ``q1`` to ``qn``; else names of one series, with
+                    words beside (``elbow.pos``) or numbered (``A1 … A6 E1``, ``J1``, ``Joint 1``, ``theta0``)
 position, pose      ``x y z``; with ``qx qy qz qw``, ``r11`` to ``r33`` or three angles (``rx ry rz``, ``a b c``,
-                    ``w p r``, ``roll pitch yaw``; the options' ``euler`` says what they mean) a pose; also with
-                    ``_meas``, ``_measured`` (where a file has both, the options' [columns] say which is to be read)
-several reflectors  ``x1 y1 z1 x2 y2 z2 ...``, each a row of its own; an empty triple is a reflector not seen
+                    ``w p r``, ``roll pitch yaw``; the options' ``euler`` says what they mean, else the arm, where it
+                    agrees with one meaning only) a pose; also with ``_meas``, ``_measured`` (where a file has both, the
+                    options' [columns] say which is to be read); else by shape: ``position.x``, ``tvec_x``,
+                    ``orientation.w``, ``phix1``, ``theta_x``, ``rvec_x``, ``T_00`` to ``T_33``, ``pose_0`` to
+                    ``pose_15``
+several reflectors  ``x1 y1 z1 x2 y2 z2 ...``, each a row of its own
+not seen            a triple that is empty, one text (``lost``) or one large number (``9999``) three times
 base frame          ``base_x`` … ``base_qw`` (or ``base_r11`` …), a frame on the robot's base measured with every row:
                     the target is then seen from there (options: ``base_frame``), and rows without it are left out;
                     ``base_sigma_x`` …, ``base_sigma_rx`` … (by default the target's); ``base_time`` beside ``time``
@@ -20,7 +25,9 @@ sockets, plane      ``socket`` (grouped together with ``tool_position``), ``plan
 tool                ``tool``: label of the reflector that a row saw
 ==================  ===================================================================================================
 
-All other columns are ignored and listed. Files of RoboDK: `calib formats robodk`.
+All other columns are ignored and listed. Files of RoboDK: `calib formats robodk`. Units may stand behind a slash
+(``X / mm``). Columns of foreign names without a unit are deg or mm where they cannot be SI. A table without names is
+read if the nominal arm agrees with one arrangement of its columns only.
 
 A base frame (as the study's LEDs on the base, Kolyubin et al. 2019, section 3.5) takes out how instrument and base move
 against each other: `calib fit` says how much. It adds the noise of both, and its orientation's over the distance to the
@@ -51,6 +58,7 @@ from calib.data.poses.columns import (
     TIME,
     Layout,
     Sheet,
+    Undecided,
     find_layout,
     with_shapes,
 )
@@ -65,8 +73,10 @@ from calib.data.poses.measurements import (
     Positions,
     Sockets,
 )
+from calib.data.poses.placeholders import without_placeholders
 from calib.data.poses.robodk import FORMS
 from calib.data.poses.silent_units import with_silent_units
+from calib.data.poses.unnamed import arrangements
 from calib.data.schema import Joints, refuse
 from calib.records import FieldValues
 
@@ -228,6 +238,8 @@ def read_measurements(
     path = source.file if isinstance(source, Table) else source
     notes: tuple[str, ...] = ()
     form = options.format
+    if table is None and not form:
+        _ask_for_names(path, robot, options)
     if not form:
         header = read_header(path)[0] if table is None else ()
         matching = [name for name, (matches, _) in FORMS.items() if matches(header)]
@@ -245,6 +257,7 @@ def read_measurements(
     sheet = with_shapes(_select_rows(Sheet(table, options)), robot)
     layout = find_layout(sheet, robot)
     sheet, unit_notes = with_silent_units(sheet, layout, robot)
+    sheet, unseen_notes = without_placeholders(sheet, layout)
     sheet, base_notes = rows_with_base(sheet, layout)
     number_columns = layout.used.difference(layout.group, [layout.tool])
     # Where a file has several targets, one that was not seen is a gap.
@@ -253,7 +266,10 @@ def read_measurements(
         columns_with_gaps.update(*layout.positions, *layout.sigmas)
     sheet.table.check([name for name in sheet.table.header if name in number_columns], columns_with_gaps)
     q, _ = sheet.joints(robot)
-    notes = (*sheet.table.notes, *notes, *layout.notes, *unit_notes, *base_notes)
+    turn_notes: tuple[str, ...] = ()
+    if options.check_limits:
+        q, turn_notes = plausible.within_limits(q, robot, layout.joints)
+    notes = (*sheet.table.notes, *notes, *layout.notes, *unit_notes, *unseen_notes, *turn_notes, *base_notes)
     notes = (*notes, *plausible.check_joints(q, sheet, layout.joints, robot))
     if layout.positions:
         block: PoseMeasurements = _read_targets(sheet, layout, q)
@@ -262,6 +278,26 @@ def read_measurements(
     ignored = tuple(name for name in sheet.table.header if name not in layout.used)
     station = options.station or Path(path).stem
     return [replace(block, station=station, ignored=ignored, notes=(*notes, *block.notes))]
+
+
+def _ask_for_names(path: str | Path, robot: Joints, options: FileOptions) -> None:
+    """Raise `Undecided` for a file without names whose number of columns suits the robot.
+
+    Args:
+        path: the file.
+        robot: the robot's joints.
+        options: options for reading the file.
+    """
+    possible = arrangements(path, len(robot.names), options)
+    if possible is None:
+        return
+    table, choices = possible
+    lines = " or ".join(list(choices)[:2])
+    message = (
+        f"has no header: put a line of names and units (q1 [deg], x [mm]) above the numbers, as in {lines}, or state "
+        "`format` in the options for a known headerless format"
+    )
+    raise Undecided(table, message, choices)
 
 
 def _without_units(columns: Mapping[str, str], table: Table) -> dict[str, str]:
@@ -273,8 +309,8 @@ def _without_units(columns: Mapping[str, str], table: Table) -> dict[str, str]:
     """
     names, _ = split_units(list(columns.values()))
     result = {}
-    for (ours, heading), name in zip(columns.items(), names):
-        result[ours] = heading if heading in table or name not in table else name
+    for (standard_name, heading), name in zip(columns.items(), names):
+        result[standard_name] = heading if heading in table or name not in table else name
     return result
 
 

@@ -21,11 +21,13 @@ columns of padding, joints [deg] last; 18 to 21 columns for six joints. A reflec
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from calib.data.csv_table import Table, read_header, read_table, row_width
+from calib.data.joint_columns import COMMANDED_WORDS, words_of
 from calib.data.poses.fit_options import FileOptions
 from calib.errors import MeasurementError, refuse_data, require
 from calib.records import frozen
@@ -57,8 +59,19 @@ def recognises(header: Sequence[str]) -> bool:
 
 
 def _is_robodk(header: Sequence[str]) -> bool:
-    """Return whether a header begins as RoboDK's, and has not more columns than RoboDK writes."""
-    return recognises(header) and (len(header) in WIDTHS or len(header) < WIDTHS[0])
+    """Return whether a header begins as RoboDK's and goes on with x y z, then with angles or with the x y z of a TCP.
+
+    Args:
+        header: names of the columns; fewer than those of a point count, too.
+    """
+    if not recognises(header) or (len(header) > WIDTHS[0] and len(header) not in WIDTHS):
+        return False
+    term_lists = list(map(words_of, header[6:]))
+    if not COMMANDED_WORDS.isdisjoint(chain(*term_lists)):
+        return False
+    is_pose = len(header) == WIDTHS[-1] or _plain("".join(header[9:10])) in _POSE_MARKS
+    axes = "xyz" if is_pose else "xyzxyz"
+    return all(axis in (name[-1][-1], name[-1][0]) for name, axis in zip(term_lists, axes))
 
 
 def read_robodk(path: str | Path, joints: int, options: FileOptions) -> Read:

@@ -1,11 +1,10 @@
 """Units of columns whose names come from a controller or another program, where the header states none.
 
-The toolkit's own names (``q1``, a joint's name, ``x``) without a unit are SI. Controllers show deg and mm, programs write
-rad and m: where most rows are impossible in SI, the columns are deg or mm, and the notes say so. A name may hold its
-unit as a word (``x_mm``, ``J1 deg``).
+The toolkit's own names (``q1``, a joint's name, ``x``) without a unit are SI. Controllers show deg and mm, programs
+write rad and m: where most rows are impossible in SI, the columns are deg or mm, and the notes say so. A name may hold
+its unit as a word (``x_mm``, ``J1 deg``).
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -43,15 +42,14 @@ def with_silent_units(sheet: Sheet, layout: Layout, robot: Joints) -> tuple[Shee
         names = sliding if kind == "prismatic" else turning
         names.append(name)
     families = [(turning, "joints", "deg", BOUNDS.max_turn), (sliding, "joints", "mm", _travel(robot))]
-    for names in layout.positions:
-        families.append((list(names), "position", "mm", BOUNDS.max_length))
+    families += [(list(names), "position", "mm", BOUNDS.max_length) for names in layout.positions]
     if len(layout.orientation) == 3:
         families.append((list(layout.orientation), "orientation", "deg", BOUNDS.max_turn))
     units = dict(sheet.options.units)
     notes = []
-    for names, family, unit, most in families:
+    for names, family, unit, limit in families:
         silent = bool(names) and not any(sheet.unit(name, family) for name in names)
-        if silent and _share_above(sheet, names, most) > MOST_ROWS:
+        if silent and _share_above(sheet, names, limit) > MOST_ROWS:
             units |= dict.fromkeys(names, unit)
             notes.append(f"{', '.join(names)}: no unit stated, read in {unit}; in {SI[unit]} they are impossible")
     read = replace(sheet, options=replace(sheet.options, units=units))
@@ -71,9 +69,9 @@ def _with_units_of_names(sheet: Sheet, layout: Layout) -> Sheet:
     units = dict(sheet.options.units)
     for names, family in families:
         for name in names:
-            words = [word for word in words_of(name) if word in WORD_UNITS]
-            if len(words) == 1 and not sheet.unit(name, family):
-                units[name] = words[0]
+            terms = list(filter(WORD_UNITS.__contains__, words_of(name)))
+            if len(terms) == 1 and not sheet.unit(name, family):
+                units[name] = terms[0]
     return replace(sheet, options=replace(sheet.options, units=units))
 
 
@@ -99,22 +97,22 @@ def _travel(robot: Joints) -> float:
     travel = 0.0
     for kind, lower, upper in zip(robot.kinds, robot.lower, robot.upper):
         if kind == "prismatic":
-            travel = max(travel, abs(lower), abs(upper))
-    return travel + BOUNDS.limit_slack if math.isfinite(travel) else BOUNDS.max_length
+            travel = np.maximum(travel, max(abs(lower), abs(upper)))
+    return float(np.fmin(travel + BOUNDS.limit_slack, BOUNDS.max_length))
 
 
-def _share_above(sheet: Sheet, names: Sequence[str], most: float) -> float:
+def _share_above(sheet: Sheet, names: Sequence[str], limit: float) -> float:
     """Return the share of rows with a number above `most` in one of the columns, among rows with numbers.
 
     Args:
         sheet: the table.
         names: the file's names of the columns.
-        most: largest possible absolute value.
+        limit: largest possible absolute value.
     """
     columns = [np.abs(sheet.table.numbers(name, None, gaps=True)) for name in names]
     largest = np.max(np.stack(columns), axis=0)
     largest = largest[np.isfinite(largest)]
-    return float(np.mean(largest > most)) if len(largest) else 0.0
+    return float(np.sum(largest > limit)) / max(len(largest), 1)
 
 
 def _ask_for_angles(sheet: Sheet, layout: Layout, turning: Sequence[str]) -> None:

@@ -1,10 +1,20 @@
-"""Recordings in ROS bags: ``sensor_msgs/JointState`` from MCAP, ROS 2 (sqlite3) and ROS 1 files, without ROS.
+"""Recordings in ROS bags: joint states from MCAP, ROS 2 (sqlite3) and ROS 1 files, without ROS.
+
+Read are, in this order of preference, as the bag has them with torques:
+
+==================================================  ===================================================================
+``sensor_msgs/JointState``                          joint_state_broadcaster, franka_ros, most drivers
+``control_msgs/DynamicJointState``                  joint_state_broadcaster: ``position``, ``velocity``, ``effort``
+                                                    (``torque``, ``current``) among its interfaces
+``control_msgs/InterfacesValues``                   state_interfaces_broadcaster, with its ``InterfacesNames`` beside it
+``franka_msgs/FrankaRobotState``                    its ``measured_joint_state``, where the bag holds the definition
+``control_msgs/JointTrajectoryControllerState``     feedback (or actual) and reference (desired), likewise
+==================================================  ===================================================================
 
 Positions, velocities and efforts are taken by joint name; efforts are torques (or currents, where the options say so:
 many drivers publish currents under that name). Stamps are those of the headers; where these are all zero, the times
-at which the messages were logged. Messages that lack one of the joints (a gripper's own) are left out. So bags of
-ros2_control's joint_state_broadcaster and of franka_ros are read; of franka_ros2 the ``measured_joint_state`` of
-``franka_msgs/FrankaRobotState``, too, where the bag holds the message's definition.
+at which the messages were logged. Messages that lack one of the joints (a gripper's own) are left out. A quantity that
+is NaN in every message is not provided.
 
 Read by `rosbags` (pure Python, Apache-2.0; its wheels' C parts exist for Linux and macOS), which is
 imported when a bag is read (75 ms). Memory grows with the joint states alone, time with their number.
@@ -12,8 +22,10 @@ imported when a bag is read (75 ms). Memory grows with the joint states alone, t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import chain, islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,9 +40,51 @@ from calib.workers.extras import needing
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
+    from rosbags.typesys.store import Typestore
 
+Message = Any  # as rosbags makes it from the message's definition
 JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
-FRANKA_STATE = "franka_msgs/msg/FrankaRobotState"  # of franka_ros2: a joint state, measured_joint_state, among others
+FRANKA_STATE = ("franka_msgs/msg/FrankaRobotState",)  # of franka_ros2
+DYNAMIC_STATE = ("control_msgs/msg/DynamicJointState", "control_msgs/DynamicJointState")
+INTERFACE_VALUES = ("control_msgs/msg/InterfacesValues",)
+INTERFACE_NAMES = "control_msgs/msg/InterfacesNames"
+TRAJECTORY_STATE = ("control_msgs/msg/JointTrajectoryControllerState", "control_msgs/JointTrajectoryControllerState")
+# Accepted types, the preferred ones first.
+KINDS = (JOINT_STATE, DYNAMIC_STATE, INTERFACE_VALUES, FRANKA_STATE, TRAJECTORY_STATE)
+# Our series → names of state interfaces of ros2_control.
+INTERFACES = {"q": ("position",), "v": ("velocity",), "effort": ("effort", "torque"), "current": ("current",)}
+# Messages of a topic that are read to see which quantities it has.
+FIRST_MESSAGES = 20
+# Definitions that bags of ROS 2 Humble (sqlite3) leave out: ros-controls/control_msgs, branch humble.
+DEFINITIONS = {
+    "control_msgs/msg/InterfacesNames": "std_msgs/Header header\nstring[] names\n",
+    "control_msgs/msg/InterfacesValues": "std_msgs/Header header\nfloat64[] values\n",
+    "control_msgs/msg/InterfaceValue": "string[] interface_names\nfloat64[] values\n",
+    "control_msgs/msg/DynamicJointState": (
+        "std_msgs/Header header\nstring[] joint_names\ncontrol_msgs/InterfaceValue[] interface_values\n"
+    ),
+}
+
+
+@dataclass(frozen=True)
+class JointState:
+    """A message of any accepted type as a joint state; quantities that it does not contain are empty.
+
+    Attributes:
+        stamp: time in the header [ns]; 0 if it is not set.
+        name: the joints' names.
+        position, velocity, effort: one value per joint.
+        reference: reference positions.
+        kind: ``current`` where the efforts are stated as currents; else empty.
+    """
+
+    stamp: int
+    name: tuple[str, ...]
+    position: np.ndarray
+    velocity: np.ndarray
+    effort: np.ndarray
+    reference: np.ndarray
+    kind: str = ""
 
 
 def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Recording:
@@ -42,13 +96,23 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
         options: options for reading the bag: topic, kind of the efforts.
     """
     with opened(path) as reader:
-        connections = connections_of(
-            reader, (*JOINT_STATE, FRANKA_STATE), options.topic, path, "joint states", "topic = '...'", "/joint_states"
-        )
+        connections = _with_torques(reader, options.topic, joints, path)
         names, parts, skipped = joint_states(reader, connections, joints, path)
-    for series, quantity in (("q", "positions"), ("effort", "efforts")):
-        require(parts[series].size, f"its joint states have no {quantity}", MeasurementError, path)
+        topics = sorted(f"{connection.topic} ({connection.msgtype})" for connection in reader.connections)
+    source = f"{connections[0].topic} ({connections[0].msgtype})"
     notes = []
+    if connections[0].msgtype not in JOINT_STATE:
+        notes.append(f"read as joint states from {source}")
+    for series in ("q", "v", "effort", "reference"):
+        if parts[series].size and np.isnan(parts[series]).all():
+            parts[series] = np.empty((0, 0))
+            notes.append(f"{series} is NaN in every message: not provided")
+    for series, quantity in (("q", "positions"), ("effort", "efforts")):
+        if not parts[series].size:
+            message = f"its joint states on {source} have no {quantity}"
+            refuse_data(
+                path, f"{message}, and no other topic has: identification needs both; found: {', '.join(topics)}"
+            )
     if skipped:
         notes.append(f"{skipped} messages that lack a joint are not used")
     if not parts["header"].any():
@@ -57,12 +121,122 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
         (parts["stamp"] - parts["stamp"][0]) * 1e-9,
         parts["q"],
         parts["effort"],
-        options.kind or "torque",
+        options.kind or ("current" if parts["current"].all() else "torque"),
         names,
         v=parts["v"] if parts["v"].size else None,
+        q_ref=parts["reference"] if parts["reference"].size else None,
         file=str(path),
         notes=tuple(notes),
     )
+
+
+def _with_torques(reader: AnyReader, topic: str, joints: Joints | None, path: Path) -> list[Connection]:
+    """Return the connections of the first type of joint states that has torques; of the first type if none has.
+
+    Args:
+        reader: reader of the bag.
+        topic: the requested topic; empty: any.
+        joints: the robot's joints; None: any.
+        path: the bag, for messages.
+    """
+    accepted = [connection.msgtype for connection in reader.connections if topic in ("", connection.topic)]
+    kinds = [kind for kind in KINDS if set(kind) & set(accepted)]
+    choices = []
+    any_kind = tuple(chain.from_iterable(KINDS))
+    for kind in kinds or [any_kind]:
+        option = "in the options (--options): recording.topic = '...'"
+        choices.append(connections_of(reader, kind, topic, path, "joint states", option, "/joint_states"))
+    for connections in choices:
+        if _has_torques(reader, connections, joints):
+            return connections
+    return choices[0]
+
+
+def _has_torques(reader: AnyReader, connections: list[Connection], joints: Joints | None) -> bool:
+    """Return whether one of the first messages with all joints has positions and efforts."""
+    interfaces = _interface_names(reader)
+    for connection, _, raw in islice(reader.messages(connections=connections), FIRST_MESSAGES):
+        state = as_joint_state(reader.deserialize(raw, connection.msgtype), interfaces.get(_namespace(connection), ()))
+        has_all = joints is None or set(joints.names) <= set(state.name)
+        if has_all and _is_there(state.position) and _is_there(state.effort):
+            return True
+    return False
+
+
+def _interface_names(reader: AnyReader) -> dict[str, tuple[str, ...]]:
+    """Return the names of state interfaces (``elbow/position``) that a broadcaster states once, by its namespace."""
+    names: dict[str, tuple[str, ...]] = {}
+    connections = [connection for connection in reader.connections if connection.msgtype == INTERFACE_NAMES]
+    if connections:
+        for connection, _, raw in reader.messages(connections=connections):
+            message: Message = reader.deserialize(raw, connection.msgtype)
+            names.setdefault(_namespace(connection), tuple(message.names))
+    return names
+
+
+def _namespace(connection: Connection) -> str:
+    return connection.topic.rpartition("/")[0]
+
+
+def _is_there(values: np.ndarray) -> bool:
+    return len(values) > 0 and not np.isnan(values).all()
+
+
+def as_joint_state(message: Message, interfaces: Sequence[str] = ()) -> JointState:
+    """Return a message of any accepted type as a joint state.
+
+    Args:
+        message: the message.
+        interfaces: names of the values of an ``InterfacesValues``, as ``elbow/position``.
+    """
+    message = getattr(message, "measured_joint_state", message)
+    stamp = header_stamp(message)
+    empty = np.empty(0)
+    values_of: dict[str, dict[str, float]] = {}
+    if hasattr(message, "values"):
+        for name, value in zip(interfaces, message.values):
+            joint, _, interface = name.rpartition("/")
+            values_of.setdefault(joint, {})[interface] = value
+        return _of_interfaces(stamp, values_of)
+    if hasattr(message, "interface_values"):
+        for joint, interface in zip(message.joint_names, message.interface_values):
+            values_of[joint] = dict(zip(interface.interface_names, interface.values))
+        return _of_interfaces(stamp, values_of)
+    if hasattr(message, "joint_names"):
+        point = _first_point(message, ("feedback", "actual"))
+        reference = _first_point(message, ("reference", "desired"))
+        effort = np.asarray(point.effort)
+        return JointState(
+            stamp, tuple(message.joint_names), point.positions, point.velocities, effort, reference.positions
+        )
+    return JointState(stamp, tuple(message.name), message.position, message.velocity, message.effort, empty)
+
+
+def _first_point(message: Message, names: Sequence[str]) -> Message:
+    """Return the first of a message's points that has positions; the first that there is if none has."""
+    points = [getattr(message, name) for name in names if hasattr(message, name)]
+    return next((point for point in points if len(point.positions)), points[0])
+
+
+def _of_interfaces(stamp: int, values_of: Mapping[str, Mapping[str, float]]) -> JointState:
+    """Return a joint state from the values of state interfaces.
+
+    Args:
+        stamp: time in the header [ns].
+        values_of: joint → name of the interface → value.
+    """
+    joints = [joint for joint, values in values_of.items() if "position" in values]
+    series = {}
+    for name, interfaces in INTERFACES.items():
+        values = []
+        for joint in joints:
+            present = [values_of[joint][interface] for interface in interfaces if interface in values_of[joint]]
+            values.append(present[0] if present else np.nan)
+        column = np.array(values, dtype=float)
+        series[name] = column if _is_there(column) else np.empty(0)
+    kind = "" if len(series["effort"]) else "current"
+    effort = series["current"] if kind else series["effort"]
+    return JointState(stamp, tuple(joints), series["q"], series["v"], effort, np.empty(0), kind)
 
 
 @contextmanager
@@ -74,14 +248,23 @@ def opened(path: Path) -> Iterator[AnyReader]:
     """
     with needing("rosbags"):
         from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
 
     damaged = "cannot be read as a ROS bag ({}): was it closed properly?"
     with (
         refused_as(MeasurementError, Exception, damaged, path),
-        AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader,
+        AnyReader([path], default_typestore=_typestore()) as reader,
     ):
         yield reader
+
+
+def _typestore() -> Typestore:
+    """Return the types of ROS 2, with those of `DEFINITIONS`."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, definition in DEFINITIONS.items():
+        store.register(get_types_from_msg(definition, name))
+    return store
 
 
 def connections_of(
@@ -119,7 +302,7 @@ def connections_of(
 def joint_states(
     reader: AnyReader, connections: list[Connection], joints: Joints | None, path: Path
 ) -> tuple[tuple[str, ...], dict[str, np.ndarray], int]:
-    """Return the joint names, arrays of time stamps [ns], q, v and effort, and the number of unused messages.
+    """Return the joint names, arrays of time stamps [ns], q, v, effort, reference, and the number of unused messages.
 
     Args:
         reader: reader of the bag.
@@ -129,12 +312,13 @@ def joint_states(
     """
     names = joints.names if joints else ()
     order: dict[tuple[str, ...], list[int] | None] = {}
-    rows: dict[str, list[object]] = {"header": [], "logged": [], "q": [], "v": [], "effort": []}
+    rows: dict[str, list[object]] = {"header": [], "logged": [], "q": [], "v": [], "effort": [], "reference": []}
+    rows["current"] = []
     skipped = 0
+    interfaces = _interface_names(reader)
     for connection, logged, raw in reader.messages(connections=connections):
-        message: Any = reader.deserialize(raw, connection.msgtype)
-        message = getattr(message, "measured_joint_state", message)
-        message_names = tuple(message.name)
+        state = as_joint_state(reader.deserialize(raw, connection.msgtype), interfaces.get(_namespace(connection), ()))
+        message_names = state.name
         names = names or message_names
         if message_names not in order:
             has_all = set(names) <= set(message_names)
@@ -143,9 +327,11 @@ def joint_states(
         if index is None:
             skipped += 1
             continue
-        rows["header"].append(header_stamp(message))
+        rows["header"].append(state.stamp)
+        rows["current"].append(state.kind == "current")
         rows["logged"].append(logged)
-        for series, values in (("q", message.position), ("v", message.velocity), ("effort", message.effort)):
+        quantities = {"q": state.position, "v": state.velocity, "effort": state.effort, "reference": state.reference}
+        for series, values in quantities.items():
             rows[series].append(values[index] if len(values) == len(message_names) else None)
     if not rows["q"]:
         _refuse_joints(names, list(order), path)
@@ -154,7 +340,7 @@ def joint_states(
     return names, arrays, skipped
 
 
-def header_stamp(message: Any) -> int:
+def header_stamp(message: Message) -> int:
     """Return the time stamp in a message's header [ns]; 0 if it is not set."""
     return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
 

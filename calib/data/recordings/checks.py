@@ -365,7 +365,12 @@ def _jumps(recording: Recording, joints: Joints | None) -> list[str]:
         low, high = np.minimum(slope[:-1], slope[1:]), np.maximum(slope[:-1], slope[1:])
         # median of two before, two after
         around = (np.maximum(low[:-3], low[3:]) + np.minimum(high[:-3], high[3:])) / 2
-        deviation = np.abs(slope[2:-2] - around) * step[2:-2]
+        by_stamps = np.abs(slope[2:-2] - around) * step[2:-2]
+        # stamps with jitter make slopes of their own: a jump is one between equally spaced samples, too
+        change = np.diff(q)
+        low, high = np.minimum(change[:-1], change[1:]), np.maximum(change[:-1], change[1:])
+        usual = (np.maximum(low[:-3], low[3:]) + np.minimum(high[:-3], high[3:])) / 2
+        deviation = np.minimum(by_stamps, np.abs(change[2:-2] - usual))
         is_jump = (deviation > min_jump[j]) & adjacent
         if not is_jump.any() or not (deviation[is_jump] > 20 * max(float(np.median(deviation)), 1e-9)).any():
             continue
@@ -403,9 +408,13 @@ def _still(recording: Recording) -> list[str]:
         fixed = np.ptp(recording.q[:, j]) < BOUNDS.min_travel
         travel = "is constant" if fixed else f"moves less than {LIMITS.min_travel:g}"
         effort = f", and so is its {recording.kind}" if dead[j] else ""
+        question = ""
+        if fixed and not dead[j] and stands.sum() == 1:
+            spread = float(recording.effort[:, j].std())
+            question = f"; its {recording.kind} varies by {spread:.3g} (rms): is its position column frozen?"
         notes.append(
             f"{recording.joint_names[j]} never moves (its position {travel}{effort}): parameters that only its "
-            "motion excites cannot be identified from this file"
+            f"motion excites cannot be identified from this file{question}"
         )
     return notes
 

@@ -22,6 +22,9 @@ MAX_WANDER = 5.0  # standard deviations of the sum of a velocity's noise
 MIN_STEPS = 3.0  # of a column's own resolution in that
 MAX_STANDING = 0.9  # of the rows with one velocity: then it was not logged, which is another finding
 JUMP = 5.0  # step behind a standing position over those at the joint's speed
+MAX_TARED_MEAN = 1e-3  # of a torque's standard deviation: a mean that is smaller was subtracted
+MAX_TARED_START = 0.03  # the same of the mean over the start
+START = 0.1  # time over which the start of a log is averaged [s]
 ABOUT = 3.0  # factor between that step and the motion expected meanwhile
 
 
@@ -30,7 +33,8 @@ class ColumnFault:
     """A column of one joint that is constant although the measured quantity changes.
 
     Attributes:
-        kind: ``clipped`` (torque), or ``position`` or ``velocity`` (constant column).
+        kind: ``clipped`` (torque), ``mean`` or ``start`` (torque whose mean, or start, is zero), or ``position`` or
+            ``velocity`` (constant column).
         joint: index of the joint.
         share: share of the moving rows in which a torque is clipped, or of all rows in which a column is constant.
         values: the extreme values at which a torque is clipped [N m or N; A].
@@ -60,7 +64,7 @@ def column_faults(
     """
     faults = []
     for joint, position in enumerate(q.T):
-        candidates = [_clipped(joint, t, position, effort[:, joint])]
+        candidates = [_clipped(joint, t, position, effort[:, joint]), _zeroed(joint, t, effort[:, joint])]
         if v is None:
             candidates.append(_jumping(joint, t, position))
         else:
@@ -102,6 +106,25 @@ def _clipped(joint: int, t: np.ndarray, q: np.ndarray, torque: np.ndarray) -> Co
             rows |= at_extreme
     share = float(rows.sum() / moves.sum())
     return ColumnFault("clipped", joint, share, tuple(values)) if share >= MIN_SHARE else None
+
+
+def _zeroed(joint: int, t: np.ndarray, torque: np.ndarray) -> ColumnFault | None:
+    """Return the fault of a torque whose mean or start is zero, as if it had been tared; None if neither is.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        torque: (N,) torque or current of the joint.
+    """
+    spread = float(torque.std())
+    if spread == 0.0:
+        return None
+    if abs(float(torque.mean())) < MAX_TARED_MEAN * spread:
+        return ColumnFault("mean", joint, 1.0)
+    start = torque[t - t[0] <= START]
+    if abs(float(start.mean())) < MAX_TARED_START * spread:
+        return ColumnFault("start", joint, len(start) / len(torque))
+    return None
 
 
 def _standing_position(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> ColumnFault | None:

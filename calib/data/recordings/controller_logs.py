@@ -26,6 +26,7 @@ from calib.files import shipped_text
 
 # Letters of a line of names (our choice).
 LONGEST = 1 << 16
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 # Rows in which a time is looked at (our choice).
 TIME_ROWS = 50
 
@@ -67,6 +68,28 @@ def translated(path: str | Path) -> Log | None:
     log.write(f"{header}\n{body}")
     log.seek(0)
     log.notes = tuple(notes)
+    return log
+
+
+def with_decimal_points(path: str | Path) -> Log | None:
+    """Return a table that has decimal commas, and another separator, with points instead; None for other tables."""
+    with open(path, encoding="utf-8-sig", errors="replace") as file:
+        head = file.readline(LONGEST)
+        while head.startswith("#") or (head and not head.strip()):
+            head = file.readline(LONGEST)
+        marks = [mark for mark in "\t;|" if mark in head]
+        first_row = file.readline(LONGEST)
+        if not marks or not first_row.strip():
+            return None
+        cells = first_row.strip().split(marks[0])
+        with_comma = [cell for cell in cells if DECIMAL_COMMA.fullmatch(cell.strip().strip('"'))]
+        if 2 * len(with_comma) <= len(cells):
+            return None
+        body = first_row + file.read()
+    log = Log()
+    log.write(head.rstrip("\r\n") + "\n" + body.replace(",", "."))
+    log.seek(0)
+    log.notes = ("decimal commas are read as points",)
     return log
 
 

@@ -1,11 +1,16 @@
-"""Recordings from files: NumPy archives, CSV tables or ROS bags, recognised by their first bytes.
+"""Recordings from files: NumPy archives, CSV tables, ROS bags or LeRobot data sets, by their first bytes.
 
 A CSV table has one column of stamps, one per joint and quantity (``q1 [deg]``, ``tau_elbow [Nm]``). A quantity's name
 (`recording_options`) is before or after the joint's number or name, with or without a ``_`` (``q1``, ``q_1``,
-``position_elbow``, ``elbow_position``, ``J1 pos``; ``q[1]`` has a number, not a unit); numbers start at 0 or 1. What
-bags hold: ``calib formats logs``.
+``position_elbow``, ``elbow_position``, ``J1 pos``; ``q[1]`` has a number, not a unit); numbers start at 0 or 1. Other
+names are told by their words (``/joint_states/elbow/position`` of PlotJuggler, ``A1 current [mA]``, ``Winkel A1``), and
+said as a line ``columns = { … }``, which options files take. Rows without positions (of other topics) are left out;
+quantities that are NaN in every row are not provided. Times without a unit that can be no seconds are read in the only
+plausible one. Bags, data sets, and what ROS's tools print: ``calib formats logs``. Positions and torques in files of
+their own: ``calib join``.
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,11 +18,14 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.controllers.table import as_described, motors_as_described
+from calib.controllers.axes import as_described, named_joints
+from calib.controllers.table import motors_as_described
 from calib.data.csv_table import Table, read_table
+from calib.data.joint_columns import words_of
 from calib.data.recordings import log_columns
 from calib.data.recordings.archives import read_archive
 from calib.data.recordings.checks import check_recording
+from calib.data.recordings.datasets import dataset_table, is_dataset
 from calib.data.recordings.recording import Ends, Recording, earlier, in_pieces, named, parse_cut, rows_used
 from calib.data.recordings.recording_options import (
     MEASURED,
@@ -37,6 +45,10 @@ from calib.files import check_regular
 from calib.records import FieldValues
 from calib.units import TIMES
 
+_LOG = logging.getLogger(__name__)
+NO_JOINTS = Joints(())
+# Letter of the heading of a column that is not looked at.
+HIDDEN = "\0"
 # What a note says of columns without any number.
 ABSENT = "not provided, NaN or empty in every row"
 
@@ -52,10 +64,11 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
         options: options for reading the file.
         ends: begin and end of the part to read; None: no bound.
     """
-    table = _numbered_brackets(read_table(path, doubles=True))
-    joint_names = joints.names if joints else ()
-    columns_of, column_notes = _find_columns(table, options, joint_names)
-    advice = _advice(table, columns_of, joint_names)
+    table = dataset_table(path) if is_dataset(path) else _numbered_brackets(read_table(path, doubles=True))
+    robot_joints = joints or NO_JOINTS
+    joint_names = robot_joints.names
+    columns_of, column_notes = _find_columns(table, options, robot_joints)
+    advice = _advice(table, columns_of, robot_joints)
     renamed = one_effort({name: name for name in columns_of}, options, table.header, path, advice)
     columns_of = {name: columns_of[file_name] for name, file_name in renamed.items()}
     n = len(columns_of["q"])
@@ -87,7 +100,7 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
     unused = [column for column in range(len(table.header)) if column not in read_columns]
     notes = [*table.notes, *column_notes, *time_notes, *row_notes, *notes]
     if unused:
-        notes.append(f"not read: {', '.join(log_columns.condensed(table.header, joint_names, unused))}")
+        notes.append(f"not read: {', '.join(log_columns.condensed(table.header, robot_joints, unused))}")
     by_words = any(note.startswith("read as columns") for note in column_notes)
     for name, columns in columns_of.items():
         if not by_words and stem_of(table.header[columns[0]])[0].startswith(MEASURED):
@@ -118,7 +131,7 @@ def read_positions(path: Path, joints: Joints, options: RecordingOptions) -> tup
     """
     table = _numbered_brackets(read_table(path, doubles=True))
     names = {key: name for key, name in options.names.items() if key in ("t", "q", "q_ref")}
-    columns_of, _ = _find_columns(table, replace(options, names=names), joints.names)
+    columns_of, _ = _find_columns(table, replace(options, names=names), joints)
     name = "q_ref" if "q_ref" in columns_of else "q"
     if name not in columns_of:
         expected = ", ".join((*SYNONYMS["q_ref"], *SYNONYMS["q"]))
@@ -140,9 +153,7 @@ def _numbered_brackets(table: Table) -> Table:
     return replace(table, header=tuple(header), units=tuple(units))
 
 
-def _find_columns(
-    table: Table, options: RecordingOptions, joints: Sequence[str]
-) -> tuple[dict[str, list[int]], list[str]]:
+def _find_columns(table: Table, options: RecordingOptions, joints: Joints) -> tuple[dict[str, list[int]], list[str]]:
     """Return the column indices of each series, in the robot's joint order, by the toolkit's name, and notes.
 
     Columns that are NaN in every row count as not provided.
@@ -158,7 +169,9 @@ def _find_columns(
     for name, synonyms in SYNONYMS.items():
         while name not in columns_of:
             provided = replace(table, header=tuple(header))
-            columns = _stamp_column(provided, synonyms) if name == "t" else _joint_columns(provided, synonyms, joints)
+            columns = (
+                _stamp_column(provided, synonyms) if name == "t" else _joint_columns(provided, synonyms, joints.names)
+            )
             if not columns:
                 break
             if name == "t" or not _all_nan(table, columns):
@@ -172,9 +185,9 @@ def _find_columns(
     by_words = {name: family for name, family in by_series.items() if name not in columns_of}
     columns_of |= {name: list(family.columns) for name, family in by_words.items()}
     for family in candidates:
-        # a table of joints' names alone: what its file's name says, else positions
-        series = log_columns.series_of(Path(table.file).stem) or "q"
-        if family.pattern == log_columns.JOINT and series not in columns_of:
+        # names of joints alone: what the file's name says, else positions
+        series = log_columns.series_of(words_of(Path(table.file).stem)) or "q"
+        if family.plain and series not in columns_of:
             columns_of[series] = list(family.columns)
             by_words[series] = family
     if "t" not in columns_of:
@@ -184,8 +197,10 @@ def _find_columns(
     if by_words or options.columns or options.names:
         notes.append(f"read as {log_columns.mapping_line(table.header, joints, columns_of)}")
         by_topic = [family.pattern for family in by_words.values() if family.pattern.startswith("/")]
-        if joints and any(log_columns.NUMBER in pattern for pattern in by_topic):
-            notes.append(f"numbers are taken for {', '.join(joints)} in this order: is it the order of the message?")
+        if any(log_columns.NUMBER in pattern for pattern in by_topic):
+            notes.append(
+                f"numbers are taken for {', '.join(joints.names)} in this order: is it the order of the message?"
+            )
     if by_words and rivals:
         notes.append(f"also there, not read: {', '.join(rivals)}")
     return columns_of, notes
@@ -204,11 +219,11 @@ def _hide(header: list[str], columns: Sequence[int]) -> str:
     """Replace the headings of columns that the logger did not provide by unique blanks; return a note on them."""
     headings = ", ".join(header[column] for column in columns)
     for column in columns:
-        header[column] = f"\0{column}"
+        header[column] = HIDDEN * (column + 1)
     return f"{ABSENT}: {headings}"
 
 
-def _stated_columns(table: Table, options: RecordingOptions, joints: Sequence[str]) -> dict[str, list[int]]:
+def _stated_columns(table: Table, options: RecordingOptions, joints: Joints) -> dict[str, list[int]]:
     """Return the column indices of the series that the options name.
 
     Args:
@@ -219,11 +234,15 @@ def _stated_columns(table: Table, options: RecordingOptions, joints: Sequence[st
     columns_of: dict[str, list[int]] = {}
     of_series = {key: heading for key, heading in options.columns.items() if key in SYNONYMS}
     for name, heading in {**options.names, **of_series}.items():
-        columns = _stamp_column(table, [heading]) if name == "t" else _joint_columns(table, [heading], joints)
-        columns = columns or list(log_columns.stated(heading, table.header, joints))
+        columns: list[int] = []
+        if name == "t":
+            columns = _stamp_column(table, [heading])
+        elif "{" not in heading:
+            columns = _joint_columns(table, [heading], joints.names)
+        columns = columns or list(log_columns.columns_meant(heading, table.header, joints))
         if not columns:
-            near = log_columns.near_names(heading, table.header, joints)
-            table.fail(f"no columns are named '{heading}' ({name}){near}; found: {', '.join(table.header)}")
+            hint = log_columns.near_names(heading, table.header, joints)
+            table.fail(f"no columns are named '{heading}' ({name}){hint}; found: {', '.join(table.header)}")
         columns_of[name] = columns
     of_joints = {key: heading for key, heading in options.columns.items() if key not in SYNONYMS}
     for name, by_joint in log_columns.joint_keys(of_joints, joints, table).items():
@@ -231,7 +250,7 @@ def _stated_columns(table: Table, options: RecordingOptions, joints: Sequence[st
     return columns_of
 
 
-def _advice(table: Table, columns_of: dict[str, list[int]], joints: Sequence[str]) -> str:
+def _advice(table: Table, columns_of: dict[str, list[int]], joints: Joints) -> str:
     """Return advice for a table without positions or without torques: a line to paste, or to join two files.
 
     Args:
@@ -246,14 +265,16 @@ def _advice(table: Table, columns_of: dict[str, list[int]], joints: Sequence[str
     read_columns: set[int] = set()
     for columns in columns_of.values():
         read_columns.update(columns)
-    header = [f"\0{column}" if column in read_columns else name for column, name in enumerate(table.header)]
+    header = list(table.header)
+    for column in read_columns:
+        header[column] = HIDDEN * (column + 1)
     line = log_columns.paste(header, joints, needed)
     if line:
         return f". If these are meant, state them in the options (--options FILE), joints in this order: {line}"
     if columns_of.keys() - {"t"}:
-        other = " and ".join("positions" if name == "q" else "torques" for name in needed)
+        quantities = " and ".join({"q": "positions", "torque": "torques"}[name] for name in needed)
         return (
-            f". Are the {other} in another file? If its times are of the same clock, join them first: "
+            f". Are the {quantities} in another file? If its times are of the same clock, join them first: "
             f"calib join {table.file} OTHER.csv --out log.csv"
         )
     return ""
@@ -392,7 +413,10 @@ def read_recording(
     for name, unit in options.units.items():
         check_units(name, [unit] * len(joints.names if joints else ()), joints, file)
     reader = _reader(Path(file), (start, stop))
-    recording = _described(reader(Path(file), joints, options), options.controller)
+    recording = _described(reader(Path(file), joints, options), options, joints)
+    for note in recording.notes:
+        if note.startswith("read as"):
+            _LOG.info("%s: %s", Path(file).name, note)
     if (start, stop) != (None, None):
         recording = recording.cut(start, stop)
     recording = in_pieces(recording, options.samples)
@@ -405,25 +429,49 @@ def read_recording(
     return check_recording(earlier(recording, options.lag), joints)
 
 
-def _described(recording: Recording, controller: str) -> Recording:
+def read_at_rest(path: Path, joints: Joints, options: RecordingOptions) -> tuple[Recording, bool]:
+    """Return the rows of a table of joints and torques, and whether they have stamps; values are only checked for gaps.
+
+    Rows without stamps are numbered by t; they may be standing poses.
+
+    Args:
+        path: the table.
+        joints: the robot's joints.
+        options: options for reading the file.
+
+    Raises:
+        MeasurementError: no joint or torque columns, or cells that are no numbers.
+    """
+    try:
+        recording, stamped = read_log(path, joints, options), True
+    except MeasurementError:
+        recording, stamped = read_log(path, joints, replace(options, rate=1.0)), False
+    return _described(recording, options, joints), stamped
+
+
+def _described(recording: Recording, options: RecordingOptions, joints: Joints | None) -> Recording:
     """Return a recording converted from the controller's joint convention to that of the robot's description.
 
     Args:
         recording: the recording.
-        controller: name of the controller; empty: the recording is returned unchanged.
+        options: options with the controller and its external axes; without one, the recording is returned unchanged.
+        joints: the robot's joints; None: all are turning joints of the arm.
     """
+    controller = options.controller
     if not controller:
         return recording
-    series_of = {
-        as_described: ("q", "v", "q_link", "q_ref"),
-        motors_as_described: ("effort", "tau_link", "tau_motor", "tau_ff"),
-    }
+    named = None
+    if joints is not None and len(joints.names) == recording.n:
+        named = named_joints(joints.names, joints.kinds)
     changes: dict[str, object] = {}
-    for conversion, names in series_of.items():
-        for name in names:
-            values = getattr(recording, name)
-            if values is not None:
-                changes[name] = conversion(controller, values)
+    for name in ("q", "v", "q_link", "q_ref"):
+        values = getattr(recording, name)
+        if values is not None:
+            changes[name] = as_described(controller, values, named, options.external)
+    for name in ("effort", "tau_link", "tau_motor", "tau_ff"):
+        values = getattr(recording, name)
+        if values is not None:
+            changes[name] = motors_as_described(controller, values)
     return replace(recording, **changes)
 
 
@@ -437,6 +485,8 @@ def _reader(path: Path, ends: Ends) -> Reader:
     try:
         if path.exists():
             check_regular(path)
+        if is_dataset(path) and path.exists():
+            return partial(read_log, ends=ends)
         if path.is_dir() or path.suffix in (".bag", ".mcap", ".db3"):
             from calib.data.recordings.bags import read_bag
 

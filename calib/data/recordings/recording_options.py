@@ -118,6 +118,7 @@ class RecordingOptions:
         topic: name of the topic to read, for a ROS bag with several topics of joint states.
         use_range: use only the rows of the file's `use_range` if the path has no cut.
         controller: joints are as this controller shows them (`calib program --list`); torques take its signs only.
+        external: names of joints that are external axes of the controller, where names and kinds do not tell.
         samples: largest number of samples used; of a longer recording, pieces spread over it; None: all.
         lag: delay of torques and currents relative to the positions in the same row [s].
         rows: name of the torques to be explained, for messages.
@@ -132,6 +133,7 @@ class RecordingOptions:
     rate: Positive | None = None
     topic: Name = ""
     controller: Name = ""
+    external: tuple[Name, ...] = ()
     use_range: Flag = True
     samples: Annotated[int, Whole(10_000, 1_000_000_000)] | None = None
     lag: Annotated[float, Real(least=-MAX_LAG, most=MAX_LAG, unit="s")] = 0.0

@@ -12,8 +12,9 @@ import numpy as np
 
 from calib.data.recordings.recording import Recording
 
-# Median steps by which a stamp may be earlier than one before it, to be put in order (our choice).
-MAX_BACK = 5
+# Median steps, and time [s], by which a stamp may be earlier than one before it, to be put in order (our choice): the
+# larger counts. Threads and sockets exchange rows by milliseconds, whatever the rate.
+MAX_BACK, MAX_BACK_TIME = 5, 5e-3
 
 
 def in_order(recording: Recording) -> Recording:
@@ -27,7 +28,7 @@ def in_order(recording: Recording) -> Recording:
     edges = [0, *np.flatnonzero(goes_far_back(t)).tolist(), len(t)]
     parts = [slice(*ends) for ends in pairwise(edges)]
     back = np.concatenate([np.maximum.accumulate(t[part]) - t[part] for part in parts])
-    if not 0.0 < back.max() <= MAX_BACK * _usual_step(t):
+    if not 0.0 < back.max() <= _max_back(t):
         return recording
     order = np.concatenate([part.start + np.argsort(t[part], kind="stable") for part in parts])
     count = int((back > 0.0).sum())
@@ -42,13 +43,14 @@ def in_order(recording: Recording) -> Recording:
 
 
 def goes_far_back(t: np.ndarray) -> np.ndarray:
-    """Return for each time stamp (N,) whether it is earlier than the one before by more than `MAX_BACK` steps."""
-    return np.append(False, np.diff(t) < -MAX_BACK * _usual_step(t))
+    """Return for each time stamp (N,) whether it is far earlier than the one before (`MAX_BACK`)."""
+    return np.append(False, np.diff(t) < -_max_back(t))
 
 
-def _usual_step(t: np.ndarray) -> float:
-    """Return the median absolute difference between successive time stamps (N,)."""
-    return float(np.median(np.abs(np.diff(t))))
+def _max_back(t: np.ndarray) -> float:
+    """Return by how much a stamp of t (N,) may be earlier than one before it, to be put in order [s]."""
+    usual_step = float(np.median(np.abs(np.diff(t))))
+    return max(MAX_BACK * usual_step, MAX_BACK_TIME)
 
 
 def _path_length(q: np.ndarray) -> float:

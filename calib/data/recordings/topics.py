@@ -13,6 +13,8 @@ from calib.data.csv_table import Table
 
 # Longest time over which values are interpolated, in median steps of the series, and at least [s] (our choice).
 MAX_STEPS, MIN_GAP = 5.0, 0.01
+# Largest difference of two stamps of one instant [s]: rounding of times since 1970.
+SAME_TIME = 1e-6
 
 
 def of_one_topic(
@@ -70,7 +72,9 @@ def at_times(t: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray
         return np.full((len(times), values.shape[1]), np.nan)
     max_gap = max(MAX_STEPS * float(np.median(np.diff(t))), MIN_GAP)
     after = np.clip(np.searchsorted(t, times), 1, len(t) - 1)
-    in_gap = (t[after] - t[after - 1] > max_gap) | (times < t[0]) | (times > t[-1])
+    distance = np.minimum(np.abs(t[after] - times), np.abs(times - t[after - 1]))
+    in_gap = (t[after] - t[after - 1] > max_gap) & (distance > SAME_TIME)
+    in_gap |= (times < t[0] - SAME_TIME) | (times > t[-1] + SAME_TIME)
     result = np.column_stack([np.interp(times, t, column) for column in values.T])
     result[in_gap] = np.nan
     return result

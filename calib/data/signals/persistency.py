@@ -68,6 +68,8 @@ def report_excitation(motion: Motion) -> ExcitationReport:
     one_frequency = bool((share > SINE).all())
     names = motion.joint_names
     notes = [f"{names[j]} never moves" for j in np.flatnonzero(still)]
+    if len(notes) == 1 and motion.n > 1:
+        notes = [f"{notes[0]}, all others do: did it stand, or is its position column frozen?"]
     if len(moving) and one_frequency:
         low, high = frequency.min(), frequency.max()
         hertz = f"{low:.3g} Hz" if high - low < FREQUENCY_SPREAD * high else f"{low:.3g} to {high:.3g} Hz"

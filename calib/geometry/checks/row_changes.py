@@ -20,6 +20,7 @@ that is missing in the arm's model would violate the last condition.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -173,6 +174,23 @@ class RowChange:
         return self.shape[:, None, None] * self.subject.columns
 
 
+class ChangeSize(NamedTuple):
+    """Size of a change, as findings state it.
+
+    The fields are the file, the name of the changed part, first and last row; the size with its standard deviation (at
+    the targets [m], or of one number [m, rad or 1]); and the rms of the position residuals without and with it [m].
+    """
+
+    file: str
+    name: str
+    first: int
+    end: int
+    size: float
+    sigma: float
+    before: float
+    after: float
+
+
 def row_changes(fit: GeometricFit) -> list[Finding]:
     """Return findings on the parts of the set-up that changed while the rows of a block were measured.
 
@@ -183,7 +201,7 @@ def row_changes(fit: GeometricFit) -> list[Finding]:
     for number, block in enumerate(fit.blocks):
         if not isinstance(block.measured, Positions) or len(block.measured) < MIN_ROWS:
             continue
-        rows = _without_gross(_rows_of(fit, number))
+        rows = without_gross(whitened_rows(fit, number))
         subjects = _subjects(fit, rows)
         for _ in range(MAX_CHANGES):
             change = _best_change(rows, subjects)
@@ -194,7 +212,7 @@ def row_changes(fit: GeometricFit) -> list[Finding]:
     return findings
 
 
-def _rows_of(fit: GeometricFit, number: int) -> WhitenedRows:
+def whitened_rows(fit: GeometricFit, number: int) -> WhitenedRows:
     """Return the whitened rows of the block with index `number` in a fit, with the columns of all rigid parameters."""
     measured = fit.blocks[number].measured
     (block,) = prepare(fit.cell, [take(measured, evenly(len(measured), MAX_ROWS))])
@@ -216,7 +234,7 @@ def _rows_of(fit: GeometricFit, number: int) -> WhitenedRows:
     return WhitenedRows(block, residual, matrix, precision, from_nominal * precision, metres)
 
 
-def _without_gross(rows: WhitenedRows) -> WhitenedRows:
+def without_gross(rows: WhitenedRows) -> WhitenedRows:
     """Return the rows without gross outliers of the rigid fit. Outliers would hide smaller changes."""
     for _ in range(GROSS_PASSES):
         size = np.linalg.norm(rows.residuals(rows.solve()), axis=1)
@@ -247,7 +265,8 @@ def _subjects(fit: GeometricFit, rows: WhitenedRows) -> list[Subject]:
         # a point has no orientation
         visible = np.linalg.norm(columns, axis=(0, 1)) > 0.0
         subjects.append(Subject(code, name, columns[:, :, visible]))
-    for joint, element in zip(cell.chain.joint_names, cell.chain.moving):
+    joints = [] if cell.chain.is_free_flyer else zip(cell.chain.joint_names, cell.chain.moving)
+    for joint, element in joints:
         number = column[cell.chain.names[element]]
         subjects.append(Subject("zero", joint, rows.matrix[:, :, [number]]))
     measured = rows.block.measured
@@ -280,11 +299,11 @@ def _best_change(rows: WhitenedRows, subjects: Sequence[Subject]) -> RowChange |
             smallest = information
     effective = rows.matrix.shape[2] - rows.resting()
     hypotheses = len(subjects) * len(residuals)
-    if best is None or not _significant(best, cost, count - effective, hypotheses):
+    if best is None or not significant(best, cost, count - effective, hypotheses):
         return None
     if max(_gains_over_other_orders(rows, residuals, subjects)) > MAX_RIVAL * best.gain:
         return None
-    if not _holds_on_held_out(rows, best):
+    if not holds_on_held_out(rows, best):
         return None
     return best
 
@@ -300,7 +319,7 @@ def _information(cost: float, count: int, parameters: int) -> float:
     return count * np.log(max(cost, 1e-300)) + parameters * np.log(count)
 
 
-def _significant(change: RowChange, cost: float, dof: float, hypotheses: int) -> bool:
+def significant(change: RowChange, cost: float, dof: float, hypotheses: int) -> bool:
     """Return whether a change is significant by Fisher's test and leaves only a small share of the residuals.
 
     Args:
@@ -366,6 +385,24 @@ def _changes(
         yield RowChange(subject, ramp, None, float(gain[0]))
 
 
+def best_gain(rows: WhitenedRows, residuals: np.ndarray, subject: Subject) -> RowChange:
+    """Return the change of a part of the set-up that acts on all rows, with its gain.
+
+    Args:
+        rows: the whitened rows.
+        residuals: (m, d) whitened residuals without a change.
+        subject: the part.
+    """
+    columns = subject.columns
+    flat = rows.matrix.reshape(-1, rows.matrix.shape[2])
+    added = columns.reshape(-1, subject.count)
+    root = scipy.linalg.cholesky(rows.normal())
+    fitted = scipy.linalg.solve_triangular(root, flat.T, trans=1).T
+    score = added.T @ residuals.ravel()
+    gain = _gains(score[None], (added.T @ added)[None], (added.T @ fitted)[None])
+    return RowChange(subject, np.ones(len(residuals)), None, float(gain[0]))
+
+
 def _sums_behind(terms: np.ndarray, rank: np.ndarray, cuts: np.ndarray) -> np.ndarray:
     """Return the sums (c, …) of `terms` (m, …) over all rows after each of c cuts.
 
@@ -409,7 +446,7 @@ def _gains_over_other_orders(rows: WhitenedRows, residuals: np.ndarray, subjects
             yield change.gain
 
 
-def _holds_on_held_out(rows: WhitenedRows, change: RowChange) -> bool:
+def holds_on_held_out(rows: WhitenedRows, change: RowChange) -> bool:
     """Return whether the change also reduces the residuals of held-out rows, every k-th row being held out in turn.
 
     Args:
@@ -445,6 +482,20 @@ def _described(rows: WhitenedRows, change: RowChange) -> Finding:
         rows: the whitened rows of one block.
         change: the change to describe.
     """
+    values = size_of(rows, change)._asdict()
+    if change.between is None:
+        return finding(DRIFTS[change.subject.code], **values)
+    last, following = change.between
+    return finding(STEPS[change.subject.code], last=int(last), next=int(following), **values)
+
+
+def size_of(rows: WhitenedRows, change: RowChange) -> ChangeSize:
+    """Return the estimated size of a change with its standard deviation, and the residuals with and without it.
+
+    Args:
+        rows: the whitened rows of one block.
+        change: the change to describe.
+    """
     extended = rows.with_columns(change.columns)
     estimate = extended.solve()
     count = change.subject.count
@@ -465,17 +516,13 @@ def _described(rows: WhitenedRows, change: RowChange) -> Finding:
         size = float(np.sqrt(gradient @ change_estimate))
         sigma = float(np.sqrt(gradient @ change_covariance @ weight @ change_estimate)) / max(size, 1e-300)
     numbers = rows.block.measured.rows
-    values = {
-        "file": Path(rows.block.measured.file).name or "measurements",
-        "name": change.subject.name,
-        "first": int(numbers.min()),
-        "end": int(numbers.max()),
-        "size": size,
-        "sigma": sigma,
-        "before": rows.position_rms(before),
-        "after": rows.position_rms(after),
-    }
-    if change.between is None:
-        return finding(DRIFTS[change.subject.code], **values)
-    last, following = change.between
-    return finding(STEPS[change.subject.code], last=int(last), next=int(following), **values)
+    return ChangeSize(
+        file=Path(rows.block.measured.file).name or "measurements",
+        name=change.subject.name,
+        first=int(numbers.min()),
+        end=int(numbers.max()),
+        size=size,
+        sigma=sigma,
+        before=rows.position_rms(before),
+        after=rows.position_rms(after),
+    )

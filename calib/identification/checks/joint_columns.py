@@ -213,13 +213,28 @@ def _position_changes(samples: MotionSamples) -> list[Change[Columns]]:
     return changes
 
 
-def _unexplained_function(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
+def without_offsets(samples: MotionSamples) -> tuple[float, float]:
+    """Return the unexplained rms shares of the torques without and with offsets, geometric means over the joints.
+
+    Torques that were tared lack the gravity torque of one pose, which an offset makes up for.
+
+    Args:
+        samples: samples of a recording.
+    """
+    unchanged = np.eye(samples.q.shape[1])
+    shares = [_unexplained_function(samples, offsets)(unchanged) for offsets in (False, True)]
+    without, with_offsets = (float(np.exp(0.5 * np.mean(np.log(share)))) for share in shares)
+    return without, with_offsets
+
+
+def _unexplained_function(samples: MotionSamples, offsets: bool = True) -> Callable[[np.ndarray], np.ndarray]:
     """Return a function that maps a mixing matrix of the torques to unexplained shares of the joints' variances (n,).
 
     The matrix (n, n) multiplies the recorded torques: the identity, or one with signs reversed or rows exchanged.
 
     Args:
         samples: samples of a recording of n joints.
+        offsets: whether each joint's torque has an offset.
     """
     m, n = samples.q.shape
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
@@ -230,7 +245,8 @@ def _unexplained_function(samples: MotionSamples) -> Callable[[np.ndarray], np.n
 
     # Bodies and offsets are free, the drives' other parameters not negative.
     drives = samples.drives.reshape(m, n, n, 4)
-    free = weighted_rows(np.concatenate([samples.inertial, drives[..., 3]], axis=2))
+    free_columns = [samples.inertial, drives[..., 3]] if offsets else [samples.inertial]
+    free = weighted_rows(np.concatenate(free_columns, axis=2))
     free = free @ spanning(free.T @ free)
     positive = weighted_rows(drives[..., :3].reshape(m, n, -1))
     positive /= np.maximum(np.abs(positive).max(axis=0), 1e-12)

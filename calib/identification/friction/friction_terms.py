@@ -2,9 +2,9 @@
 
     tau_j += parameter_j · f(v_j)        or        tau_j += parameter_j · f(q_j)
 
-The parameter is identified with all others. The function is made a table (`calib.dynamics.tables`) over the joint's
-range, so that the identified model is data: it is stored, simulated and read back without the function. URDF and MJCF
-have no place for it; exports say so.
+The parameter is identified with all others. The function is made a table over the joint's range
+(`calib.identification.friction.function_tables`), so that the identified model is data: it is stored, simulated and
+read back without the function. URDF and MJCF have no place for it; exports say so.
 """
 
 import math
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from calib.dynamics.drives import DriveTerm, term
-from calib.dynamics.tables import Function, knots_of
 from calib.errors import UsageError, one_of, require
+from calib.identification.friction.function_tables import Function, knots_of
 from calib.robot.chain import Chain, Joint
 
 # Speeds of the table as a multiple of the joint's limit, and for joints without one [rad/s, m/s] (our choice).
@@ -76,7 +76,7 @@ class FrictionTerm:
 
         Raises:
             UsageError: a joint that the arm does not have, or a function that is no friction term
-                (`calib.dynamics.tables.knots_of`).
+                (`calib.identification.friction.function_tables.knots_of`).
         """
         numbers = range(1, chain.n + 1) if self.joints is None else self.joints
         terms = []
@@ -102,9 +102,9 @@ class FrictionTerm:
         upper = joint.upper if math.isfinite(joint.upper) else turn
         return lower, upper
 
-    def _table(self, lower: float, upper: float, what: str) -> tuple[float, ...]:
+    def _table(self, lower: float, upper: float, title: str) -> tuple[float, ...]:
         """Return place, value and slope of each knot between lower and upper, one after the other."""
         if (lower, upper) not in self._tables:
-            knots = knots_of(self.function, self.slope, lower, upper, what)
+            knots = knots_of(self.function, self.slope, lower, upper, title)
             self._tables[lower, upper] = tuple(knots.ravel().tolist())
         return self._tables[lower, upper]

@@ -38,6 +38,8 @@ from calib.units import headings, per_ampere
 TORQUE_RATE = 100.0
 
 INSTRUMENTAL = "instrumental.csv"
+# statuses of gains in tables
+GAIN_STATUS = {"told": "identified", "not told": "not identified", "reference": "reference"}
 OURS = (
     calibrated.ROBOT,
     MODEL,
@@ -251,8 +253,9 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     nominal = geometry_tables.on_nominal_geometry(folder)
     _write_torques(inputs, first, outcome, nominal, folder / "torques_1.csv")
     if gains is not None:
-        header = ("joint", f"gain [{gains.unit}]", f"sigma [{gains.unit}]", "told")
-        rows = zip(inputs.chain.joint_names, plain(gains.values), plain(gains.sigma), gains.told)
+        header = ("joint", f"gain [{gains.unit}]", f"sigma [{gains.unit}]", "status")
+        status = [GAIN_STATUS[text] for text in gains.told]
+        rows = zip(inputs.chain.joint_names, plain(gains.values), plain(gains.sigma), status)
         files.write_table(folder / "drive_gains.csv", header, rows)
     files.write_json(folder / folders.METRICS, metrics(outcome))
 

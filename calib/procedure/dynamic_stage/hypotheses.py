@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.column_changes import MAX_RIVAL_RATIO, Explanation
+from calib.column_changes import Explanation
 from calib.errors import Finding, finding
 from calib.identification.checks.gravity import GravityHypotheses, gravity_of
-from calib.identification.checks.joint_columns import corrected
+from calib.identification.checks.joint_columns import corrected, without_offsets
 from calib.identification.checks.recorded_motion import bodies_under, take_samples
 from calib.identification.checks.recording_sizes import MAX_SAMPLES
 from calib.identification.checks.unstated_load import unstated_load
@@ -16,6 +16,12 @@ from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.robot.chain import Chain
 from calib.units import TORQUE
 
+# share that gravity leaves over that which columns leave, from which on columns are the likelier cause (our choice)
+MIN_BETTER = 1.5
+# of the joints, whose torques start or average at zero: fewer may do so by chance (our choice)
+MIN_TARED = 0.8
+# largest unexplained share with offsets of the torques, as a share of that without (our choice)
+MAX_TARED = 0.6
 MAX_COMPARED = 12  # recordings in which an unstated load is looked for (our choice)
 
 
@@ -53,7 +59,7 @@ def likelier_gravity(
     """Return the gravity hypotheses, for corrected columns if these explain the training recordings better.
 
     Wrong columns may look like another gravity. The hypothesis that leaves the smaller share of the torques decides;
-    of equal ones it is gravity. Joints with clipped torques do not tell whether gravity is absent.
+    of similar ones it is gravity, and so it is if the alternative is another robot, whose base may be turned. Joints with clipped torques do not tell whether gravity is absent.
 
     Args:
         inputs: robot, recordings and options.
@@ -66,12 +72,12 @@ def likelier_gravity(
     clipped = set()
     for case in inputs.cases:
         explanation = columns.get(case.name)
-        if explanation is not None:
+        if explanation is not None and (explanation.changes[0].joints or hypotheses.direction is None):
             shares.append(explanation.factor)
         for fault in case.motion.faults:
             if fault.kind == "clipped":
                 clipped.add(fault.joint)
-    if shares and (hypotheses.direction is None or min(shares) * MAX_RIVAL_RATIO < hypotheses.factor):
+    if shares and (hypotheses.direction is None or min(shares) * MIN_BETTER < hypotheses.factor):
         hypotheses = gravity_hypotheses(inputs, columns) or hypotheses
     absent = tuple(joint for joint in hypotheses.absent if joint not in clipped)
     return replace(hypotheses, absent=absent)
@@ -139,6 +145,29 @@ def load_findings(inputs: IdentificationInputs, gravity: Sequence[float] | None)
                     after=load.after,
                 )
             )
+    return findings
+
+
+def tare_findings(inputs: IdentificationInputs, gravity: Sequence[float] | None) -> list[Finding]:
+    """Return a finding for each recording whose torques were tared: they start or average at zero, unlike gravity's.
+
+    Args:
+        inputs: the recordings.
+        gravity: gravity (3,) in the base frame [m/s²]; None: gravity of the robot's description.
+    """
+    if not isinstance(inputs.chain, Chain) or not inputs.options.settings.torque_rows.has_bodies:
+        return []
+    bodies = bodies_under(inputs.chain, gravity)
+    findings = []
+    for case in (*inputs.cases, *inputs.unseen):
+        for kind, verb in (("mean", "average"), ("start", "start")):
+            tared = {fault.joint for fault in case.motion.faults if fault.kind == kind}
+            samples = take_samples(case, bodies, MAX_SAMPLES) if len(tared) >= MIN_TARED * inputs.chain.n else None
+            if samples is None:
+                continue
+            without, with_offsets = without_offsets(samples)
+            if with_offsets < MAX_TARED * without:
+                findings.append(finding("torques-tared", file=case.name, kind=verb, before=without, after=with_offsets))
     return findings
 
 

@@ -156,7 +156,11 @@ def gather(
     if not recordings:
         raise UsageError("no recording given")
     sources = [*recordings, *validate]
-    paths = [_path(recording) for recording in sources]
+    unnamed = sum(isinstance(recording, Recording) and not recording.file for recording in sources)
+    paths = []
+    for number, recording in enumerate(sources, 1):
+        name = f"recording {number}" if unnamed > 1 else "recording"
+        paths.append(_path(recording, name))
     # a mechanism's outcome may be judged on more files later, named in the same options
     if not isinstance(robot, Mechanism):
         _check_files(options, paths)
@@ -240,14 +244,18 @@ def _check_payloads(cases: Sequence[Case], unseen: Sequence[Case], settings: Ide
             )
 
 
-def _path(recording: str | Path | Recording) -> str:
+def _path(recording: str | Path | Recording, unnamed: str = "recording") -> str:
     """Return the path of a recording, by which options and names refer to it.
 
     For a recording in memory, this is its file name with its time span, so that two cuts of one file differ.
+
+    Args:
+        recording: the recording.
+        unnamed: name of a recording in memory without a file.
     """
     if not isinstance(recording, Recording):
         return str(recording)
-    file = recording.file or "recording"
+    file = recording.file or unnamed
     # what times must be is checked later
     t = recording.t[np.isfinite(recording.t)]
     if len(t) < 2:

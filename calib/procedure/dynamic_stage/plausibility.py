@@ -21,6 +21,7 @@ from calib.procedure.dynamic_stage.hypotheses import (
     gravity_hypotheses,
     likelier_gravity,
     load_findings,
+    tare_findings,
 )
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.findings import level_of, limit, settle
@@ -37,6 +38,19 @@ RODS_SIGMA = 0.17
 # of the loop's factors at the joints: spread below which they are one, and distance from 1 that counts (our choice)
 MAX_FACTOR_SPREAD = 0.1
 MIN_FACTOR_ERROR = 0.1
+# jitter of the stamps in steps (rms), and share of missing samples, from which on they are noted (our choice)
+MAX_JITTER = 0.15
+MAX_MISSING = 0.02
+# velocity units that logs use -> size of a radian, or metre, per second in them
+VELOCITY_UNITS = {
+    "deg/s": 180.0 / np.pi,
+    "rpm": 30.0 / np.pi,
+    "turns per second": 0.5 / np.pi,
+    "mrad/s or mm/s": 1e3,
+    "rad/min or m/min": 60.0,
+}
+# relative error of a factor up to which it is that of a unit (our choice)
+MAX_UNIT_ERROR = 0.01
 
 
 def implausible(
@@ -66,8 +80,10 @@ def implausible(
     result = wrong_joints(columns, chain.joint_names)
     result += gravity_findings(hypotheses, chain.joint_names)
     result += load_findings(inputs, gravity)
+    result += tare_findings(inputs, gravity)
     result += standing_columns(cases, chain.joint_names)
     result += findings(sizes, chain.joint_names)
+    result += sampling_findings(cases)
     result += impossible(impossible_by)
     result += another_loop(loop)
     result += described(chain)
@@ -119,6 +135,28 @@ def _of_some_level(candidates: Iterable[Finding]) -> list[Finding]:
     return [candidate for candidate in candidates if level_of(candidate)]
 
 
+def sampling_findings(cases: Sequence[Case]) -> list[Finding]:
+    """Return findings on stamps that jitter, and on samples that were lost.
+
+    Args:
+        cases: the recordings.
+    """
+    result = []
+    for case in cases:
+        report = case.motion.sampling
+        jitter = report.jitter[0] * report.rate
+        length = float(case.motion.t[-1] - case.motion.t[0])
+        missing = report.lost / report.rate + sum(duration for _, duration in report.gaps)
+        share = missing / max(length, 1e-9)
+        if jitter > MAX_JITTER:
+            result.append(finding("stamps-jitter", file=case.name, jitter=jitter, seconds=report.jitter[0]))
+        if share > MAX_MISSING:
+            result.append(
+                finding("samples-missing", file=case.name, share=share, count=report.lost, gaps=len(report.gaps))
+            )
+    return result
+
+
 def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Finding]:
     """Return findings on clipped torques, and on positions or velocities that stay constant while a joint moves.
 
@@ -135,6 +173,8 @@ def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Findi
                 extremes = " and ".join(f"{value:.4g}" for value in fault.values)
                 clipped.append(joint)
                 values.append(f"{extremes} in {fault.share:.0%} of its motion")
+                continue
+            if fault.kind in ("mean", "start"):
                 continue
             code = "velocity-stands" if fault.kind == "velocity" else "encoder-stands"
             result.append(
@@ -354,9 +394,22 @@ def _speed(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding
         size=max(median, 1.0 / median),
         way="large" if median > 1.0 else "small",
         against=_against(clock, median),
+        unit=_velocity_unit(median),
         ratio=clock and clock.ratio,
         sigma=clock and clock.relative_sigma,
     )
+
+
+def _velocity_unit(factor: float) -> str | None:
+    """Return the unit in which velocities are `factor` times those per second; None if no usual unit has this factor.
+
+    Args:
+        factor: measured velocities divided by differentiated positions.
+    """
+    for unit, size in VELOCITY_UNITS.items():
+        if abs(factor / size - 1.0) < MAX_UNIT_ERROR:
+            return unit
+    return None
 
 
 def _against(clock: ClockRatio | None, speed_ratio: float) -> str:
@@ -414,6 +467,7 @@ def _lag(name: str, lag: Lag | None, joints: Sequence[str]) -> Iterator[Finding]
             by=abs(lag.seconds),
             sigma=lag.sigma,
             way=_direction(lag.seconds),
+            commanded="the motion" if lag.seconds > 0 else None,
             lag=lag.seconds,
             before=lag.before,
             after=lag.after,

@@ -12,8 +12,9 @@ drives.csv            joint, armature, damping, friction, offset, and the sigma 
                       by hand. A sigma is empty where the model has no such term. Then a row per coupling, as
                       "joint5 + joint6", of a motor that turns with both.
 joint_offsets.csv     of a fit: joint, unit, ``add_to_reading`` (a joint that the controller reads q of stands at q
-                      plus this), ``add_to_command`` (the same with the other sign, to send), sigma. They stand for
-                      the rest of the geometry, not beside it.
+                      plus this), ``add_to_command`` (the same with the other sign, to send), sigma. They are of a fit
+                      of offsets alone, and stand instead of robot.urdf, not beside it. Left out, with the reason,
+                      where the fit has none.
 joint_origins.yaml    with --urdf: origins as tesseract reads them, ``<calibration_config filename=.../>`` in the SRDF:
                       calibration / joints / name / position x y z [m], orientation x y z w.
 parameters.json       names, units, values and covariances of geometry and dynamics, base and standard parameters, what
@@ -62,6 +63,7 @@ from calib.procedure.kinematic_stage.folder import (
     FitFolder,
     ValidationFolder,
 )
+from calib.procedure.kinematic_stage.mastering import NoOffsets
 from calib.procedure.kinematic_stage.metrics import FitMetrics, ValidationMetrics
 from calib.robot.calibrated import ROBOT, CalibratedChain, nominal_of
 from calib.robot.chain import Joint
@@ -205,8 +207,8 @@ def _copy(export: Export, path: Path) -> list[str]:
 
 
 def _offsets(export: Export, path: Path) -> list[str]:
-    geometry.export_offsets(export.robot, path)
-    return [f"{path.name}: joint offsets only, without the rest of the geometry; --model offsets fits the best offsets"]
+    mastering = geometry.export_offsets(export.fit or Path(), path)
+    return [f"{path.name}: {mastering}, not those of {URDF}; calib deliver states the frames that belong to them"]
 
 
 def _ur_kinematics(export: Export, path: Path) -> list[str]:
@@ -289,7 +291,7 @@ class ExportFile:
     marked: bool = False
 
 
-_TO_MASTER = "for the controller: joint offsets to add to its mastering; contains no other part of the geometry"
+_TO_MASTER = f"for the controller's mastering: of a fit of joint offsets alone, instead of {URDF}, not beside it"
 _ONLY = f"only for programs that apply {TERMS}, otherwise {URDF} is better; masses are those of the source"
 TO_SIMULATE = "for simulators: motor inertia, friction and offset of each joint, with sigmas"
 _UR = "for ur_description: kinematics_params_file"
@@ -329,7 +331,7 @@ def deliver(export: Export, out: Path) -> list[str]:
         for file in export.files:
             try:
                 notes.extend(file.write(export, staging / file.name))
-            except geometry.NoSuchArm as error:
+            except (geometry.NoSuchArm, NoOffsets) as error:
                 notes.append(f"{file.name}: left out: {error}")
 
     write_staged(out, [file.name for file in export.files], write)
@@ -367,8 +369,8 @@ def check_into(export: Export, into: Path, folder: Path) -> None:
     """
     names = [file.name for file in export.files]
     marks: tuple[str, ...] = (PARAMETERS,)
-    # an earlier export
-    if (into / OFFSETS).exists() or (into / PARAMETERS).exists():
+    earlier_fit = (into / ROBOT).exists() and (into / README).exists()
+    if earlier_fit or (into / OFFSETS).exists() or (into / PARAMETERS).exists():
         marks = ()
     check_target(into, names, marks, "export", [export.urdf, *results(folder)])
 

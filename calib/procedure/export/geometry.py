@@ -9,6 +9,8 @@ from calib.errors import RobotError, UsageError
 from calib.folders import files_of
 from calib.procedure.dynamic_stage import folder as identification
 from calib.procedure.kinematic_stage.folder import OURS, FitFolder
+from calib.procedure.kinematic_stage.mastering import Mastering
+from calib.procedure.kinematic_stage.mastering import read as read_mastering
 from calib.result_kinds import refusal
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain, nominal_of
@@ -140,28 +142,26 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
     return "Pinocchio and yourdfpy read the same poses to 1e-9"
 
 
-def export_offsets(robot: CalibratedChain, out: Path) -> Path:
+def export_offsets(fit: Path, out: Path) -> Mastering:
     """Write a table of joint offsets, to be added to the controller's readings and subtracted from commands.
 
-    The offset is calibrated minus nominal: a joint with the reading q is at q + offset in the nominal robot's model. If
-    the fit has joint corrections, offsets and their σ are those of the best geometry without corrections, for users who
-    do not apply them.
+    The offset is calibrated minus nominal: a joint with the reading q is at q + offset in the nominal robot's model.
+    The offsets are those of a fit of offsets alone, for controllers that take no other parameter.
 
     Args:
-        robot: the calibrated robot.
+        fit: folder of the fit.
         out: path of the CSV file.
 
     Returns:
-        Path of the table.
+        The offsets with their arm and its error.
+
+    Raises:
+        NoOffsets: the fit's folder has none.
     """
-    nominal = nominal_of(robot)
-    sigma = np.full(len(robot.chain.elements), np.nan)
-    if robot.covariance is not None:
-        sigma = np.sqrt(np.diag(robot.covariance))
+    mastering = read_mastering(fit)
     rows = []
-    for joint, k in zip(robot.chain.joints, robot.chain.moving):
-        element = robot.chain.elements[k]
-        offset = (element.value - nominal.elements[k].value) / element.ratio
-        offset_sigma = float(sigma[k]) if sigma[k] > 0.0 else None
-        rows.append((joint.name, joint.unit, offset, 0.0 - offset, offset_sigma))
-    return files.write_table(out, OFFSETS_HEADER, rows)
+    for joint, offset, sigma in zip(mastering.cell.chain.joints, mastering.offset, mastering.sigma, strict=True):
+        stated = float(sigma) if sigma > 0.0 else None
+        rows.append((joint.name, joint.unit, float(offset), 0.0 - float(offset), stated))
+    files.write_table(out, OFFSETS_HEADER, rows)
+    return mastering

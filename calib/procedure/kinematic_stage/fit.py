@@ -10,7 +10,9 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, NotConverged, finding
 from calib.estimation.robust import Loss, loss_name
 from calib.geometry.accuracy import errors
+from calib.geometry.checks.joint_errors import joint_factors, joint_scatter, scatter_finding
 from calib.geometry.checks.joint_range import joint_range
+from calib.geometry.checks.pose_direction import parted_set_up
 from calib.geometry.checks.row_changes import row_changes
 from calib.geometry.diagnosis import diagnose
 from calib.geometry.error_model import ErrorModel, learn_errors
@@ -38,6 +40,8 @@ Progress = Callable[[str], None]
 
 # nominal errors fall by this factor when each file gets a station of its own: the instrument was moved (our choice)
 MOVED = 3.0
+# smallest cross-validated error with corrections over that without, if errors of joints are random (our choice)
+MIN_RANDOM = 0.8
 # losses that let a few gross rows draw a fit
 HEEDS_ALL = ("none", "huber")
 
@@ -187,7 +191,7 @@ def run(
     nominal = selection.nominal.cell
     _check_convergence(selection, inputs, options)
 
-    changes = row_changes(selection.rigid)
+    changes = row_changes(selection.rigid) or joint_factors(selection.rigid)
     rigid_misfit = _rigid_misfit(selection, changes, climb, weighing)
 
     progress("comparing on unseen poses")
@@ -195,6 +199,9 @@ def run(
     rigid = selection.rigid_fit(inputs.fit, weighing, inputs.bare)
     outliers = named_outliers(selection.fit)
     notes = _residual_findings(selection, inputs, changes, rigid_misfit, weighing)
+    if not changes:
+        for block in inputs.fit:
+            notes += parted_set_up(inputs.chain, block)
     if prediction is not None:
         ratio = compared_with_fit(prediction, selection.fit)
         if ratio is not None:
@@ -237,7 +244,7 @@ def _rigid_misfit(
 
     Args:
         selection: the selection of models.
-        changes: findings on changed rows; if a change explains the misfit, None is returned.
+        changes: findings on changed rows or on joints with a factor; if they explain the misfit, None is returned.
         climb: function that selects models on the same rows with another loss.
         weighing: loss settings of the selection.
     """
@@ -263,15 +270,27 @@ def _residual_findings(
     Args:
         selection: the selection of models.
         inputs: robot and measurements.
-        changes: findings on changed rows.
+        changes: findings on changed rows, or on joints with a factor.
         rigid_misfit: finding that no rigid geometry explains the rows; None: a rigid geometry explains them.
         weighing: settings of the loss function.
     """
     notes = list(changes)
+    if rigid_misfit and not changes and rigid_misfit.code == "rigid-misfit":
+        # systematic errors of joints would be predicted by corrections
+        random = selection.cross_validated > MIN_RANDOM * rigid_misfit.values["folds"]
+        scatter = joint_scatter(selection.rigid) if random else None
+        if scatter is not None:
+            notes.append(scatter_finding(scatter))
+    if rigid_misfit and rigid_misfit.code == "rigid-misfit" and notes:
+        rigid_misfit = replace(rigid_misfit, values={**rigid_misfit.values, "causes": None})
     if rigid_misfit:
         notes.append(rigid_misfit)
     notes += _moved_between(selection.nominal.cell, inputs.fit, weighing)
     notes += diagnose(selection.fit, with_changes=not changes)
+    with_factor = [change.values.get("joint") for change in changes]
+    for scale in plausibility.joint_scales(selection.fit):
+        if scale.values["joint"] not in with_factor:
+            notes.append(scale)
     notes += image_notes(selection.fit)
     return notes
 

@@ -23,7 +23,7 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import lines_of
-from calib.procedure.kinematic_stage import fit_tables
+from calib.procedure.kinematic_stage import fit_tables, mastering
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import Inputs, plain_reference
 from calib.procedure.kinematic_stage.metrics import SCHEMA, Findings, FitMetrics, ValidationMetrics
@@ -63,6 +63,7 @@ OURS = (
     RESIDUALS,
     TERMS,
     FORMULA,
+    mastering.MASTERING,
     REPORT,
     *PAGES,
     METRICS,
@@ -245,6 +246,7 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
     robot = outcome.robot
     frames = installation.frame_tables(fit.cell)
     calibrated.write(folder, robot, frames, _record(outcome), f"calibrated from {source}")
+    mastering.write(folder, outcome)
     urdfs = {URDF: robot.chain}
     if robot.corrections is not None:
         urdfs[CORRECTED_URDF] = robot.corrections.chain

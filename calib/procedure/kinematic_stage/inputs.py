@@ -7,15 +7,18 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.images.pixels import Pixels
+from calib.data.joint_columns import joints_in
 from calib.data.poses import JOINTS, is_image_folder
 from calib.data.poses.columns import Undecided
 from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
-from calib.errors import CalibError, MeasurementError, UsageError, require
+from calib.errors import CalibError, Finding, MeasurementError, UsageError, require
 from calib.extensions import Point
-from calib.geometry.first_guess import as_seen_by_instrument, check_orientations, check_scale
+from calib.geometry.checks.pose_direction import as_seen_by_instrument
+from calib.geometry.checks.readings import without_unseen
+from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
 from calib.geometry.repeatability import repeated, repeated_rows, without_copies
@@ -67,6 +70,7 @@ class Inputs:
         earlier: the robot with the results of an earlier fit, as its file contains them; None for a URDF.
         masses: (n, 10) identified standard parameters, from which gravity torques are computed; None: parameters of the
             robot's description.
+        noticed: findings on readings that were left out, since the instrument did not see the target.
     """
 
     chain: Chain
@@ -76,6 +80,7 @@ class Inputs:
     notes: tuple[str, ...] = ()
     earlier: CalibratedChain | None = None
     masses: np.ndarray | None = None
+    noticed: tuple[Finding, ...] = ()
 
     @property
     def weighed(self) -> Chain:
@@ -162,9 +167,12 @@ def gather(
     notes = remarks(chain)
     unseen: dict[str, Unseen] = {}
     fitted_blocks = []
+    noticed: list[Finding] = []
     for block in _with_station_and_tool_names(read_blocks, options, settings.stations, settings.tools):
         block, copy_notes = without_copies(block)
         notes += tuple(copy_notes)
+        block, unseen_readings = without_unseen(weighed, block, "copies" in options.accept)
+        noticed += unseen_readings
         fitted, held_out = hold_out(block, settings.holdout, settings.seed)
         fitted_blocks.append(fitted)
         if held_out is not None:
@@ -172,7 +180,7 @@ def gather(
 
     if masses is not None:
         notes += (f"gravity torques of the compliance are those of the masses identified in {settings.masses}",)
-    inputs = Inputs(chain, robot_file, tuple(fitted_blocks), unseen, notes, earlier, masses)
+    inputs = Inputs(chain, robot_file, tuple(fitted_blocks), unseen, notes, earlier, masses, tuple(noticed))
     inputs = with_unseen(inputs, validate, options, settings)
     if earlier is None or earlier.corrections is None:
         return inputs
@@ -198,6 +206,7 @@ def with_unseen(
     """
     unseen = dict(inputs.unseen)
     notes: list[str] = []
+    noticed = list(inputs.noticed)
     fit_files = {Path(block.file).resolve() for block in inputs.fit}
     for source in validate:
         fitted = _path(source).resolve() in fit_files
@@ -205,6 +214,8 @@ def with_unseen(
             if fitted:
                 notes.append(f"{block.file} is also a fit file, so its errors do not count as validation")
             name = _free_name(unseen, block.file)
+            block, unseen_readings = without_unseen(inputs.weighed, block, "copies" in options.accept)
+            noticed += unseen_readings
             if settings.refit_frames:
                 unseen[name] = Unseen(block, own_frames=True, seen=fitted)
             else:
@@ -216,7 +227,8 @@ def with_unseen(
     for name, rows in unseen.items():
         if name in copied and not rows.held_out:
             unseen[name] = replace(rows, seen=True)
-    return replace(inputs, unseen=unseen, notes=(*inputs.notes, *notes, *copy_notes))
+    notes = [*inputs.notes, *notes, *copy_notes]
+    return replace(inputs, unseen=unseen, notes=tuple(notes), noticed=tuple(noticed))
 
 
 def plain_reference(nominal: Installation, inputs: Inputs) -> Installation | None:
@@ -264,6 +276,8 @@ def load_robot(
         header = joint_columns(table)
         columns = dict.fromkeys([*header, *options.for_file(measured).columns])
         names = [column for column in columns if column in joints and joints[column].actuated]
+        if not names:
+            names = joints_in(header, [name for name, joint in joints.items() if joint.actuated])
         # numbered columns hold more joints than are named
         if f"q{len(names) + 1}" in header:
             names = []

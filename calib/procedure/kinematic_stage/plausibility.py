@@ -20,7 +20,7 @@ from calib.geometry.diagnosis import Scale, length_factor, scale_of, wrong_angle
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.cross_validation import JUDGED_POSES
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
-from calib.geometry.observation import sampled
+from calib.geometry.observation import layout, sampled
 from calib.geometry.weighing import GeometricFit
 from calib.procedure.findings import level_of, limit
 from calib.procedure.kinematic_stage.metrics import Outlier
@@ -36,6 +36,14 @@ HALF = 0.5
 # changes of a healthy arm's elements: [rad], and as a share of the reach (our choice)
 MAX_TURN = 0.1
 MAX_SHIFT = 0.03
+# what sets the scale of images, in messages
+SQUARES = " (square size of the board)"
+# σ from which on a joint's scale is named, and the least scale that is: other effects of a turning joint leave a slope,
+# too, and a gear with another number of teeth is off by more (our choice)
+SURE_SCALE = 5.0
+LEAST_SCALE = {"prismatic": 5e-5, "revolute": 2e-3}
+# of a rigid misfit, where the data name none
+USUAL_CAUSES = "flexibility, gear errors or a moved target"
 # number of images by which the scale is judged
 MAX_IMAGES = 100
 
@@ -70,7 +78,15 @@ def misfit(selection: ModelSelection, reach: float) -> Finding | None:
     if min(rigid.cross_validated, fitted) <= healthy:
         return None
     left = selection.cross_validated / healthy
-    return finding("rigid-misfit", rms=fitted, folds=rigid.cross_validated, reach=reach, healthy=healthy, left=left)
+    return finding(
+        "rigid-misfit",
+        rms=fitted,
+        folds=rigid.cross_validated,
+        reach=reach,
+        healthy=healthy,
+        left=left,
+        causes=USUAL_CAUSES,
+    )
 
 
 def gross_rows(selection: ModelSelection, robust: ModelSelection, reach: float) -> Finding | None:
@@ -93,6 +109,28 @@ def gross_rows(selection: ModelSelection, robust: ModelSelection, reach: float) 
         rms=min(rung.cross_validated for rung in robust.rungs),
         left=selection.cross_validated / (FLOOR * reach),
     )
+
+
+def joint_scales(fit: GeometricFit) -> list[Finding]:
+    """Return findings on joints whose fitted coupling with themselves is a scale of their readings.
+
+    Args:
+        fit: the fit, with its joint corrections.
+    """
+    cell = fit.cell
+    first = len(layout(cell).names) - len(cell.deflection.terms)
+    variance = dict(zip(fit.free.tolist(), np.diag(fit.estimate.covariance)))
+    findings = []
+    coefficients = np.asarray(cell.deflection.coefficients)
+    for number, (term, scale) in enumerate(zip(cell.deflection.terms, coefficients)):
+        joint = cell.chain.joints[term.source]
+        own_element = cell.chain.names[cell.chain.moving[term.source]]
+        sigma = np.sqrt(variance.get(first + number, 0.0))
+        is_own_scale = term.basis == "joint" and term.element == own_element
+        if is_own_scale and abs(scale) > max(LEAST_SCALE[joint.kind], SURE_SCALE * sigma):
+            code = "rail-scale" if joint.kind == "prismatic" else "gear-scale"
+            findings.append(finding(code, joint=joint.name, size=1e6 * scale, sigma=1e6 * sigma))
+    return findings
 
 
 def _position_rms(fit: GeometricFit) -> float:
@@ -176,9 +214,10 @@ def findings(
     # A wrong scale is looked for where it leaves an error that an arm may have.
     scale = scale_of(nominal, sample)
     if scale is not None and before * np.sqrt(1.0 - scale.explained) < limit("unexplained", "share") * reach:
-        scale_findings = _wrong_scale(("scale-of-another-robot", "scale"), scale)
+        board = SQUARES if any(isinstance(block, Pixels) for block in blocks) else ""
+        scale_findings = _wrong_scale(("scale-of-another-robot", "scale"), scale, board)
         if not scale_findings:
-            scale_findings = _wrong_scale(("lengths-of-another-robot", "lengths-grew"), length_factor(fit))
+            scale_findings = _wrong_scale(("lengths-of-another-robot", "lengths-grew"), length_factor(fit), board)
         result += scale_findings
     return list(filter(level_of, result))
 
@@ -274,18 +313,24 @@ def _large_changes(fit: GeometricFit, reach: float) -> list[Finding]:
     return [finding("moved", elements=[text for _, text in large], times=largest_change)]
 
 
-def _wrong_scale(codes: tuple[str, str], scale: Scale | None) -> list[Finding]:
+def _wrong_scale(codes: tuple[str, str], scale: Scale | None, board: str) -> list[Finding]:
     """Return a finding on an implausible scale factor; an empty list if the factor is plausible.
 
     Args:
         codes: two codes of findings; the first one that reaches a level of the catalogue is used.
         scale: the scale factor; None: unknown.
+        board: what else sets the scale of images; empty for other instruments.
     """
     if scale is None:
         return []
     off = abs(scale.factor - 1.0)
     values = asdict(scale)
-    values |= {"off": off, "surely_off": off - 3.0 * scale.sigma, "sigmas": off / max(scale.sigma, 1e-300)}
+    values |= {
+        "board": board,
+        "off": off,
+        "surely_off": off - 3.0 * scale.sigma,
+        "sigmas": off / max(scale.sigma, 1e-300),
+    }
     for code in codes:
         wrong_scale = finding(code, **values)
         if level_of(wrong_scale):

@@ -12,6 +12,7 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pose_files import read_measurements
 from calib.data.schema import Joints
 from calib.errors import CalibError
+from calib.geometry.checks.pose_direction import as_seen_by_instrument
 from calib.geometry.first_guess import CHECKED_ROWS, contradiction
 from calib.records import evenly
 from calib.robot.chain import Chain
@@ -38,17 +39,18 @@ def decided(chain: Chain, undecided: Undecided, joints: Joints) -> list[PoseMeas
     readings = []
     faults: list[CalibError] = []
     for says, options, block in _readings(table.where(few), undecided.choices, joints, faults):
-        scores.append(contradiction(chain, block))
+        # a camera on the arm measures the inverse
+        scores.append(contradiction(chain, as_seen_by_instrument(chain, block)))
         readings.append((says, options))
     if not scores and faults:
         raise faults[0]
     if not scores or min(scores) > 1.0:
         raise undecided
-    best, *others = np.argsort(scores, kind="stable").tolist()
-    if others and scores[others[0]] < MIN_RATIO * scores[best]:
+    best, *rivals = np.argsort(scores, kind="stable").tolist()
+    if rivals and scores[rivals[0]] < MIN_RATIO * scores[best]:
         raise undecided
     says, options = readings[best]
-    note = f"read with {says}: the arm agrees with this reading and contradicts the {len(others)} others"
+    note = f"read with {says}: the arm agrees with this reading and contradicts the {len(rivals)} others"
     blocks = read_measurements(table, joints, options)
     return [replace(block, notes=(note, *block.notes)) for block in blocks]
 

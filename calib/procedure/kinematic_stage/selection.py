@@ -255,10 +255,10 @@ def _feasible_candidates(
         q = read_poses(source, joints_of(chain))
     numbers = np.flatnonzero(is_feasible(space, q))
     if len(numbers) < m:
-        outside = int(((q < space.lower) | (q > space.upper)).any(axis=1).sum())
+        exceeding = int(((q < space.lower) | (q > space.upper)).any(axis=1).sum())
         raise UsageError(
-            f"candidates: {len(numbers)} of {len(q)} keep the constraints, and {m} are to be chosen: {outside} exceed "
-            "the joint limits [rad or m]; give more candidates, or loosen the constraints"
+            f"candidates: {len(numbers)} of {len(q)} keep the constraints, and {m} are to be chosen: {exceeding} "
+            "exceed the joint limits [rad or m]; give more candidates, or loosen the constraints"
         )
     return q, numbers
 

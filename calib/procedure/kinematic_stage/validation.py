@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import Finding, finding
+from calib.geometry.checks.file_change import changed_since_fit
 from calib.geometry.error_model import ErrorModel
 from calib.geometry.fit import without_corrections
 from calib.geometry.installation import Installation
@@ -142,7 +143,7 @@ def judge(
     if worst is None:
         return Verdict.of("", [finding("no-unseen-poses"), *common])
     if frames_only:
-        return _frames_verdict(worst, tolerance, arm, common)
+        return _frames_verdict(worst, fitted_rms, tolerance, arm, common)
 
     # Grossly wrong unseen rows refute no promise of the fit.
     if gross:
@@ -154,19 +155,23 @@ def judge(
     return verdict
 
 
-def _frames_verdict(worst: _Proof, tolerance: float | None, arm: str, findings: Sequence[Finding]) -> Verdict:
+def _frames_verdict(
+    worst: _Proof, fitted_rms: float, tolerance: float | None, arm: str, findings: Sequence[Finding]
+) -> Verdict:
     """Return the verdict if only base and tool placement (frames) were fitted.
 
     With a tolerance it is pass or follows from the findings; without a tolerance it is not judged.
 
     Args:
         worst: the errors on which the verdict is based.
+        fitted_rms: rms error on the fitted poses [m].
         tolerance: largest acceptable rms on held-out poses [m]; None if not stated.
         arm: name of the deliverable if there are several; otherwise empty.
         findings: findings on these errors.
     """
     if tolerance is not None:
-        return Verdict.of(_figures(worst, arm, tolerance), findings)
+        above = finding("fitted-above-tolerance", rms=fitted_rms, tolerance=tolerance, times=fitted_rms / tolerance)
+        return Verdict.of(_figures(worst, arm, tolerance), [*findings, above])
     verdict = Verdict.of(sentence(finding("frames-only", rms=worst.after, where=worst.where)), findings)
     if verdict.level == "pass":
         return replace(verdict, level=NOT_JUDGED)
@@ -434,14 +439,19 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
     for name, rows in validation.items():
         noticed += filter(level_of, _references(name, rows, deliverable, frames_only))
     noticed += findings.noticed
+    noticed += inputs.noticed
     copies = _copies(inputs)
     if copies:
         noticed.append(finding("not-unseen", files=copies))
+    fitted_files = {block.file for block in inputs.fit}
     usual = np.inf
     if len(fitted.errors[0].main):
         usual = float(np.median(fitted.errors[0].main))
     for name, rows in validation.items():
         noticed += _noticed(name, rows, usual)
+        others = [block for block in rows.blocks if block.file not in fitted_files]
+        if rows.shares_frames and rows.proves and others:
+            noticed += changed_since_fit(rows.cells[1], others, fitted.errors[1].rms)
 
     notes = [*inputs.notes]
     for block in inputs.fit:

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.errors import counted
 from calib.geometry.accuracy import ErrorStatistics, rms_sigma
+from calib.geometry.model_choice.ladder import MAX_RESIDUAL
 from calib.geometry.repeatability import RepeatedPose
 from calib.procedure.findings import as_notes
 from calib.procedure.kinematic_stage.comparison import iso9283_sentence
@@ -451,7 +453,13 @@ def outlier_sentences(metrics: FitMetrics) -> list[str]:
     treatment = "kept in the fit"
     if metrics.findings and metrics.findings.loss not in ("", "none"):
         treatment = f"weight reduced by the {metrics.findings.loss} loss"
-    return [f"{len(rows)} rows beyond 4 robust sigma, {treatment}: {worst}"]
+    lines = [f"{counted(len(rows), 'row')} beyond 4 robust sigma, {treatment}: {worst}"]
+    if max(outlier.sigmas for outlier in metrics.outliers) > MAX_RESIDUAL:
+        lines.append(
+            "were these rows measured wrongly (beam lost, an earlier point read again)? Correct them or leave them "
+            "out; errors on fitted poses include them"
+        )
+    return lines
 
 
 def _identifiability(report: Report) -> list[str]:

@@ -15,7 +15,7 @@ from rich.text import Text
 from calib.arguments import checked
 from calib.config import parse
 from calib.config_types import ParsedTable
-from calib.controllers.table import check_controller
+from calib.controllers.axes import check_controller
 from calib.data.csv_table import read_table
 from calib.data.poses import IMAGES
 from calib.errors import UsageError, command_line, require
@@ -342,7 +342,7 @@ def new_session(
     require(dynamics or device.measures != NOTHING, words, UsageError)
     chain = load(robot, base or None, tip or None)
     if program:
-        check_controller(program, chain.n)
+        check_controller(program, chain.joints)
     of_instrument: dict[str, object] = {**asdict(device), "reference": reference}
     if tool is not None:
         of_instrument["tool"] = [*map(float, tool)]

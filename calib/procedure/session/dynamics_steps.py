@@ -75,7 +75,7 @@ def options_of(session: Session) -> IdentifyOptions:
     for path in session.brought("training", "unseen"):
         labels = labels_in(path.stem, payloads)
         if labels:
-            default = FileSettings(options.every.recording, options.every.filter)
+            default = FileSettings(options.every.recording, options.every.filter, columns=options.every.columns)
             by_file[path.name] = replace(by_file.get(path.name, default), payload=labels)
     return replace(options, settings=settings, files=by_file)
 

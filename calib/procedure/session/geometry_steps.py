@@ -65,7 +65,7 @@ CAMERA_ADVICE = "add [camera] to the limits file, see `calib formats constraints
 # [rad or m]: joints closer to the commanded ones were not read back
 MIN_READBACK_DIFFERENCE = 1e-8
 
-WRITE_PROGRAM: Point[Callable[[Path, Path, str], object]] = Point(
+WRITE_PROGRAM: Point[Callable[[Path, Path, str, Sequence[str]], object]] = Point(
     "write_program", "files of a program of the poses in a CSV"
 )
 
@@ -162,11 +162,11 @@ def _write_pose_lists(session: Session, chain: Chain, q: np.ndarray) -> int:
     lists = {folder.POSES: q}
     if session.settings.poses.validation:
         lists[folder.UNSEEN] = _random_poses(session, chain, session.settings.poses.validation)
-    controller = session.settings.robot.controller
+    robot = session.settings.robot
     for name, joints in lists.items():
         path = write_poses(session.path(f"2-poses/{name}"), joints, chain.joint_names, joint_kinds(chain))
-        if controller:
-            WRITE_PROGRAM.one()(path, path.with_suffix(""), controller)
+        if robot.controller:
+            WRITE_PROGRAM.one()(path, path.with_suffix(""), robot.controller, robot.external)
     return len(lists.get(folder.UNSEEN, ()))
 
 

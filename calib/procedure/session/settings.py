@@ -95,6 +95,7 @@ class RobotSection:
         base: URDF: first link of the arm; empty: the root
         tip: URDF: last link of the arm; empty: its flange
         controller: whose program of the poses is written beside them, as krl; see `calib program --list`
+        external: joints that are the controller's external axes, where names and kinds do not tell
     """
 
     file: Annotated[Name, Checked(_beside)]
@@ -102,6 +103,7 @@ class RobotSection:
     base: Text = ""
     tip: Text = ""
     controller: Text = ""
+    external: tuple[Name, ...] = ()
 
 
 @strict

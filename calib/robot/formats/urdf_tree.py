@@ -41,6 +41,7 @@ class DescriptionReader(Protocol):
 DESCRIPTIONS: Point[DescriptionReader] = Point("descriptions", "readers of robots' descriptions that are no URDF")
 
 XACRO = "this is a xacro file; rename it to end in .xacro (robot.urdf.xacro)"
+_LATE_DECLARATION = re.compile(r"(?P<blank>\s+)(?P<declaration><\?xml[^>]*\?>)")
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
@@ -104,7 +105,7 @@ def text(path: str | Path) -> tuple[str, str]:
     """
     room = converter(path)
     if room is not None:
-        return room.urdf(str(path)), "utf-8"
+        return declaration_first(room.urdf(str(path))), "utf-8"
     with refused_as(RobotError, OSError, f"cannot read {path}: {{}}"):
         data = Path(path).read_bytes()
     declaration = _DECLARED.match(data)
@@ -114,12 +115,40 @@ def text(path: str | Path) -> tuple[str, str]:
         encoding = "utf-16"
     else:
         encoding = "utf-8"
+    if encoding.lower() in ("utf-8", "utf8"):
+        return declaration_first(decoded(data)), encoding
     with refused_as(RobotError, (LookupError, UnicodeError), f"{path}: not readable as {encoding}: {{}}"):
         content = data.decode(encoding)
         # Python knows encodings that it cannot write.
         content.encode("utf-8")
         content.encode(encoding)
-        return content, encoding
+        return declaration_first(content), encoding
+
+
+def decoded(data: bytes) -> str:
+    """Return text that should be UTF-8; bytes that are not are taken as Latin-1, as CAD programs write undeclared.
+
+    Args:
+        data: bytes of the file.
+    """
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        return data.decode("latin-1")
+
+
+def declaration_first(content: str) -> str:
+    """Return an XML text with its declaration before the blank lines with which the file begins.
+
+    XML allows nothing before the declaration. The numbers of all other lines stay.
+
+    Args:
+        content: text of the file.
+    """
+    match = _LATE_DECLARATION.match(content)
+    if match is None:
+        return content
+    return match["declaration"] + match["blank"] + content[match.end() :]
 
 
 def parse(source: str, where: str) -> Node:

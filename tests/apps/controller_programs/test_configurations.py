@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from calib.apps.controller_programs.configurations import configuration_of, has_spherical_wrist, postures, signs_at
+from calib.controllers.axes import plain_axes
 from calib.controllers.table import controller_named
 from calib.geometry.installation import Installation
 from calib.geometry.inverse import Goal
@@ -70,7 +71,7 @@ def m20ia(request):
 def test_real_configuration_matches_joints(m20ia):
     """CURPOS.DG of an R-30iA: joints 86.75 -45.63 -10.99 56.19 -81.55 -94.01, CFG N U T, 0, 0, 0."""
     controller = controller_named("fanuc")
-    q = controller.described(np.radians([[86.75, -45.63, -10.99, 56.19, -81.55, -94.01]]))
+    q = plain_axes(6).uncoupled(controller, np.radians([[86.75, -45.63, -10.99, 56.19, -81.55, -94.01]]))
     configuration = configuration_of(controller, "N U T 0 0 0")
     assert configuration is not None and configuration.holds(controller, m20ia[0], q)[0]
     flipped = configuration_of(controller, "F U T 0 0 0")

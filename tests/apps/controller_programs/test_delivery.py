@@ -8,7 +8,8 @@ import pytest
 
 from calib import cli
 from calib.apps.controller_programs.delivery import delivery_text
-from calib.controllers.table import as_described, controller_named, controllers
+from calib.controllers.axes import as_described
+from calib.controllers.table import controller_named, controllers
 from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.robot.kinematics import forward
 from calib.robot.library import load
@@ -35,7 +36,7 @@ def test_nominal_frames_fit_as_metrics_say(fit):
     """The frames of the nominal arm fit as its metrics say."""
     folder, q, seen = fit
     out = delivery_text(folder, controller_named("ros2"))
-    assert "Users cannot master the axes" in out and "Mastering, " not in out
+    assert "Users cannot master the axes" in out and "Mastering of a fit" not in out
     form = " ".join(["xyz", *[NUMBER] * 3]) + ", rpy " + " ".join([NUMBER] * 3)
     found = [from_xyz_rpy(v[:3], v[3:]) for v in np.array(re.findall(form, out), float)]
     points = (invert(found[1]) @ forward(load("ur5"), q) @ found[0])[:, :3, 3]
@@ -47,7 +48,7 @@ def test_offsets_and_frames_fit_better(fit):
     """Offsets, and the frames beside them, fit better."""
     folder, q, seen = fit
     out = delivery_text(folder, controller_named("krl"))
-    mastered = out.partition("Mastering, ")[2]
+    mastered = out.partition("Mastering of a fit of joint offsets alone: ")[2]
     offsets = np.radians(np.array(re.findall(r"shown angle ([-+]\d+\.\d+) deg", mastered), float))
     names = "".join(rf"{name} {NUMBER}[,}}]" for name in "XYZABC")
     frames = np.array(re.findall("{" + names, mastered), float)

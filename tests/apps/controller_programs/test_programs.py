@@ -13,7 +13,8 @@ from calib import cli
 from calib.apps.controller_programs.program import joints_in, joints_table, program_files
 from calib.apps.controller_programs.program_settings import CSV, ProgramSettings
 from calib.apps.controller_programs.targets import read_program
-from calib.controllers.table import check_controller, controller_named, controllers
+from calib.controllers.axes import check_controller, plain_axes
+from calib.controllers.table import controller_named, controllers
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.pose_files import read_measurements
 from calib.data.recordings.recording_files import read_recording
@@ -22,6 +23,7 @@ from calib.errors import MeasurementError, UsageError
 from calib.procedure.session import geometry_steps
 from calib.procedure.session.folder import open_session
 
+PULSES = (1341.4, 1341.4, 1341.4, 1000.0, -1000.0, 622.0)
 Q = np.radians(np.random.default_rng(3).uniform(-170.0, 170.0, (7, 6)))
 READABLE = [name for name, each in controllers().items() if each.joints]
 
@@ -47,9 +49,12 @@ def test_a_program_reads_back_as_its_poses(tmp_path, name, output):
     one = controller_named(name)
     if output is not None and not one.outputs:
         return
-    path = next(path for suffix, path in written(tmp_path, name, output=output).items() if suffix != ".pgx")
-    q, _ = joints_in(path, name)
+    pulses = PULSES if one.pulses else ()
+    files = written(tmp_path, name, output=output, pulses=pulses)
+    path = next(path for suffix, path in files.items() if suffix != ".pgx")
+    q, _ = joints_in(path, name, ProgramSettings(pulses=pulses))
     rounding = 0.5 * 10.0**-one.decimals * (np.pi / 180 if one.unit == "deg" else 1.0)
+    rounding /= min(map(abs, pulses), default=1.0)
     assert np.abs(q - Q).max() <= 2.01 * rounding, "a coupled axis carries the rounding of two"
 
 
@@ -107,8 +112,8 @@ def test_what_controller_refuses_is_named(tmp_path):
     with pytest.raises(MeasurementError, match="has no complete targets"):
         read_program(tmp_path / "empty.src")
     (tmp_path / "rail.csv").write_text("rail [mm],joint1 [deg]\n1,2\n")
-    with pytest.raises(UsageError, match=r"not lengths: rail"):
-        program_files(tmp_path / "rail.csv", tmp_path / "cal", "ros2")
+    with pytest.raises(UsageError, match=r"of which rail slide.* takes 6 turning joints or the four of a SCARA"):
+        program_files(tmp_path / "rail.csv", tmp_path / "cal", "krl")
     (tmp_path / "plain.csv").write_text("q1,q2\n1,2\n")
     with pytest.raises(UsageError, match="no column of joint angles"):
         program_files(tmp_path / "plain.csv", tmp_path / "cal", CSV)
@@ -195,7 +200,7 @@ def test_fanuc_log_has_description_joints(tmp_path):
     """A log of a Fanuc is read as the description's joints."""
     t = np.arange(400) / 100.0
     q = 0.5 * np.sin(t[:, None] * np.arange(1, 7))
-    shown = controller_named("fanuc").shown(q)
+    shown = plain_axes(6).shown(controller_named("fanuc"), q)
     head = ["t", *(f"q{k + 1} [deg]" for k in range(6)), *(f"tau{k + 1}" for k in range(6))]
     with (tmp_path / "log.csv").open("w", newline="") as file:
         csv.writer(file).writerows([head, *np.column_stack([t, shown, q]).tolist()])
@@ -207,7 +212,7 @@ def test_fanuc_log_has_description_joints(tmp_path):
 @pytest.mark.parametrize("joint", ["q", "J"])
 def test_fanuc_poses_have_description_joints(tmp_path, joint):
     """From our columns, and from RoboDK's."""
-    shown = controller_named("fanuc").shown(Q)
+    shown = plain_axes(6).shown(controller_named("fanuc"), Q)
     unit = " [deg]" if joint == "q" else ""
     head = [*(f"{joint}{k + 1}{unit}" for k in range(6)), *(("x [mm]", "y [mm]", "z [mm]") if unit else "XYZ")]
     with (tmp_path / "m.csv").open("w", newline="") as file:

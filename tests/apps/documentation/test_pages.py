@@ -128,10 +128,12 @@ def test_notebooks_are_kept_without_outputs() -> None:
 
 
 def test_command_finds_built_pages(tmp_path, monkeypatch, capsys) -> None:
-    """The command finds the built pages, or says how to build them."""
+    """The command finds the built pages, or lists the topics and says how to build them."""
     monkeypatch.setattr(commands, "CLONE", tmp_path / "elsewhere")
     monkeypatch.chdir(tmp_path)
-    assert cli.run(["docs"]) == 2 and "python docs/build.py" in capsys.readouterr().err
+    assert cli.run(["docs"]) == 0
+    out = capsys.readouterr().out
+    assert "python docs/build.py" in out and "calib docs tracker " in out
     page = tmp_path / "docs/_build/html/index.html"
     page.parent.mkdir(parents=True)
     page.touch()
@@ -142,3 +144,15 @@ def test_command_finds_built_pages(tmp_path, monkeypatch, capsys) -> None:
 @pytest.mark.parametrize("page", [page for page in PAGES if "<!-- slow -->" in page.read_text(encoding="utf-8")])
 def test_slow_blocks_run(page: Path, tmp_path: Path) -> None:
     assert blocks.run(page, tmp_path / "run", slow=True).complaints == []
+
+
+@pytest.mark.parametrize("topic", commands.pages())
+def test_a_page_is_shown_where_no_pages_are_built(topic, capsys) -> None:
+    """Each page is shown as its text, without directives of the builder."""
+    assert cli.run(["docs", topic]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("# ") and "```{" not in out
+
+
+def test_a_topic_that_is_not_there_is_said(capsys) -> None:
+    assert cli.run(["docs", "trakcer"]) == 2 and "did you mean 'tracker'" in capsys.readouterr().err

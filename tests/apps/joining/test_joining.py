@@ -10,6 +10,7 @@ from sessions import begin
 
 import calib
 from calib.cli import run
+from calib.controllers.axes import plain_axes
 from calib.controllers.table import controller_named
 from calib.data.csv_table import read_table
 from calib.data.poses.fit_options import FitOptions
@@ -142,7 +143,7 @@ def test_joints_as_a_controller_shows_them(tmp_path):
     robot = Path(__file__).parents[1] / "controller_programs/fanuc_m20ia.urdf"
     arm = load(robot)
     q = random_joints(arm, 30, 5)
-    shown = controller_named("fanuc").shown(q)
+    shown = plain_axes(6).shown(controller_named("fanuc"), q)
     joints = write(tmp_path / "j.csv", [f"q{k} [deg]" for k in range(1, 7)], shown)
     points = write(tmp_path / "p.csv", POINT, seen(arm, q))
     with pytest.raises(MeasurementError, match=r"its points fit the joints as FANUC.*state controller = \"fanuc\""):

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.data.images.board import Board, corners
-from calib.data.images.detection import detect
+from calib.data.images.detection import detect, detected
 from calib.data.images.images import decode, read_image
 from calib.data.images.lens import Lens
 from calib.data.images.pixels import Detection
@@ -125,3 +125,43 @@ def test_a_corrupt_file_is_refused(content, words, tmp_path):
         read_image(tmp_path / "bad.png")
     with pytest.raises(ValueError, match=words):
         decode(content)
+
+
+OLD = Board("charuco", 8, 6, 0.026, 0.018, "4x4_50", legacy=True)
+SEEN = {"old": OLD, "new": Board("charuco", 9, 7, 0.022, 0.015, "4x4_50"), "tags": BOARDS["apriltag"]}
+SEEN["chessboard"] = Board("chessboard", 10, 7, 0.02)
+
+
+def reasons(kind: str, **stated: object) -> tuple[str, str]:
+    """Return the reason why an image of a board is unusable with another board stated, and the notes."""
+    picture = render(SEEN[kind], LENS, placed(10.0, -10.0, 5.0, 0.4), None, 1)
+    found = detected([("1.png", picture)], replace(SEEN[kind], **stated))
+    return found.images["1.png"].problem, " ".join(found.notes)
+
+
+def test_the_old_charuco_pattern_is_read_and_named():
+    """A ChArUco board of OpenCV before 4.6 is read with its pattern, and the line for board.toml is said."""
+    problem, notes = reasons("old", legacy=False)
+    assert not problem and "OpenCV before 4.6" in notes and "legacy = true in board.toml" in notes
+    assert not "".join(reasons("old"))
+    old_board = cv2.aruco.CharucoBoard((8, 6), 0.026, 0.018, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+    old_board.setLegacyPattern(True)
+    picture = cv2.copyMakeBorder(old_board.generateImage((640, 480)), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
+    assert np.array_equal(detect(picture, OLD).seen, np.ones(35, dtype=bool))
+
+
+@pytest.mark.parametrize(
+    ("kind", "stated", "words"),
+    [
+        ("new", {"columns": 7, "rows": 9}, "columns and rows are exchanged; they fit columns = 9, rows = 7"),
+        ("new", {"columns": 8, "rows": 6}, "squares are counted, not inner corners; they fit columns = 9, rows = 7"),
+        ("new", {"columns": 6, "rows": 8}, "exchanged, and squares are counted"),
+        ("new", {"columns": 12, "rows": 5}, "they fit a board of 9 columns"),
+        ("old", {"columns": 7, "rows": 5, "legacy": False}, "they fit columns = 8, rows = 6, legacy = true"),
+        ("tags", {"columns": 3, "rows": 4}, "columns and rows are exchanged; they fit columns = 4, rows = 3"),
+        ("chessboard", {"columns": 9, "rows": 6}, "a chessboard of 10 x 7 squares is seen"),
+    ],
+)
+def test_a_board_stated_wrongly_is_named(kind, stated, words):
+    """Exchanged or inner counts in board.toml are named by where the markers are."""
+    assert words in reasons(kind, **stated)[0]

@@ -84,3 +84,68 @@ def test_lens_without_focal_length_refused():
     """A lens without focal length is refused."""
     with pytest.raises(CalibError, match="focal lengths -1, 1 px"):
         Lens("pinhole", np.array([-1.0, 1.0, 0, 0, 0, 0, 0, 0, 0]), SIZE)
+
+
+OPENCV = """%YAML:1.0
+---
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 780., 0., 400., 0., 782., 298., 0., 0., 1. ]
+dist_coeffs: !!opencv-matrix
+   rows: 1
+   cols: 5
+   dt: d
+   data: [ -0.2, 0.08, 0.0005, -0.0003, 0.02 ]
+"""
+OPENCV_XML = """<?xml version="1.0"?>
+<opencv_storage>
+<image_width>800</image_width><image_height>600</image_height>
+<cameraMatrix type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt>
+  <data>780. 0. 400. 0. 782. 298. 0. 0. 1.</data></cameraMatrix>
+<distCoeffs type_id="opencv-matrix"><rows>5</rows><cols>1</cols><dt>d</dt>
+  <data>-0.2 0.08 0.0005 -0.0003 0.02</data></distCoeffs>
+</opencv_storage>
+"""
+KALIBR = """cam0:
+  camera_model: pinhole
+  distortion_coeffs: [-0.2, 0.08, 0.0005, -0.0003]
+  distortion_model: radtan
+  intrinsics: [780.0, 782.0, 400.0, 298.0]
+  resolution: [800, 600]
+"""
+REALSENSE = (
+    '{"width": 800, "height": 600, "fx": 780.0, "fy": 782.0, "ppx": 400.0, "ppy": 298.0, '
+    '"model": "distortion.inverse_brown_conrady", "coeffs": [-0.2, 0.08, 0.0005, -0.0003, 0.02]}'
+)
+ZIVID = """CameraIntrinsics:
+  CameraMatrix: {CX: 400.0, CY: 298.0, FX: 780.0, FY: 782.0}
+  Distortion: {K1: -0.2, K2: 0.08, K3: 0.02, P1: 0.0005, P2: -0.0003}
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "k3"), [(OPENCV, 0.02), (OPENCV_XML, 0.02), (KALIBR, 0.0), (REALSENSE, 0.02), (ZIVID, 0.02)]
+)
+def test_lenses_of_other_programs(text, k3, tmp_path):
+    """Files of OpenCV, kalibr, RealSense and Zivid give the lens; a missing size is that of the images."""
+    path = tmp_path / "lens.yaml"
+    path.write_text(text)
+    lens = read_lens(path, SIZE)
+    assert lens.values == pytest.approx([*BASE, -0.2, 0.08, 5e-4, -3e-4, k3]) and lens.size == SIZE
+
+
+def test_fisheyes_and_odd_lenses(tmp_path):
+    """Fisheye models are told by their names; several lenses, and unknown models, are refused by name."""
+    path = tmp_path / "lens.yaml"
+    path.write_text(KALIBR.replace("radtan", "equidistant"))
+    assert read_lens(path).model == "fisheye"
+    for text, words in (
+        (KALIBR + KALIBR.replace("cam0", "cam1"), r"has 2 lenses \(cam0, cam1\)"),
+        (KALIBR.replace("radtan", "fov"), "distortion_model 'fov' is unknown"),
+        (OPENCV, "image_width: expected a number of pixels"),
+    ):
+        path.write_text(text)
+        with pytest.raises(MeasurementError, match=words):
+            read_lens(path)

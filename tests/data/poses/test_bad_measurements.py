@@ -179,6 +179,16 @@ def test_a_pose_outside_the_joint_limits(write, good):
     assert any("elbow is outside its limits" in note for note in block.notes)
 
 
+def test_lost_turn_and_other_zero_are_asked_for(write, good):
+    """A value that fits after a whole turn, and a column that fits after a right angle, say so."""
+    wound = write(POSE, put(5, 1, 6.0)(good))
+    refused(wound, r"\(-1 turn\) is inside: was the joint wound", 6, "q2", limits=WIDE)
+    first = good[0][1] + np.pi / 2
+    near = ([-2.9, good[0][1] - 0.1, -2.9], [2.9, good[0][1] + 0.1, 2.9])
+    turned = [[row[0], first + 0.01 * number, *row[2:]] for number, row in enumerate(good[:9])]
+    refused(write(POSE, turned), "another zero. With -90° all rows fit", 1, "q2", limits=near)
+
+
 def test_swapped_columns_show_in_the_limits(write, good):
     """Swapped joint columns show in the limits."""
     rows = [[row[0], 0.3 * abs(row[1]) - 2.9, *row[2:]] for row in good]

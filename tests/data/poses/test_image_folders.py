@@ -118,6 +118,18 @@ def test_stated_lens_is_kept_unless_fitted(folder):
     assert {"fx", "k1", "bend_xx"} <= set(fitted.free) and "scale" not in fitted.free
 
 
+def test_a_lens_under_another_name_is_read_and_said(folder):
+    """A lens file of any name is read, and said; two are refused, and a YAML without a lens is said."""
+    write_lens(LENS, folder / "left.yaml")
+    (folder / "notes.yaml").write_text("a: 1")
+    block = read(folder)
+    assert block.known and "the lens is read from left.yaml" in block.notes
+    assert any(note.startswith("notes.yaml is not read as a lens") for note in block.notes)
+    write_lens(LENS, folder / "right.yaml")
+    with pytest.raises(MeasurementError, match="several files with a lens"):
+        read(folder)
+
+
 def write_bag(path, compressed: bool, moving: int) -> None:
     """Write a ROS 2 bag: joint states at 100 Hz, an image at each stop, and one while the arm moves."""
     from rosbags.rosbag2 import StoragePlugin, Writer

@@ -9,7 +9,6 @@ from scipy.interpolate import CubicSpline
 
 from calib.dynamics import drives, rigid_body
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
-from calib.dynamics.tables import knots_of
 from calib.errors import CalibError, NotConverged
 from calib.identification.closed_loop import controllers, simulation
 from calib.identification.closed_loop.controllers import Reference
@@ -21,6 +20,7 @@ from calib.identification.closed_loop.simulation import (
     simulate,
     tracking_error,
 )
+from calib.identification.friction.function_tables import knots_of
 from calib.robot import description, library
 from calib.robot.chain import Chain
 from calib.simulation import known_robots

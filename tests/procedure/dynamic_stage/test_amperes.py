@@ -91,6 +91,7 @@ def test_identified_gains_are_kept(robot, tmp_path):
     rows = list(csv.DictReader((out / "drive_gains.csv").open()))
     np.testing.assert_allclose([float(row["gain [N m per A]"]) for row in rows], kept["values"], rtol=1e-9)
     assert json.loads((out / "dynamics.json").read_text())["unit"] == "N m"
+    assert {row["status"] for row in rows} == {"identified"}
 
 
 @pytest.mark.parametrize(

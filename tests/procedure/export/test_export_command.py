@@ -13,8 +13,12 @@ from robot_oracle import axis, joint, robot
 from without_figures import run
 
 from calib import export
-from calib.procedure.export.geometry import check_readback, export_offsets
-from calib.robot.calibrated import CalibratedChain, CorrectedChain, Deflection, Term
+from calib.data.poses.measurements import PoseMeasurements
+from calib.geometry.accuracy import errors
+from calib.geometry.first_guess import install
+from calib.geometry.fit import polish_frames
+from calib.procedure.export.geometry import check_readback
+from calib.procedure.kinematic_stage.mastering import read as read_mastering
 from calib.robot.formats import urdf
 from calib.robot.formats.urdf_write import write_new
 from calib.robot.kinematics import forward
@@ -89,27 +93,53 @@ def test_another_robots_urdf_is_refused(cell, calib, fitted):
     assert (code, "not describe the nominal robot" in err, Path("new.urdf").exists()) == (2, True, False)
 
 
-def test_offsets_are_what_a_controller_adds(cell, calib, fitted):
-    assert calib("export", fitted, "--offsets", "offsets.csv")[0] == 0
+def test_offsets_are_those_of_a_fit_of_offsets_alone(cell, calib, fitted):
+    """The table of a fit of the full geometry has the offsets of ``--model offsets``, and says so."""
+    code, out, _ = calib("export", fitted, "--offsets", "offsets.csv")
+    assert code == 0 and "of a fit of joint offsets alone: " in out
+    assert calib("fit", "source.urdf", "a.csv", "--model", "offsets", "--out", "alone")[0] == 0
     with Path("offsets.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    chain, nominal = load(fitted), load("source.urdf")
+    chain, nominal = load("alone"), load("source.urdf")
     assert [row["joint"] for row in rows] == list(chain.joint_names)
     for row, k in zip(rows, chain.moving):
-        assert float(row["add_to_reading"]) == pytest.approx(chain.values[k] - nominal.values[k], abs=1e-12)
+        assert float(row["add_to_reading"]) == pytest.approx(chain.values[k] - nominal.values[k], abs=1e-9)
         assert float(row["add_to_command"]) == -float(row["add_to_reading"])
     assert float(rows[0]["add_to_reading"]) == 0.0  # the first joint's offset cannot be told from the station
+    assert calib("export", "alone", "--offsets", "same.csv")[0] == 0
+    with Path("same.csv").open(newline="") as file:
+        for row, same in zip(rows, csv.DictReader(file), strict=True):
+            assert {key: float(row[key] or 0) for key in row if key not in ("joint", "unit")} == pytest.approx(
+                {key: float(same[key] or 0) for key in row if key not in ("joint", "unit")}, rel=1e-4, abs=1e-9
+            )
 
 
-def test_offsets_have_sigmas_of_geometry(tmp_path):
-    """Offsets beside corrections have the sigmas of the geometry without them."""
-    chain = load("ur5")
-    moved = CorrectedChain(chain, Deflection((Term("theta2", "cos", 1, 1),), np.array([1e-3]), chain))
-    covariance = np.diag(np.arange(1.0, len(chain.elements) + 1.0)) * 1e-8
-    export_offsets(CalibratedChain(chain, chain, covariance, moved), tmp_path / "offsets.csv")
-    with (tmp_path / "offsets.csv").open(newline="") as file:
-        sigmas = [float(row["sigma"]) for row in csv.DictReader(file)]
-    np.testing.assert_allclose(sigmas, np.sqrt(1e-8 * (chain.moving + 1.0)))
+def test_offsets_serve_the_nominal_arm_better_than_those_of_the_full_geometry(cell, calib, fitted):
+    """The true arm errs less from the nominal one with these offsets than with those of the full geometry."""
+    nominal, full = load("source.urdf"), load(fitted)
+    mastering = read_mastering(fitted)
+    only_offsets = nominal.values.copy()
+    only_offsets[full.moving] = full.values[full.moving]
+    q = np.random.default_rng(8).uniform(-2.0, 2.0, (200, 6))
+    truth = PoseMeasurements.of(q, forward(cell.truth, q)[:, :3, 3])
+
+    def error(chain):
+        start = install(chain, [truth])
+        return errors(polish_frames(start, [truth]).cell, [truth]).rms
+
+    full_offsets = error(nominal.with_values(only_offsets))
+    assert error(mastering.cell.chain) < min(full_offsets, error(nominal))
+
+
+def test_offsets_are_left_out_with_the_reason(cell, calib, fitted):
+    """Where frames alone were fitted there are no offsets: the export says so, and is still one."""
+    assert calib("fit", "source.urdf", "a.csv", "--model", "frames", "--out", "placed")[0] == 0
+    code, out, _ = calib("export", "placed", "--urdf", "source.urdf", "--into", "robot")
+    assert code == 0 and "joint_offsets.csv: left out: offsets of the full geometry would be wrong" in out
+    assert not Path("robot/joint_offsets.csv").exists() and Path("robot/robot.urdf").exists()
+    assert calib("export", "placed", "--urdf", "source.urdf", "--into", "robot", "--overwrite")[0] == 0
+    code, _, err = calib("export", "placed", "--offsets", "offsets.csv")
+    assert code == 2 and "--model offsets" in err
 
 
 def test_ur_kinematics_keep_calibrated_poses(cell, calib, fitted):

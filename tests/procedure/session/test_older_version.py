@@ -67,8 +67,8 @@ def test_older_fit_validates_to_its_verdict(cell: Path) -> None:
 
 def test_older_fit_exports_and_compensates(cell: Path, tmp_path: Path) -> None:
     """An older fit is exported, and compensates as it did."""
-    assert not run("export", cell / "4-fit", "--offsets", tmp_path / "joint_offsets.csv")
-    assert (tmp_path / "joint_offsets.csv").read_bytes() == (EXPECTED / "joint_offsets.csv").read_bytes()
+    # its offsets were those of the full geometry, and of no use alone
+    assert run("export", cell / "4-fit", "--offsets", tmp_path / "joint_offsets.csv") == 2
     where = ("--tool", "0.3,0.05,0.02", "--dof", 3, "--tolerance", "2,100")
     assert not run("compensate", cell / "4-fit", OLDER / "targets.csv", *where, "--out", tmp_path / "q.csv")
     for column in ("shoulder [deg]", "elbow [deg]", "left [mm]", "sigma [mm]"):

@@ -274,8 +274,13 @@ def test_file_encodings_and_byte_order_marks(tmp_path):
     with pytest.raises(RobotError, match=r"cannot read .*absent\.urdf: No such file"):
         urdf.read(tmp_path / "absent.urdf")
     (tmp_path / "d.urdf").write_bytes(source.encode("latin-1"))
-    with pytest.raises(RobotError, match="not readable as utf-8"):
-        urdf.read(tmp_path / "d.urdf")
+    assert urdf.read(tmp_path / "d.urdf").joint_names == ("gelénk",)
+    (tmp_path / "e.urdf").write_bytes(b"\r\n  \n" + source.encode())
+    assert urdf.read(tmp_path / "e.urdf").joint_names == ("gelénk",)
+    unknown = source.replace('version="1.0"', 'version="1.0" encoding="klingon"').encode()
+    (tmp_path / "f.urdf").write_bytes(unknown)
+    with pytest.raises(RobotError, match="not readable as klingon"):
+        urdf.read(tmp_path / "f.urdf")
 
 
 REAL = sorted(DATA.glob("*/*.urdf"))

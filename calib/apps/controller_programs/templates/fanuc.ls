@@ -29,7 +29,7 @@ TCD:  STACK_SIZE	= 0,
       BUSY_LAMP_OFF	= 0,
       ABORT_REQUEST	= 0,
       PAUSE_REQUEST	= 0;
-DEFAULT_GROUP	= 1,*,*,*,*;
+DEFAULT_GROUP	= 1,{{ '1' if group == 2 else '*' }},*,*,*;
 CONTROL_CODE	= 00000000 00000000;
 /MN
 {% for line in lines %}
@@ -42,9 +42,18 @@ P[{{ loop.index }}]{
 	UF : 0, UT : 1,	
 {% for three in pose|batch(3) %}
 {% set row = loop.index0 * 3 %}
-{{ "\t" }}{% for value in three %}J{{ row + loop.index }}= {{ "%9s"|format(value) }} deg{{ ",\t" if row + loop.index < pose|length }}{% endfor %}
+{{ "\t" }}{% for value in three %}J{{ row + loop.index }}= {{ "%9s"|format(value) }} {{ "%3s"|format(units[row + loop.index0]) }}{{ ",\t" if row + loop.index < pose|length or group == 1 }}{% endfor %}
 
 {% endfor %}
+{% if group == 2 %}
+   GP2:
+	UF : 0, UT : 1,	
+{% endif %}
+{% if group %}
+{% set letter = "EJ"[group - 1] %}
+{{ "\t" }}{% for value in external[loop.index0] %}{{ letter }}{{ loop.index }}= {{ "%9s"|format(value) }} {{ "%3s"|format(units[pose|length + loop.index0]) }}{{ ",\t" if not loop.last }}{% endfor %}
+
+{% endif %}
 };
 {% endfor %}
 /END

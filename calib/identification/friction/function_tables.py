@@ -31,32 +31,32 @@ MAX_SLOPE_ERROR = 1e-3
 STEP = 1e-6
 
 
-def knots_of(function: Function, slope: Function, lower: float, upper: float, what: str) -> np.ndarray:
+def knots_of(function: Function, slope: Function, lower: float, upper: float, title: str) -> np.ndarray:
     """Return knots (k, 3), each a place, the value and the slope there, that represent a function from lower to upper.
 
     Args:
         function, slope: the function and its derivative.
         lower, upper: range of the places.
-        what: name of the function for messages.
+        title: name of the function for messages.
 
     Raises:
         UsageError: the function or its slope has another shape or is not finite, the slope is not that of the function,
             or the function jumps.
     """
     span = upper - lower
-    near = np.concatenate([-NEAR_ZERO[::-1], [0.0], NEAR_ZERO]) * max(abs(lower), abs(upper))
-    near = near[(near > lower) & (near < upper)]
-    places = np.unique(np.concatenate([np.linspace(lower, upper, EVEN + 1), near]))
-    values = _evaluated(function, places, what, "function")
-    slopes = _evaluated(slope, places, what, "slope")
-    _check_slope(function, slope, places, what)
+    around_zero = np.concatenate([-NEAR_ZERO[::-1], [0.0], NEAR_ZERO]) * max(abs(lower), abs(upper))
+    around_zero = around_zero[(around_zero > lower) & (around_zero < upper)]
+    places = np.unique(np.concatenate([np.linspace(lower, upper, EVEN + 1), around_zero]))
+    values = _evaluated(function, places, title, "function")
+    slopes = _evaluated(slope, places, title, "slope")
+    _check_slope(function, slope, places, title)
     size = np.abs(values).max()
     if size == 0.0:
-        raise UsageError(f"{what}: the function is zero from {lower:.4g} to {upper:.4g}: it cannot be identified")
+        raise UsageError(f"{title}: the function is zero from {lower:.4g} to {upper:.4g}: it cannot be identified")
     while True:
         widths = np.diff(places)
-        inside = places[:-1, None] + widths[:, None] * INSIDE
-        exact = _evaluated(function, inside.ravel(), what, "function").reshape(inside.shape)
+        checked_places = places[:-1, None] + widths[:, None] * INSIDE
+        exact = _evaluated(function, checked_places.ravel(), title, "function").reshape(checked_places.shape)
         error = np.abs(_cubic(places, values, slopes) - exact).max(axis=1)
         wrong = error > TOLERANCE * size
         if not wrong.any():
@@ -65,23 +65,23 @@ def knots_of(function: Function, slope: Function, lower: float, upper: float, wh
         if narrow.any() or len(places) > MAX_KNOTS:
             k = int(np.argmax(np.where(wrong, error, 0.0)))
             raise UsageError(
-                f"{what}: the function changes by {abs(values[k + 1] - values[k]):.3g} between {places[k]:.6g} and "
+                f"{title}: the function changes by {abs(values[k + 1] - values[k]):.3g} between {places[k]:.6g} and "
                 f"{places[k + 1]:.6g}, too abruptly to be simulated: smooth it, for example sign(v) as tanh(v / 0.01)"
             )
         middles = 0.5 * (places[:-1] + places[1:])[wrong]
         order = np.argsort(np.concatenate([places, middles]), kind="stable")
         places = np.concatenate([places, middles])[order]
-        values = np.concatenate([values, _evaluated(function, middles, what, "function")])[order]
-        slopes = np.concatenate([slopes, _evaluated(slope, middles, what, "slope")])[order]
+        values = np.concatenate([values, _evaluated(function, middles, title, "function")])[order]
+        slopes = np.concatenate([slopes, _evaluated(slope, middles, title, "slope")])[order]
 
 
-def _evaluated(function: Function, places: np.ndarray, what: str, role: str) -> np.ndarray:
+def _evaluated(function: Function, places: np.ndarray, title: str, role: str) -> np.ndarray:
     """Return the values (m,) of a function at places (m,), checked for shape and finite numbers.
 
     Args:
         function: the function.
         places: where it is evaluated.
-        what: name of the function for messages.
+        title: name of the function for messages.
         role: ``function`` or ``slope``, for messages.
     """
     values = np.asarray(function(places), dtype=float)
@@ -89,39 +89,39 @@ def _evaluated(function: Function, places: np.ndarray, what: str, role: str) -> 
         values = np.full(len(places), float(values))
     if values.shape != places.shape:
         raise UsageError(
-            f"{what}: {role}: expected an array of shape {places.shape} for places of that shape, found "
+            f"{title}: {role}: expected an array of shape {places.shape} for places of that shape, found "
             f"{values.shape}; write it with numpy's functions"
         )
     if not np.isfinite(values).all():
         k = int(np.flatnonzero(~np.isfinite(values))[0])
-        raise UsageError(f"{what}: {role} is {values[k]} at {places[k]:.6g}: it must be finite in the joint's range")
+        raise UsageError(f"{title}: {role} is {values[k]} at {places[k]:.6g}: it must be finite in the joint's range")
     return values
 
 
-def _check_slope(function: Function, slope: Function, places: np.ndarray, what: str) -> None:
+def _check_slope(function: Function, slope: Function, places: np.ndarray, title: str) -> None:
     """Raise an error if `slope` differs from differences of `function` at more than a few places, such as kinks.
 
     Args:
         function, slope: the function and its stated derivative.
         places: (m,) places; compared is between them.
-        what: name of the function for messages.
+        title: name of the function for messages.
     """
     widths = np.diff(places)
     between = places[:-1] + 0.37 * widths
     step = STEP * widths
-    values = _evaluated(function, between, what, "function")
-    after = _evaluated(function, between + step, what, "function")
-    before = _evaluated(function, between - step, what, "function")
+    values = _evaluated(function, between, title, "function")
+    after = _evaluated(function, between + step, title, "function")
+    before = _evaluated(function, between - step, title, "function")
     difference = (after - before) / (2.0 * step)
-    stated = _evaluated(slope, between, what, "slope")
+    slopes_between = _evaluated(slope, between, title, "slope")
     rounding = 1e-15 * (np.abs(values) + np.abs(values).max()) / step
-    steepness = np.abs(np.diff(_evaluated(function, places, what, "function"))).sum() / widths.sum()
-    scale = np.maximum(np.abs(stated), np.abs(difference)) + MAX_SLOPE_ERROR * steepness
-    wrong = np.abs(stated - difference) > MAX_SLOPE_ERROR * scale + rounding
+    steepness = np.abs(np.diff(_evaluated(function, places, title, "function"))).sum() / widths.sum()
+    scale = np.maximum(np.abs(slopes_between), np.abs(difference)) + MAX_SLOPE_ERROR * steepness
+    wrong = np.abs(slopes_between - difference) > MAX_SLOPE_ERROR * scale + rounding
     if wrong.sum() > 2:
-        k = int(np.argmax(np.where(wrong, np.abs(stated - difference), 0.0)))
+        k = int(np.argmax(np.where(wrong, np.abs(slopes_between - difference), 0.0)))
         raise UsageError(
-            f"{what}: slope is {stated[k]:.6g} at {between[k]:.6g}, differences of the function give "
+            f"{title}: slope is {slopes_between[k]:.6g} at {between[k]:.6g}, differences of the function give "
             f"{difference[k]:.6g} ({int(wrong.sum())} of {len(wrong)} places differ): give its derivative"
         )
 

@@ -1,0 +1,676 @@
+"""Gravity from torques at rest: ``calib identify ROBOT poses.csv --out gravity``.
+
+A file with one row per standing pose (joints and torques, no stamps), or a log that stands at its poses, shows gravity
+and nothing else of the dynamics. What standing poses determine are the base parameters of the gravity regressor (first
+moments and masses), and a payload's mass and centre where one file is with it and one without::
+
+    [payload.tool]
+    [files."loaded.csv"]
+    payload = ["tool"]
+
+Friction holds a standing joint within ±Fs of its gravity torque. Without columns ``approach1`` … ``approachn`` (+1
+where the joint moved upwards before it stood, -1 downwards, 0 unknown) only a band is known, which contains 95 % of the
+residuals; with them, Fs is estimated. Inertias and friction in motion are not identified: those of the description
+stay.
+
+The model is judged on the poses of ``--validate``, or on a quarter of the poses that it is not fitted to.
+
+Source: W. Khalil and E. Dombre (2002), Modeling, Identification and Control of Robots, sections 9.4 and 12.3.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from calib import files
+from calib.data.csv_table import read_header, read_table
+from calib.data.recordings.recording import Recording
+from calib.data.recordings.recording_files import read_at_rest
+from calib.dynamics import base as base_parameters
+from calib.dynamics import drives
+from calib.dynamics.base import Base
+from calib.dynamics.bodies import standard_parameters
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.regressor_model import States
+from calib.errors import MeasurementError, UsageError, listing
+from calib.identification.identify_options import IdentifyOptions, read_options
+from calib.identification.settings import make_bodies
+from calib.procedure.findings import Verdict
+from calib.procedure.robot_kinds import joints_of
+from calib.robot.chain import Chain
+from calib.robot.formats import urdf, urdf_write
+from calib.robot.formats.urdf_tree import is_urdf
+from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.formats.urdf_tree import text as description_text
+from calib.robot.library import load_calibrated, resolve
+from calib.units import motion_units
+
+# suffixes of tables
+TABLES = (".csv", ".txt", ".tsv", ".dat")
+# [bytes] a larger log is not searched for standing poses
+MAX_BYTES = 50_000_000
+# [rad or m], [s] a joint stands where it moves by less for longer; share of the rows that stand in a standing log
+STILL, STANDING, SHARE = 1e-3, 0.5, 0.95
+# [rad or m] poses that differ by less are one, fitted or held out together
+SAME = 0.02
+# share of the poses that is held out where no file is
+HELD_OUT = 0.25
+# least rows of torques per base parameter
+ROWS = 2.0
+# unexplained share of the torques' variation up to which a model passes, and above which it fails (those of motion)
+PASS, FAIL = 0.10, 0.30
+# prior deviations by which what the poses do not tell is divided: share of a mass, and first moment per mass [m]
+MASS_SHARE, MOMENT = 0.3, 0.1
+# [kg] mass that counts for a body without mass
+LEAST_MASS = 0.05
+# rounds of weighing the joints by their residuals
+ROUNDS = 10
+# smallest part of a payload parameter that the base parameters do not contain
+EXACT = 1e-8
+# smallest cosine between stated gravity and the direction that explains the torques best with the described masses
+ALIKE = 0.9
+# residual with that direction over the one with the stated gravity, from which on it is believed
+BETTER = 0.7
+# cosine to an axis of the base from which on gravity is taken to be along it
+SNAP = 0.985
+# torques that hold less than this share of the described masses' gravity hold none
+ABSENT = 0.1
+# identified masses below this share of the described ones are not believed: then only first moments change
+LEAST_SHARE = 0.3
+NAMES = ("robot.urdf", "gravity.csv", "friction_at_rest.csv", "payload.csv", "summary.txt")
+README = """\
+Gravity identified from standing poses.
+
+robot.urdf          the description with masses and centres of mass that give the identified gravity torques
+gravity.csv         base parameters of the gravity regressor, with sigma
+friction_at_rest.csv  per joint: band of the friction that holds it
+payload.csv         mass and centre of payloads in the tip's frame
+
+Use robot.urdf for gravity compensation, payload checks and collision detection at rest. Inertias about the centres of
+mass, motor inertias and friction in motion were not identified (they are the description's): do not use it for
+computed torque, planning at torque limits or simulation of fast motion. For these: calib excite, then calib identify
+with its log.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class StandingPoses:
+    """Torques at standing poses, from one file.
+
+    Attributes:
+        name: the file.
+        q: (N, n) joint values [rad or m].
+        torque: (N, n) torques [N m or N].
+        approach: (N, n) direction of the motion before each joint stood, +1, -1 or 0 (unknown); None if not recorded.
+        carried: labels of the payloads.
+    """
+
+    name: str
+    q: np.ndarray
+    torque: np.ndarray
+    approach: np.ndarray | None
+    carried: tuple[str, ...]
+
+    def where(self, rows: np.ndarray) -> "StandingPoses":
+        """Return some of the poses, given by their indices or a mask."""
+        approach = None if self.approach is None else self.approach[rows]
+        return replace(self, q=self.q[rows], torque=self.torque[rows], approach=approach)
+
+
+@dataclass(frozen=True, eq=False)
+class GravityModel:
+    """Gravity of an arm, identified from standing poses.
+
+    Attributes:
+        chain: the arm as described.
+        model: its bodies and payloads, and an offset of each torque.
+        base: base parameters of the gravity regressor, of which `values` are those identified.
+        values, covariance: (b,) base parameters, (b, b) their covariance.
+        friction: (n,) band of the friction at rest [N m or N], ± this; (n,) its sigma where it was estimated, else NaN.
+        reference: (p,) standard parameters of the description; zero where it has no masses.
+    """
+
+    chain: Chain
+    model: IdentificationModel
+    base: Base
+    values: np.ndarray
+    covariance: np.ndarray
+    friction: tuple[np.ndarray, np.ndarray]
+    reference: np.ndarray
+
+    def torque(self, poses: StandingPoses) -> np.ndarray:
+        """Return the gravity torques (N, n) at poses, offsets included."""
+        return _regressor(self.model, poses)[..., self.base.kept] @ self.values
+
+    def described(self, poses: StandingPoses) -> np.ndarray:
+        """Return the gravity torques (N, n) of the description."""
+        return _regressor(self.model, poses) @ self.reference
+
+    @property
+    def standard(self) -> np.ndarray:
+        """Standard parameters (p,) nearest to the description's that have the identified base parameters."""
+        estimate = self._nearest(MASS_SHARE)
+        count = 10 * self.chain.n
+        described, masses = self.reference[9:count:10], estimate[9:count:10]
+        if np.any(masses < LEAST_SHARE * described):
+            return self._nearest(0.0)
+        return estimate
+
+    def _nearest(self, mass_share: float) -> np.ndarray:
+        """Return the nearest standard parameters, if masses may deviate by this share of the description's."""
+        deviations = np.zeros(len(self.reference))
+        count = self.model.inertial
+        bodies = self.reference[:count].reshape(-1, 10)
+        sizes = np.maximum(bodies[:, 9], LEAST_MASS)
+        deviations[:count].reshape(-1, 10)[:, 6:9] = MOMENT * sizes[:, None]
+        deviations[:count].reshape(-1, 10)[:, 9] = mass_share * sizes
+        deviations[count:] = sizes.mean()
+        transform = self.base.transform
+        scaled = transform * deviations
+        step = np.linalg.lstsq(scaled, self.values - transform @ self.reference, rcond=None)[0]
+        return self.reference + deviations * step
+
+    @property
+    def bodies(self) -> np.ndarray:
+        """Standard parameters (n, 10) of the arm's bodies; moments about the centres of mass are the description's."""
+        count = self.chain.n
+        estimate = self.standard[: 10 * count].reshape(-1, 10)
+        reference = self.reference[: 10 * count].reshape(-1, 10)
+        return np.array([_with_centre(old, new) for old, new in zip(reference, estimate)])
+
+    def payload(self, label: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """Return first moments and mass (4,) of a payload in the tip's frame, and their covariance (4, 4).
+
+        None where the poses do not determine them.
+        """
+        first = 10 * self.model.bodies.labels.index(label)
+        selection = np.zeros((4, len(self.reference)))
+        selection[np.arange(4), first + np.arange(6, 10)] = 1.0
+        transform = self.base.transform
+        combination = np.linalg.lstsq(transform.T, selection.T, rcond=None)[0].T
+        if np.abs(combination @ transform - selection).max() > EXACT:
+            return None
+        return combination @ self.values, combination @ self.covariance @ combination.T
+
+
+def _with_centre(reference: np.ndarray, estimate: np.ndarray) -> np.ndarray:
+    """Return a body (10,) with the mass and first moments found, and the reference's moments about the centre."""
+    _, _, moments = urdf_write.centred(reference)
+    body = np.concatenate([np.zeros(6), estimate[6:10]])
+    _, _, steiner = urdf_write.centred(body)
+    return np.concatenate([moments - steiner, estimate[6:10]])
+
+
+def _regressor(model: IdentificationModel, poses: StandingPoses) -> np.ndarray:
+    zero = np.zeros(poses.q.shape)
+    return model.regressor(poses.q, zero, zero, carried=poses.carried)
+
+
+def stand(
+    robot: str | Path, recordings: Sequence[str], options: Path | None, base: str | None, tip: str | None
+) -> bool:
+    """Return whether all files are tables of standing poses: without stamps, or logs in which nothing moves for long.
+
+    Args:
+        robot: the robot.
+        recordings: the files.
+        options: the options file.
+        base, tip: first and last link of the arm.
+    """
+    settings = read_options(options)
+    chain = None
+    for name in recordings:
+        path = Path(name)
+        if path.suffix.lower() not in TABLES or not path.is_file() or path.stat().st_size > MAX_BYTES:
+            return False
+        recording_options = settings.file_settings(name).recording
+        if recording_options.rate or "t" in recording_options.names or not read_header(path)[0]:
+            return False
+        chain = chain or load_calibrated(robot, base, tip).chain
+        try:
+            recording, stamped = read_at_rest(path, joints_of(chain), recording_options)
+        except MeasurementError:
+            # said by the reader of recordings
+            return False
+        if stamped and not len(_standing_rows(recording)):
+            return False
+    return True
+
+
+def _standing_rows(recording: Recording) -> list[np.ndarray]:
+    """Return the rows of each standstill of a log; empty if the log moves."""
+    starts = [0]
+    for row in range(1, len(recording.q)):
+        if np.abs(recording.q[row] - recording.q[starts[-1]]).max() > STILL:
+            starts.append(row)
+    standing = []
+    for first, last in zip(starts, [*starts[1:], len(recording.q)]):
+        if recording.t[last - 1] - recording.t[first] >= STANDING:
+            standing.append(np.arange(first, last))
+    rows = sum(map(len, standing))
+    if rows < SHARE * len(recording.q):
+        return []
+    return standing
+
+
+def read_poses(path: str, chain: Chain, options: IdentifyOptions) -> StandingPoses:
+    """Return the standing poses in a table, or the mean of each standstill of a log.
+
+    Args:
+        path: the file.
+        chain: the arm.
+        options: options with the file's columns and payloads.
+
+    Raises:
+        MeasurementError: an invalid file, or currents.
+    """
+    settings = options.file_settings(path)
+    recording, stamped = read_at_rest(Path(path), joints_of(chain), settings.recording)
+    if recording.kind == "current":
+        raise MeasurementError(
+            "has currents: gravity at rest is identified from torques; write columns tau1 … with gain x current [N m]",
+            path,
+        )
+    groups: Sequence[np.ndarray] = list(np.arange(len(recording.q))[:, None])
+    if stamped:
+        groups = _standing_rows(recording)
+    q, torque = [], []
+    for rows in groups:
+        q.append(recording.q[rows].mean(axis=0))
+        torque.append(recording.effort[rows].mean(axis=0))
+    approach = None
+    table = read_table(path)
+    names = [f"approach{joint}" for joint in range(1, chain.n + 1)]
+    if all(name in table for name in names):
+        sides = np.column_stack([table.numbers(name, None) for name in names])
+        approach = np.array([np.sign(sides[rows[0]]) for rows in groups])
+    return StandingPoses(path, np.array(q), np.array(torque), approach, tuple(settings.payload))
+
+
+def fitted(chain: Chain, options: IdentifyOptions, poses: Sequence[StandingPoses]) -> GravityModel:
+    """Return the gravity model of an arm, fitted to standing poses by weighted least squares.
+
+    Args:
+        chain: the arm.
+        options: options with gravity and payloads.
+        poses: the poses of each file.
+
+    Raises:
+        MeasurementError: too few poses for the parameters.
+    """
+    if len(chain.driven) != chain.n:
+        raise UsageError(
+            f"robot '{chain.name}' has mimic joints: their gravity at rest is not identified; use a motion"
+        )
+    linear = [joint.kind == "prismatic" for joint in chain.joints]
+    offsets = drives.standard(["off"] * chain.n, linear=linear)
+    model = IdentificationModel(make_bodies(chain, options.settings), offsets)
+    loads = _loads(poses)
+    q = np.concatenate([block.q for block in poses])
+    zero = np.zeros(q.shape)
+    base = base_parameters.find(model, States(q, zero, zero), loads)
+    columns = [_regressor(model, block)[..., base.kept] for block in poses]
+    W = np.concatenate(columns)
+    torque = np.concatenate([block.torque for block in poses])
+    sided = all(block.approach is not None for block in poses)
+    count, n = torque.shape
+    if W.shape[0] * n < ROWS * base.b:
+        needed = int(np.ceil(ROWS * base.b / n))
+        raise MeasurementError(
+            f"{count} standing poses for {base.b} parameters of gravity and offsets: measure at least {needed}, spread "
+            "over the joints' ranges",
+            poses[0].name,
+        )
+    if sided:
+        approach = np.concatenate([block.approach for block in poses])
+        W = np.concatenate([W, approach[:, :, None] * np.eye(n)], axis=2)
+    values, covariance, residual = _least_squares(W, torque)
+    friction = np.quantile(np.abs(residual), 0.95, axis=0), np.full(n, np.nan)
+    if sided:
+        friction = np.abs(values[base.b :]), np.sqrt(np.diag(covariance))[base.b :]
+    reference = np.zeros(model.p)
+    if chain.inertias is not None:
+        arm = standard_parameters(chain)
+        reference[: len(arm)] = arm
+    return GravityModel(chain, model, base, values[: base.b], covariance[: base.b, : base.b], friction, reference)
+
+
+def _loads(blocks: Sequence[StandingPoses]) -> tuple[tuple[str, ...], ...]:
+    """Return the distinct sets of payloads with which the poses were measured."""
+    return tuple(dict.fromkeys(block.carried for block in blocks))
+
+
+def _least_squares(W: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return estimate (b,), covariance (b, b) and residuals (N, n), with each joint weighted by its residuals.
+
+    Args:
+        W: (N, n, b) regressor.
+        torque: (N, n) torques.
+    """
+    count, n, b = W.shape
+    sigma = np.ones(n)
+    sizes = np.maximum(np.linalg.norm(W.reshape(-1, b), axis=0), 1e-12)
+    for _ in range(ROUNDS):
+        weighted = (W / sizes / sigma[:, None]).reshape(-1, b)
+        inverse = np.linalg.pinv(weighted)
+        values = inverse @ (torque / sigma).ravel() / sizes
+        residual = torque - W @ values
+        degrees = max(count - b / n, 1.0)
+        sigma = np.maximum(np.sqrt(np.sum(residual**2, axis=0) / degrees), 1e-6)
+    covariance = inverse @ inverse.T / np.outer(sizes, sizes)
+    return values, covariance, residual
+
+
+def divided(blocks: Sequence[StandingPoses], seed: int) -> tuple[list[StandingPoses], list[StandingPoses]]:
+    """Return the poses to fit and those held out; rows of one pose stay together.
+
+    Args:
+        blocks: the poses of each file.
+        seed: seed of the random choice.
+    """
+    random = np.random.default_rng(seed)
+    training, unseen = [], []
+    for block in blocks:
+        _, pose = np.unique(np.round(block.q / SAME), axis=0, return_inverse=True)
+        distinct = int(pose.max()) + 1
+        chosen = random.permutation(distinct)[: max(1, round(HELD_OUT * distinct))]
+        out = np.isin(pose.ravel(), chosen)
+        training.append(block.where(~out))
+        unseen.append(block.where(out))
+    return training, unseen
+
+
+@dataclass(frozen=True, eq=False)
+class GravityResult:
+    """A gravity model with its errors at held-out poses.
+
+    Attributes:
+        gravity: the model.
+        training, unseen: the poses it was fitted to, and those held out.
+        source: file of the robot.
+    """
+
+    gravity: GravityModel
+    training: tuple[StandingPoses, ...]
+    unseen: tuple[StandingPoses, ...]
+    source: Path
+
+    def errors(self, described: bool = False) -> np.ndarray:
+        """Return the torque errors (N, n) at the held-out poses, of the model or of the description."""
+        predict = self.gravity.torque
+        if described:
+            predict = self.gravity.described
+        return np.concatenate([block.torque - predict(block) for block in self.unseen])
+
+    def unexplained(self, described: bool = False) -> float:
+        """Return the share of the held-out torques that is not explained."""
+        torque = np.concatenate([block.torque for block in self.unseen])
+        return float(np.linalg.norm(self.errors(described)) / np.linalg.norm(_varying(torque)))
+
+    def contradiction(self) -> Verdict | None:
+        """Return a verdict where the torques contradict gravity as stated with the described masses, else None.
+
+        Masses of any sign explain torques of any sign: without this comparison a reversed torque would pass.
+        """
+        gravity = self.gravity
+        if gravity.chain.inertias is None:
+            return None
+        assumed = np.asarray(gravity.model.bodies.gravity)
+        columns = []
+        for direction in np.eye(3):
+            model = replace(gravity.model, bodies=gravity.model.bodies.with_gravity(direction))
+            blocks = [_regressor(model, block) @ gravity.reference for block in self.training]
+            columns.append(_varying(np.concatenate(blocks)))
+        W = np.array(columns).T
+        torque = _varying(np.concatenate([block.torque for block in self.training]))
+        size = np.linalg.norm(assumed)
+        expected = W @ assumed
+        if not np.linalg.norm(expected):
+            return None
+        direction = np.linalg.lstsq(W, torque, rcond=None)[0]
+        factor = max(float(expected @ torque / (expected @ expected)), 0.0)
+        before = np.linalg.norm(torque - factor * expected)
+        after = np.linalg.norm(torque - W @ direction)
+        scale = np.linalg.norm(direction)
+        if scale < ABSENT * size:
+            reason = f"the torques vary by {100 * scale / size:.2g} % of the described masses' gravity"
+            return Verdict("fail", reason, "", "are they compensated for gravity already? Log them before compensation")
+        if direction @ assumed < ALIKE * scale * size and after < BETTER * before:
+            believed = direction / scale * size
+            # an arm on a wall or a ceiling stands along an axis
+            upright = np.round(believed / size)
+            if np.linalg.norm(upright) == 1.0 and upright @ believed > SNAP * size:
+                believed = upright * size
+            option = ", ".join(f"{component:.4g}" for component in np.round(believed, 3) + 0.0)
+            reason = f"gravity ({option}) m/s² explains the torques with the described masses, the stated does not"
+            advice = (
+                "is the arm mounted otherwise, or have its torques the other sign? Both are the same at rest: "
+                f"gravity = [{option}] in the options"
+            )
+            return Verdict("fail", reason, "", advice)
+        return None
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict, by the unexplained share of the torques at held-out poses."""
+        contradiction = self.contradiction()
+        if contradiction is not None:
+            return contradiction
+        share = self.unexplained()
+        count = len(self.errors())
+        reason = f"{100 * share:.3g} % of the torques at {count} held-out poses unexplained"
+        if self.gravity.chain.inertias is not None:
+            reason += f" (description: {100 * self.unexplained(True):.3g} %)"
+        reason += ", for gravity at rest only"
+        if share <= PASS:
+            return Verdict("pass", reason)
+        advice = "are torques those of the motors at rest, and are joints, signs and units the description's?"
+        level = "fail"
+        if share <= FAIL:
+            level = "marginal"
+        return Verdict(level, reason, "", advice)
+
+    def lines(self) -> list[str]:
+        """Return the lines for the console and ``summary.txt``."""
+        gravity = self.gravity
+        chain = gravity.chain
+        fitted_count = sum(len(block.q) for block in self.training)
+        counts = f"{fitted_count} fitted, {len(self.errors())} held out"
+        result = [f"standing poses ({counts}): gravity is identified, inertias and friction in motion are not"]
+        offsets = sum(name.startswith("off") for name in gravity.base.names)
+        result.append(f"{gravity.base.b} parameters: {gravity.base.b - offsets} of gravity, {offsets} offsets")
+        result += self._undetermined()
+        rms = np.sqrt(np.mean(self.errors() ** 2, axis=0))
+        band, sigma = gravity.friction
+        for joint, error, width, deviation in zip(chain.joints, rms, band, sigma):
+            _, _, _, unit = motion_units([joint.kind])
+            basis = f"± {deviation:.2g}, from both approaches"
+            if np.isnan(deviation):
+                basis = "band of 95 %"
+            result.append(
+                f"{joint.name}: held out {error:.3g} {unit} rms; friction at rest ± {width:.3g} {unit} ({basis})"
+            )
+        if np.isnan(sigma).all():
+            result.append("with columns approach1 … (+1, -1: the side from which a joint came) friction is estimated")
+        result += [self._payload_line(label) for label in self._labels()]
+        if chain.inertias is None:
+            result.append("the description has no masses: gravity.csv is written, but no robot.urdf")
+        verdict = self.verdict
+        result.append(str(verdict))
+        if verdict.advice:
+            result.append(verdict.advice)
+        return result
+
+    def _labels(self) -> list[str]:
+        carried: set[str] = set()
+        for block in self.training:
+            carried.update(block.carried)
+        return sorted(carried)
+
+    def _payload_line(self, label: str) -> str:
+        estimate = self.gravity.payload(label)
+        if estimate is None:
+            return f"payload {label}: not determined; measure the same poses without it too, with the wrist turned"
+        values, covariance = estimate
+        centre, sigma = _centre(values, covariance)
+        coordinates = []
+        for coordinate, deviation in zip(1e3 * centre, 1e3 * sigma):
+            coordinates.append(f"{coordinate:.1f} ± {deviation:.1g}")
+        position = ", ".join(coordinates)
+        mass = f"{values[3]:.4g} ± {np.sqrt(covariance[3, 3]):.2g} kg"
+        return f"payload {label}: {mass} at {position} mm in '{self.gravity.chain.tip}'"
+
+    def _undetermined(self) -> list[str]:
+        """Return a line on gravity parameters that other standing poses would determine."""
+        gravity = self.gravity
+        model = gravity.model
+        lower, upper = gravity.chain.sampling_limits()
+        states = base_parameters.random_samples(model, lower=lower, upper=upper)
+        zero = np.zeros(states.q.shape)
+        possible = base_parameters.find(model, States(states.q, zero, zero), _loads(self.training))
+        missing = [name for name in possible.names if name not in gravity.base.names]
+        if possible.b <= gravity.base.b:
+            return []
+        count = possible.b - gravity.base.b
+        names = ""
+        if missing:
+            names = f", such as {listing(missing, 3)}"
+        return [f"{count} more parameters of gravity need other poses{names}: move all joints over their ranges"]
+
+    def write(self, out: Path) -> Path:
+        """Write robot.urdf, tables and a README into a folder, and return it.
+
+        Raises:
+            UsageError: the folder contains other files.
+        """
+        gravity = self.gravity
+        sigma = np.sqrt(np.diag(gravity.covariance))
+        rows = zip(gravity.base.names, gravity.base.units, gravity.values, sigma)
+        files.write_table(out / "gravity.csv", ["name", "unit", "value", "sigma"], list(rows))
+        names = gravity.chain.joint_names
+        friction = list(zip(names, *gravity.friction))
+        files.write_table(out / "friction_at_rest.csv", ["joint", "band", "sigma"], friction)
+        payloads = []
+        for label in self._labels():
+            estimate = gravity.payload(label)
+            if estimate is not None:
+                centre, centre_sigma = _centre(*estimate)
+                payloads.append([label, estimate[0][3], *centre, np.sqrt(estimate[1][3, 3]), *centre_sigma])
+        if payloads:
+            head = ["payload", "mass [kg]", "x [m]", "y [m]", "z [m]"]
+            head += ["sigma_mass [kg]", "sigma_x [m]", "sigma_y [m]", "sigma_z [m]"]
+            files.write_table(out / "payload.csv", head, payloads)
+        if gravity.chain.inertias is not None and self.contradiction() is None:
+            files.write(out / "robot.urdf", urdf_text(gravity, self.source, str(self.verdict)))
+        files.write(out / "summary.txt", "\n".join([*self.lines(), "", README]))
+        return out
+
+
+def _varying(torque: np.ndarray) -> np.ndarray:
+    """Return torques (N, n) without the mean of each joint, as a vector."""
+    return (torque - torque.mean(axis=0)).ravel()
+
+
+def _centre(values: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a payload's centre of mass (3,) [m] and its sigma (3,), from first moments and mass (4,)."""
+    mass = values[3]
+    centre = values[:3] / mass
+    slopes = np.hstack([np.eye(3), -centre[:, None]]) / mass
+    return centre, np.sqrt(np.diag(slopes @ covariance @ slopes.T))
+
+
+def urdf_text(gravity: GravityModel, source: Path, verdict: str) -> str:
+    """Return a URDF whose gravity torques are the identified ones, with a comment on its use.
+
+    Args:
+        gravity: the model.
+        source: file of the robot; its links and meshes stay where it is a URDF.
+        verdict: the verdict's text.
+    """
+    chain = replace(gravity.chain, inertias=gravity.bodies)
+    note = (
+        f"<!-- calib identify: gravity from standing poses; {verdict}. Use: gravity compensation, payload checks. "
+        "Inertias about the centres of mass and friction are the description's, not identified: not for computed "
+        "torque or simulation of fast motion. -->\n"
+    )
+    text = _edited(gravity, source)
+    if text is None:
+        text = urdf_write.write_new(chain)
+    head, mark, rest = text.partition("?>\n")
+    if not mark:
+        return note + text
+    return head + mark + note + rest
+
+
+def _edited(gravity: GravityModel, source: Path) -> str | None:
+    """Return the URDF at `source` with the identified bodies; None where it is no URDF, or cannot have them."""
+    if not source.is_file() or source.suffix == ".toml":
+        return None
+    xml, *_ = description_text(source)
+    if not is_urdf(source):
+        return None
+    tree = read_tree(xml, str(source))
+    path = tree.path(gravity.chain.base, gravity.chain.tip)
+    change = gravity.bodies - gravity.reference[: 10 * gravity.chain.n].reshape(-1, 10)
+    links = {}
+    moving = [joint for joint in path if joint.moves]
+    for joint, step in zip(moving, change):
+        body = tree.bodies[joint.child]
+        if body is None:
+            return None
+        turn = urdf.align(joint.axis)[:3, :3]
+        estimate = np.concatenate([np.zeros(6), body[6:9] + turn @ step[6:9], body[9:] + step[9:]])
+        if not estimate[9] > 0.0:
+            return None
+        links[joint.child] = _with_centre(body, estimate)
+    text = urdf_write.put(xml, str(source), links)
+    written = urdf.parse(text, str(source), gravity.chain.base, gravity.chain.tip)
+    if written.inertias is None or np.abs(written.inertias - gravity.bodies)[:, 6:].max() > 1e-6:
+        return None
+    return text
+
+
+def identify_gravity(
+    robot: str | Path,
+    recordings: Sequence[str],
+    validate: Sequence[str] = (),
+    options: Path | None = None,
+    base: str | None = None,
+    tip: str | None = None,
+    seed: int = 0,
+) -> GravityResult:
+    """Identify an arm's gravity from files of standing poses, and judge it on poses that were not fitted.
+
+    Args:
+        robot: name of a library robot, or its file.
+        recordings, validate: files of poses to fit, and of held-out poses; without the latter a quarter is held out.
+        options: options file of an identification: columns, payloads, gravity.
+        base, tip: first and last link of the arm.
+        seed: seed of the choice of held-out poses.
+
+    Raises:
+        MeasurementError: invalid files, or too few poses.
+        UsageError: an unknown robot.
+    """
+    settings = read_options(options)
+    chain = load_calibrated(robot, base, tip).chain
+    blocks = [read_poses(name, chain, settings) for name in recordings]
+    if validate:
+        training, unseen = blocks, [read_poses(name, chain, settings) for name in validate]
+    else:
+        training, unseen = divided(blocks, seed)
+    gravity = fitted(chain, settings, training)
+    return GravityResult(gravity, tuple(training), tuple(unseen), Path(resolve(robot)))
+
+
+def check_target(out: Path, inputs: Sequence[str | Path | None]) -> None:
+    """Raise UsageError if a folder contains files that this command does not write, or one of the inputs."""
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out} is a file: give a folder")
+    names = [path.name for path in out.glob("*")]
+    foreign = [name for name in names if name not in NAMES]
+    resolved = {Path(name).resolve() for name in inputs if name}
+    if foreign or any((out / name).resolve() in resolved for name in names):
+        raise UsageError(f"{out} contains {listing(foreign or names, 3)}: give another folder")

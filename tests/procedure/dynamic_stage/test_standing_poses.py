@@ -1,0 +1,187 @@
+"""Gravity and payloads from torques at rest, made by Pinocchio with friction that holds each joint (case 17)."""
+
+import csv
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio
+import pytest
+
+from calib import cli
+from calib.procedure.dynamic_stage.standing_poses import identify_gravity, stand
+from calib.robot.chain import Chain
+from calib.robot.formats.urdf_write import write_new
+from calib.robot.library import load
+
+STICTION = 0.8  # [N m]
+PAYLOAD = pinocchio.Inertia(2.5, np.array([0.03, -0.02, 0.12]), np.zeros((3, 3)))
+OPTIONS = '[payload.tool]\n[files."loaded.csv"]\npayload = ["tool"]\n'
+
+
+def with_masses(chain: Chain) -> Chain:
+    """Return a chain of rods of 4 to 1 kg, their centres 0.1 m from each joint."""
+    masses = np.linspace(4.0, 1.0, chain.n)
+    bodies = np.zeros((chain.n, 10))
+    bodies[:, [0, 3]] = (0.01 * masses + masses * 0.1**2)[:, None]
+    bodies[:, 5] = 0.01 * masses
+    bodies[:, 8] = 0.1 * masses
+    bodies[:, 9] = masses
+    return replace(chain, inertias=bodies)
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory) -> tuple[Path, Chain, pinocchio.Model]:
+    """A description, its chain, and the real arm: masses 20 % heavier, centres off by 20 mm."""
+    chain = with_masses(load("iiwa14"))
+    folder = tmp_path_factory.mktemp("arm")
+    text = write_new(chain)
+    (folder / "arm.urdf").write_text(text)
+    model = pinocchio.buildModelFromXML(text)
+    random = np.random.default_rng(2)
+    for inertia in list(model.inertias)[1:]:
+        inertia.mass *= 1.2
+        inertia.lever = inertia.lever + random.uniform(-0.02, 0.02, 3)
+    return folder / "arm.urdf", chain, model
+
+
+def torques(model: pinocchio.Model, q: np.ndarray, load: pinocchio.Inertia | None = None) -> np.ndarray:
+    model = model.copy()
+    if load is not None:
+        tip = model.frames[model.getFrameId("tip") if model.existFrame("tip") else model.nframes - 1]
+        model.appendBodyToJoint(model.njoints - 1, load, tip.placement)
+    data = model.createData()
+    return np.array([pinocchio.computeGeneralizedGravity(model, data, row) for row in q])
+
+
+def sides(q: np.ndarray) -> np.ndarray:
+    return np.random.default_rng(len(q)).choice([-1.0, 1.0], q.shape)
+
+
+def write(path: Path, q: np.ndarray, torque: np.ndarray, extra: np.ndarray | None = None, separator: str = ",") -> str:
+    n = q.shape[1]
+    head = [f"q{k}" for k in range(1, n + 1)] + [f"tau{k}" for k in range(1, n + 1)]
+    columns = [q, torque]
+    if extra is not None:
+        head += [f"approach{k}" for k in range(1, n + 1)]
+        columns.append(extra)
+    with path.open("w", newline="") as file:
+        csv.writer(file, delimiter=separator).writerows([head, *np.hstack(columns).tolist()])
+    return str(path)
+
+
+def drawn(count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1.8, 1.8, (count, 7))
+
+
+def held(model: pinocchio.Model, q: np.ndarray, **options: object) -> np.ndarray:
+    """Return torques within the band of friction, with noise."""
+    random = np.random.default_rng(7)
+    gravity = torques(model, q, **options)  # type: ignore[arg-type]
+    return gravity + random.uniform(-STICTION, STICTION, q.shape) + random.normal(0.0, 0.02, q.shape)
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_a_table_of_poses_identifies_gravity(tmp_path, arm, separator):
+    """No stamps: one row per pose. The exported URDF has the real arm's gravity, within the band of friction."""
+    urdf, _, model = arm
+    q = drawn(120)
+    path = write(tmp_path / "poses.csv", q, held(model, q), separator=separator)
+    assert stand(urdf, [path], None, None, None)
+    result = identify_gravity(urdf, [path])
+    assert result.verdict == "pass" and "description" in result.verdict.reason
+    result.write(tmp_path / "out")
+    written = pinocchio.buildModelFromXML((tmp_path / "out/robot.urdf").read_text())
+    unseen = drawn(50, 9)
+    error = torques(written, unseen) - torques(model, unseen)
+    described = torques(pinocchio.buildModelFromXML(urdf.read_text()), unseen) - torques(model, unseen)
+    assert np.sqrt(np.mean(error**2)) < 0.3 < np.sqrt(np.mean(described**2))
+    before = pinocchio.buildModelFromXML(urdf.read_text()).inertias[3].inertia
+    np.testing.assert_allclose(written.inertias[3].inertia, before, atol=1e-6)
+    assert "not identified" in (tmp_path / "out/robot.urdf").read_text()[:800]
+
+
+def test_friction_is_estimated_from_both_sides(tmp_path, arm):
+    """Where the side from which each joint came is told, its friction at rest comes with a sigma; else a band."""
+    urdf, _, model = arm
+    q = drawn(120)
+    side = sides(q)
+    torque = torques(model, q) + STICTION * side + np.random.default_rng(1).normal(0.0, 0.05, q.shape)
+    told = identify_gravity(urdf, [write(tmp_path / "told.csv", q, torque, side)])
+    friction, sigma = told.gravity.friction
+    assert np.all(np.abs(friction - STICTION) < 4.0 * sigma) and np.all(sigma < 0.02)
+    untold = identify_gravity(urdf, [write(tmp_path / "untold.csv", q, torque)])
+    assert np.isnan(untold.gravity.friction[1]).all()
+    assert "approach1" in "\n".join(untold.lines()) and "approach1" not in "\n".join(told.lines())
+
+
+def test_payload_from_two_files(tmp_path, arm, monkeypatch, capsys):
+    urdf, _, model = arm
+    monkeypatch.chdir(tmp_path)
+    q = drawn(100)
+    write(tmp_path / "empty.csv", q, held(model, q))
+    write(tmp_path / "loaded.csv", q, held(model, q, load=PAYLOAD))
+    (tmp_path / "o.toml").write_text(OPTIONS)
+    words = ["identify", str(urdf), "empty.csv", "loaded.csv", "--options", "o.toml", "--out", "out"]
+    assert cli.run(words) == 0
+    printed = capsys.readouterr().out
+    assert "payload tool: 2." in printed and "inertias and friction in motion are not" in printed
+    result = identify_gravity(urdf, ["empty.csv", "loaded.csv"], options=Path("o.toml"))
+    values, covariance = result.gravity.payload("tool")
+    truth = np.append(PAYLOAD.mass * PAYLOAD.lever, PAYLOAD.mass)
+    assert np.all(np.abs(values - truth) < 4.0 * np.sqrt(np.diag(covariance)))
+    assert abs(values[3] - 2.5) < 0.1
+
+
+def test_a_log_that_stands_is_averaged_and_one_that_moves_is_not(tmp_path, arm):
+    urdf, _, model = arm
+    q = drawn(60)
+    rows = np.repeat(np.arange(60), 100)
+    random = np.random.default_rng(3)
+    torque = held(model, q)[rows] + random.normal(0.0, 0.3, (6000, 7))
+    table = np.column_stack([np.arange(6000) / 100.0, q[rows], torque])
+    head = ["t", *(f"q{k}" for k in range(1, 8)), *(f"tau{k}" for k in range(1, 8))]
+    log = tmp_path / "log.csv"
+    with log.open("w", newline="") as file:
+        csv.writer(file).writerows([head, *table.tolist()])
+    assert stand(urdf, [str(log)], None, None, None)
+    result = identify_gravity(urdf, [str(log)])
+    assert len(result.training[0].q) + len(result.unseen[0].q) == 60 and result.verdict == "pass"
+    table[:, 1:8] = 0.3 * np.sin(table[:, :1] * np.arange(1, 8) / 10.0)
+    with log.open("w", newline="") as file:
+        csv.writer(file).writerows([head, *table.tolist()])
+    assert not stand(urdf, [str(log)], None, None, None)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda gravity: -gravity, r"gravity \(0, 0, 9.81\).*gravity = \[0, 0, 9.81\] in the options"),
+        (lambda gravity: 0.001 * gravity, "compensated for gravity already"),
+        (lambda gravity: gravity[:, [0, 2, 1, 3, 4, 5, 6]], "verdict fail"),
+    ],
+)
+def test_what_contradicts_the_description_does_not_pass(tmp_path, arm, change, words):
+    """Masses of any sign explain torques of any sign: those described decide, and no robot.urdf is written."""
+    urdf, _, model = arm
+    q = drawn(120)
+    result = identify_gravity(urdf, [write(tmp_path / "p.csv", q, change(held(model, q)))])
+    lines = " ".join(result.lines())
+    assert result.verdict == "fail"
+    assert re.search(words, lines)
+    result.write(tmp_path / "out")
+    if "options" in words:
+        assert not (tmp_path / "out/robot.urdf").exists()
+
+
+def test_too_few_poses_and_corners_are_said(tmp_path, arm, capsys):
+    urdf, _, model = arm
+    q = drawn(4)
+    few = write(tmp_path / "few.csv", q, held(model, q))
+    assert cli.run(["identify", str(urdf), few, "--out", str(tmp_path / "out")]) == 2
+    assert "standing poses for" in capsys.readouterr().err
+    q = drawn(80)
+    q[:, 1:4] = [0.3, 0.0, 0.5]
+    corner = identify_gravity(urdf, [write(tmp_path / "corner.csv", q, held(model, q))])
+    assert any("need other poses" in line for line in corner.lines())

@@ -1,0 +1,230 @@
+"""Files with the columns of controllers and other programs: read where names, numbers and the arm leave one reading."""
+
+from itertools import chain as joined
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calib.data.poses.fit_options import FileOptions, FitOptions
+from calib.data.poses.measurements import Positions
+from calib.data.poses.pose_files import read_measurements
+from calib.data.schema import Joints
+from calib.errors import MeasurementError
+from calib.geometry.checks.readings import without_unseen
+from calib.procedure.kinematic_stage.inputs import read_file
+from calib.robot.kinematics import forward
+from calib.robot.library import load
+
+COUNT = 16
+DEGREES = 180.0 / np.pi
+STATION = Rotation.from_euler("xyz", [0.3, -0.2, 2.0])
+TOOL = Rotation.from_euler("xyz", [0.4, 0.7, -0.5])
+SIX = range(1, 7)
+
+
+@pytest.fixture(scope="module")
+def arm():
+    """Return the arm, joint values and the poses that an instrument sees."""
+    chain = load("ur5")
+    q = np.random.default_rng(5).uniform(-2.2, 2.2, (COUNT, 6))
+    pose = forward(chain, q)
+    rotation = STATION * Rotation.from_matrix(pose[:, :3, :3])
+    position = STATION.apply(pose[:, :3, 3]) + np.array([1.0, 2.0, 0.5]) + rotation.apply([0.02, 0.05, 0.1])
+    return chain, q, position, rotation * TOOL
+
+
+def written(path, header, columns, separator=",", mark="."):
+    """Write columns to a file, with a header or without."""
+    lines = [separator.join(header)] if header else []
+    rows = np.column_stack(columns)
+    lines += [separator.join(f"{value:.6f}".replace(".", mark) for value in row) for row in rows]
+    path.write_text("\n".join([*lines, ""]))
+    return path
+
+
+def matrices(position, rotation):
+    """Return (m, 4, 4) poses."""
+    result = np.tile(np.eye(4), (len(position), 1, 1))
+    result[:, :3, :3] = rotation.as_matrix()
+    result[:, :3, 3] = position
+    return result
+
+
+def numbered(*forms):
+    return list(joined(*([form.format(number) for number in SIX] for form in forms)))
+
+
+SCALAR_FIRST = [3, 0, 1, 2]
+FORMS = {
+    "kuka": lambda q, p, r: (
+        [*numbered("A{}"), "X", "Y", "Z", "A", "B", "C"],
+        [q * DEGREES, p * 1e3, r.as_euler("ZYX", degrees=True)],
+    ),
+    "kawasaki": lambda q, p, r: (
+        [*numbered("JT{} / °"), *(f"{name} / mm" for name in "XYZ"), *(f"{name} / °" for name in "OAT")],
+        [q * DEGREES, p * 1e3, r.as_euler("ZYZ", degrees=True)],
+    ),
+    "abb": lambda q, p, r: (
+        [*numbered("rax_{}"), "x_mm", "y_mm", "z_mm", "q1", "q2", "q3", "q4"],
+        [q * DEGREES, p * 1e3, r.as_quat()[:, SCALAR_FIRST]],
+    ),
+    "yaskawa": lambda q, p, r: (
+        [*"SLURBT", "X", "Y", "Z", "Rx", "Ry", "Rz"],
+        [q * DEGREES, p * 1e3, r.as_euler("xyz", degrees=True)],
+    ),
+    "ros": lambda q, p, r: (
+        [
+            *numbered("joint{}.pos"),
+            *(f"pose.position.{axis}" for axis in "xyz"),
+            *(f"pose.orientation.{axis}" for axis in "xyzw"),
+        ],
+        [q, p, r.as_quat()],
+    ),
+    "opencv": lambda q, p, r: (
+        [*numbered("theta{}"), *(f"tvec[{k}]" for k in range(3)), *(f"rvec[{k}]" for k in range(3))],
+        [q, p, r.as_rotvec()],
+    ),
+    "figaroh": lambda q, p, r: (
+        ["x1", "y1", "z1", "phix1", "phiy1", "phiz1", *numbered("q{}")],
+        [p, r.as_euler("xyz"), q],
+    ),
+    "rows of a matrix": lambda q, p, r: (
+        [*numbered("q{}"), *(f"T_{i}{j}" for i in range(4) for j in range(4))],
+        [q, matrices(p, r).reshape(-1, 16)],
+    ),
+    "columns of a matrix": lambda q, p, r: (
+        [*numbered("q{}"), *(f"pose_{k}" for k in range(16))],
+        [q, np.swapaxes(matrices(p, r), 1, 2).reshape(-1, 16)],
+    ),
+    "auto id": lambda q, p, r: (None, [p * 1e3, r.as_euler("xyz", degrees=True), q * DEGREES]),
+    "counted": lambda q, p, r: (None, [np.arange(COUNT), q, p, r.as_quat()]),
+}
+
+
+@pytest.mark.parametrize("name", FORMS)
+@pytest.mark.parametrize(("separator", "mark"), [(",", "."), (";", ","), ("\t", ".")])
+def test_one_reading_is_taken_and_said(arm, tmp_path, name, separator, mark):
+    chain, q, position, rotation = arm
+    path = written(tmp_path / "m.csv", *FORMS[name](q, position, rotation), separator, mark)
+    (block,) = read_file(path, chain, FitOptions())
+    np.testing.assert_allclose(block.q, q, atol=2e-6)
+    np.testing.assert_allclose(block.position, position, atol=2e-6)
+    turn = Rotation.from_quat(block.quaternion) * rotation.inv()
+    assert block.kind == "pose" and turn.magnitude().max() < 1e-5
+    assert block.notes
+
+
+def test_what_is_not_told_is_asked_by_a_line_to_paste(arm, tmp_path):
+    chain, q, position, _ = arm
+    path = written(tmp_path / "a.csv", [*numbered("M{}"), "x", "y", "z"], [q, position])
+    with pytest.raises(MeasurementError, match=r'columns = \{ q1 = "M1", .*q6 = "M6" \}'):
+        read_file(path, chain, FitOptions())
+    columns = {f"q{number}": f"M{number}" for number in SIX}
+    (block,) = read_measurements(path, chain.joint_names, FileOptions(columns=columns))
+    np.testing.assert_allclose(block.q, q, atol=2e-6)
+
+    path = written(tmp_path / "b.csv", [*numbered("q{}"), "x", "y", "z", "rx", "ry", "rz"], [q, position, position])
+    with pytest.raises(MeasurementError, match=r"look like an orientation.*one line in the options: euler = 'vector'"):
+        read_file(path, chain, FitOptions())
+    path = written(tmp_path / "c.csv", None, [q + 1.0, position])
+    with pytest.raises(MeasurementError, match="has no header: put a line of names and units"):
+        read_file(path, chain, FitOptions())
+    two = [*numbered("q{}"), "tip_x", "tip_y", "tip_z", "ball_x", "ball_y", "ball_z"]
+    path = written(tmp_path / "d.csv", two, [q, position, position])
+    with pytest.raises(MeasurementError, match=r'may be meant.*columns = \{ x = "tip_x"'):
+        read_file(path, chain, FitOptions())
+
+
+def test_small_angles_beside_joints_in_degrees(arm, tmp_path):
+    """Small angles without a unit are read as the arm says, or asked for."""
+    chain, q, position, rotation = arm
+    path = written(
+        tmp_path / "m.csv",
+        [*numbered("A{}"), "X", "Y", "Z", "rvec_x", "rvec_y", "rvec_z"],
+        [q * DEGREES, position * 1e3, rotation.as_rotvec()],
+    )
+    (block,) = read_file(path, chain, FitOptions())
+    assert (Rotation.from_quat(block.quaternion) * rotation.inv()).magnitude().max() < 1e-5
+    with pytest.raises(MeasurementError, match=r"units = \{ orientation = 'deg' \} or units"):
+        read_measurements(path, chain.joint_names)
+
+
+def test_our_own_names_without_a_unit_are_si(arm, tmp_path):
+    chain, q, position, _ = arm
+    path = written(tmp_path / "m.csv", [*numbered("q{}"), "x", "y", "z"], [q * DEGREES, position])
+    with pytest.raises(MeasurementError, match="looks like deg"):
+        read_file(path, chain, FitOptions())
+
+
+def test_readings_beyond_a_limit_by_a_turn(arm, tmp_path):
+    chain, q, position, _ = arm
+    few = q / 2.0
+    joints = Joints(chain.joint_names, (), np.full(6, -1.2), np.full(6, 1.2))
+    shown = np.where(few < 0, few + 2 * np.pi, few)
+    path = written(tmp_path / "m.csv", [*numbered("q{}"), "x", "y", "z"], [shown, position])
+    (block,) = read_measurements(path, joints)
+    np.testing.assert_allclose(block.q, few, atol=2e-6)
+    assert any("within them by a turn" in note for note in block.notes)
+    shown[3, 2] = 2.0
+    path = written(tmp_path / "m.csv", [*numbered("q{}"), "x", "y", "z"], [shown, position])
+    with pytest.raises(MeasurementError, match="outside the limits"):
+        read_measurements(path, joints)
+
+
+@pytest.mark.parametrize("mark", ["---", "9999", ""])
+def test_placeholders_of_one_target_are_rows_not_seen(arm, tmp_path, mark):
+    chain, q, position, _ = arm
+    path = written(tmp_path / "m.csv", [*numbered("q{}"), "x", "y", "z"], [q, position])
+    lines = path.read_text().splitlines()
+    for row in (3, 8):
+        lines[row] = ",".join([*lines[row].split(",")[:6], mark, mark, mark])
+    path.write_text("\n".join(lines))
+    (block,) = read_measurements(path, chain.joint_names)
+    assert block.rows.tolist() == [row for row in range(1, COUNT + 1) if row not in (3, 8)]
+    assert any("x, y, z: not seen in row(s) 3, 8" in note for note in block.notes)
+
+
+def test_placeholders_of_one_of_two_targets(arm, tmp_path):
+    chain, q, position, _ = arm
+    header = [*numbered("q{}"), "x1", "y1", "z1", "x2", "y2", "z2"]
+    path = written(tmp_path / "m.csv", header, [q, position, position + 0.1])
+    lines = path.read_text().splitlines()
+    lines[5] = ",".join([*lines[5].split(",")[:9], "lost", "lost", "lost"])
+    path.write_text("\n".join(lines))
+    (block,) = read_measurements(path, chain.joint_names)
+    assert len(block) == 2 * COUNT - 1
+    assert any("x2, y2, z2: not seen in row(s) 5, which hold 'lost' three times" in note for note in block.notes)
+
+
+@pytest.mark.parametrize(("copied", "targets", "count"), [(range(COUNT), 2, 2 * COUNT), ((2, 5, 9), 3, 3 * COUNT - 3)])
+def test_copies_are_left_out_of_the_target_that_is_one(arm, copied, targets, count):
+    chain, q, position, rotation = arm
+    offsets = ([0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.03])
+    points = np.stack([position + rotation.apply(offset) for offset in offsets], axis=1)
+    points[list(copied), 1] = points[list(copied), 0]
+    tool = np.tile(np.arange(3), COUNT)
+    names = ("a", "b", "c")
+    rows = np.repeat(np.arange(1, COUNT + 1), 3)
+    block = Positions(
+        np.repeat(q, 3, axis=0), chain.joint_names, points.reshape(-1, 3), tool=tool, tool_names=names, rows=rows
+    )
+    seen, findings = without_unseen(chain, block)
+    assert [entry.code for entry in findings] == ["target-copied"]
+    assert (len(seen.tool_names), len(seen)) == (targets, count)
+    if targets == 3:
+        assert sorted(set(rows.tolist()) - set(seen.rows[seen.tool == 1].tolist())) == [3, 6, 10]
+    same, nothing = without_unseen(chain, block, copies_accepted=True)
+    assert len(same) == len(block) and not nothing
+
+
+@pytest.mark.parametrize(("stale", "value"), [((4, 5, 6), None), ((2, 11), 0.0), ((7,), 0.0)])
+def test_repeated_readings_are_left_out(arm, stale, value):
+    chain, q, position, _ = arm
+    points = position.copy()
+    points[list(stale)] = points[stale[0]] if value is None else value
+    block = Positions(q, chain.joint_names, points, rows=np.arange(1, COUNT + 1))
+    seen, findings = without_unseen(chain, block)
+    assert [entry.code for entry in findings] == ["reading-repeated"]
+    assert findings[0].values["rows"] == tuple(str(row + 1) for row in stale)
+    assert set(seen.rows.tolist()) == set(range(1, COUNT + 1)) - {row + 1 for row in stale}
