@@ -24,7 +24,7 @@ def new(
     poses: Annotated[int, typer.Option(min=1)] = 40,
     validation: Annotated[int, typer.Option(min=0)] = 20,
     plan: bool = True,
-    holdout: Annotated[float, typer.Option(min=0.0, max=0.99)] = 0.0,
+    holdout: float = 0.0,
     base: str | None = "",
     tip: str | None = "",
     seed: Seed = 0,
@@ -43,7 +43,7 @@ def new(
         poses: poses to choose for the fit
         validation: poses to measure for validation only, not fitted; 0 for none
         plan: choose poses and design motions; --no-plan: what is measured and recorded is already there, or is free
-        holdout: share of the measured poses, and of each recording, that is held out where no file of validation comes
+        holdout: share (0 to 0.99) of the poses and of each recording, held out where no file of validation comes
     """
     from calib.procedure.session.commands import new_session
     from calib.procedure.session.questions import checked

@@ -24,6 +24,8 @@ from calib.toolkit.sessions import (
 
 # files that a form may bring: question -> endings. Descriptions that name other files of this computer are refused
 FILES = {"robot": (".urdf", ".toml"), "limits": (".toml",), "lens": (".yaml", ".yml"), "board": (".toml",)}
+# end of the name of a form's field that brings a file
+FILE = "_file"
 # questions that have lists of answers
 ALWAYS = ("robot", "instrument", "program", "dynamics", "tool", "tolerance_mm")
 # bytes of a text and of the whole form, and number of files
@@ -31,12 +33,13 @@ MAX_TEXT, MAX_FORM, MAX_FILES = 1 << 16, 64 << 20, len(FILES)
 COUNTS = {"poses": 40, "validation": 20, "seed": 0}
 
 
-def creation_page(values: dict[str, str] | None = None, problem: str = "") -> Response:
+def creation_page(values: dict[str, str] | None = None, problem: str = "", had_files: bool = False) -> Response:
     """Return the page with the questions of `calib new`.
 
     Args:
         values: answers as they were sent; None: the defaults.
         problem: why they were refused; empty: nothing was refused.
+        had_files: whether files came with them, which have to be chosen again.
     """
     choices = {"instrument": list(INSTRUMENTS), "program": ["none", *controllers()], "dynamics": ["yes", "no"]}
     further = [question for question in QUESTIONS if question.name not in (*ALWAYS, *FILES, "details")]
@@ -55,6 +58,7 @@ def creation_page(values: dict[str, str] | None = None, problem: str = "") -> Re
         files=FILES,
         values=values or {},
         problem=problem,
+        had_files=had_files,
     )
 
 
@@ -65,38 +69,42 @@ async def create(request: Request) -> Response:
     message = f"the form and its files are larger than {MAX_FORM >> 20} MB; nothing was made"
     require(length.isdecimal() and int(length) <= MAX_FORM, message, UsageError)
     values: dict[str, str] = {}
+    uploaded: dict[str, Path] = {}
     with tempfile.TemporaryDirectory(prefix="calib-new-") as temporary:
         form = request.form(max_files=MAX_FILES, max_fields=200, max_part_size=MAX_TEXT)
         async with form as content:
-            for name, value in content.items():
+            for field, value in content.multi_items():
+                name = field.removesuffix(FILE)
                 if not isinstance(value, UploadFile):
-                    values[name] = value.strip()
-                elif value.filename:
+                    values[field] = value.strip()
+                elif value.filename and name in FILES:
                     path = Path(temporary) / f"{name}{Path(value.filename).suffix.lower()}"
                     path.write_bytes(await value.read())
-                    values[f"{name}_file"] = str(path)
+                    uploaded[name] = path
         try:
-            await run_in_threadpool(_made, folder, values)
+            await run_in_threadpool(_made, folder, values, uploaded)
         except (CalibError, OSError) as error:
             foreseen = complaint(error)
             message = foreseen[0] if foreseen else str(error)
-            return creation_page(values, message.replace(temporary, "the uploaded file"))
+            message = message.replace(f"{temporary}/", "the uploaded ")
+            return creation_page(values, message, bool(uploaded))
     return back()
 
 
-def _made(folder: Path, values: dict[str, str]) -> None:
+def _made(folder: Path, values: dict[str, str], uploaded: dict[str, Path]) -> None:
     """Make the session in a folder from the answers of a form.
 
     Args:
         folder: the folder, new or empty.
-        values: texts by name of the question; ``NAME_file`` is the path of an uploaded file.
+        values: texts by name of the question.
+        uploaded: paths of uploaded files by name of the question.
 
     Raises:
         CalibError: an answer is not valid; the message says what is.
     """
     answers = Answers()
     for question in QUESTIONS:
-        text = _text(question, values)
+        text = _text(question, values, uploaded)
         if text:
             answers = with_answer(answers, question, text)
     counts = {}
@@ -115,7 +123,7 @@ def _made(folder: Path, values: dict[str, str]) -> None:
     )
 
 
-def _text(question: Question, values: dict[str, str]) -> str:
+def _text(question: Question, values: dict[str, str], uploaded: dict[str, Path]) -> str:
     """Return the answer to a question; empty if there is none.
 
     Paths are those of uploaded files only, so that no file of this computer is read.
@@ -123,6 +131,7 @@ def _text(question: Question, values: dict[str, str]) -> str:
     Args:
         question: the question.
         values: texts by name.
+        uploaded: paths of uploaded files by name.
 
     Raises:
         UsageError: an uploaded file of another format.
@@ -130,12 +139,11 @@ def _text(question: Question, values: dict[str, str]) -> str:
     name = question.name
     if name not in FILES:
         return values.get(name, "")
-    uploaded = values.get(f"{name}_file", "")
-    if uploaded:
+    if name in uploaded:
         endings = FILES[name]
         message = f"{name}: expected a file {' or '.join(endings)}; a xacro: xacro robot.urdf.xacro > robot.urdf"
-        require(Path(uploaded).suffix in endings, message, UsageError)
-        return uploaded
+        require(uploaded[name].suffix in endings, message, UsageError)
+        return str(uploaded[name])
     if name == "robot":
         robot = values.get(name, "")
         require(not robot or robot in robot_names(), f"robot: '{robot}' is no robot of the library", UsageError)

@@ -126,8 +126,8 @@ def test_joints_and_points_apart_are_joined_in_the_page(session: Session, client
     assert (asked.joints, asked.points) == ("joints.dat.csv", "points.txt")
     notes = received.join_received(session, "measured", asked)
     shown = unescape(client.get("/").text)
-    assert all(note in shown for note in notes[:-1]) and "joined by name" in shown
-    assert "s, t, u, v, w, k, l read as q1" in shown
+    assert all(note in shown for note in notes[:-1])
+    assert "joined by name" in shown and "s, t, u, v, w, k, l read as q1" in shown
 
     assert client.post("/take/measured").status_code == 200
     (path,) = session.brought("measured")
@@ -201,11 +201,17 @@ def test_a_session_begins_in_the_page(tmp_path: Path) -> None:
         ("holdout", "a quarter", "a share from 0 to 0.99"),
         ("holdout", "2", "a share from 0 to 0.99"),
         ("cone", "wide", "--cone"),
+        ("robot", "", "a robot and an instrument are needed"),
     ):
         refused = client.post("/new", data=answers | {key: value})
         assert refused.status_code == 400 and words in unescape(refused.text) and not folder.exists()
     assert client.post("/new", data=answers, headers={"origin": "http://evil.example"}).status_code == 403
-    assert client.post("/new", data=answers).status_code == 200
+    robot = {"robot_file": ("arm.xacro", b"<robot/>")}
+    assert "expected a file .urdf or .toml" in client.post("/new", data=answers, files=robot).text
+    named = answers | {"robot": "", "robot_file": str(tmp_path / "robot.urdf")}
+    assert client.post("/new", data=named).status_code == 400, "a path is no uploaded file"
+    # as a browser sends the field of a file that was not chosen
+    assert client.post("/new", data=answers, files={"robot_file": ("", b"")}).status_code == 200
     settings = open_session(folder).settings
     assert (settings.poses.plan, settings.poses.fit, settings.fit.holdout) == (False, 12, 0.25)
     assert "Bring files" in client.get("/").text and client.get("/bundle/1-robot.zip").status_code == 404
