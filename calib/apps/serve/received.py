@@ -20,6 +20,7 @@ from calib.apps.joining.joined import Joined
 from calib.apps.joining.joining import join
 from calib.apps.joining.stated import stated, with_point_columns
 from calib.errors import CalibError, UsageError, counted, listing, require
+from calib.folders import SESSION
 from calib.toolkit.chains import CalibratedChain, Chain, toml_table, toml_text
 from calib.toolkit.pose_data import (
     POSITION,
@@ -102,7 +103,7 @@ def received(session: Session, kind: str) -> list[Received]:
     """Return the received files of a kind that wait, with what each was recognised as."""
     result = []
     for path in waiting(session, kind):
-        sources = (path, place(session, kind, OPTIONS), session.path("session.toml"), session.robot_file)
+        sources = (path, place(session, kind, OPTIONS), session.path(SESSION), session.robot_file)
         versions = tuple(_version(source) for source in sources)
         result.append(_recognised(session.folder, kind, path, versions))
     return result

@@ -24,6 +24,8 @@ MAX_STANDING = 0.9  # of the rows with one velocity: then it was not logged, whi
 JUMP = 5.0  # step behind a standing position over those at the joint's speed
 MAX_TARED_MEAN = 1e-3  # of a torque's standard deviation: a mean that is smaller was subtracted
 MAX_TARED_START = 0.03  # the same of the mean over the start
+TARED_KINDS = ("mean", "start")  # kinds of faults that make torques tared
+MIN_TARED = 0.8  # least share of the joints whose torques are zeroed alike
 START = 0.1  # time over which the start of a log is averaged [s]
 ABOUT = 3.0  # factor between that step and the motion expected meanwhile
 
@@ -56,6 +58,8 @@ def column_faults(
 ) -> tuple[ColumnFault, ...]:
     """Return the columns of a recording that are constant although the measured quantity changes; () without any.
 
+    Torques whose mean or start is zero count where those of most joints are.
+
     Args:
         t: (N,) time stamps as logged [s].
         q: (N, n) positions [rad or m].
@@ -70,7 +74,11 @@ def column_faults(
         else:
             candidates.append(_standing_position(joint, t, position, v[:, joint]))
             candidates.append(_standing_velocity(joint, t, position, v[:, joint]))
-        faults += [fault for fault in candidates if fault is not None]
+        faults += filter(None, candidates)
+    for kind in TARED_KINDS:
+        zeroed = [fault for fault in faults if fault.kind == kind]
+        if len(zeroed) < MIN_TARED * q.shape[1]:
+            faults = [fault for fault in faults if fault.kind != kind]
     return tuple(faults)
 
 

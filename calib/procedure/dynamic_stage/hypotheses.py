@@ -18,8 +18,6 @@ from calib.units import TORQUE
 
 # share that gravity leaves over that which columns leave, from which on columns are the likelier cause (our choice)
 MIN_BETTER = 1.5
-# of the joints, whose torques start or average at zero: fewer may do so by chance (our choice)
-MIN_TARED = 0.8
 # largest unexplained share with offsets of the torques, as a share of that without (our choice)
 MAX_TARED = 0.6
 MAX_COMPARED = 12  # recordings in which an unstated load is looked for (our choice)
@@ -162,8 +160,8 @@ def tare_findings(inputs: IdentificationInputs, gravity: Sequence[float] | None)
     findings = []
     for case in (*inputs.cases, *inputs.unseen):
         for kind, verb in (("mean", "average"), ("start", "start")):
-            tared = {fault.joint for fault in case.motion.faults if fault.kind == kind}
-            samples = take_samples(case, bodies, MAX_SAMPLES) if len(tared) >= MIN_TARED * inputs.chain.n else None
+            kinds = {fault.kind for fault in case.motion.faults}
+            samples = take_samples(case, bodies, MAX_SAMPLES) if kind in kinds else None
             if samples is None:
                 continue
             without, with_offsets = without_offsets(samples)

@@ -38,6 +38,7 @@ from calib.errors import MeasurementError, UsageError, listing
 from calib.identification.identify_options import IdentifyOptions, read_options
 from calib.identification.settings import make_bodies
 from calib.procedure.findings import Verdict
+from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.chain import Chain
 from calib.robot.formats import urdf, urdf_write
@@ -83,14 +84,15 @@ SNAP = 0.985
 ABSENT = 0.1
 # identified masses below this share of the described ones are not believed: then only first moments change
 LEAST_SHARE = 0.3
-NAMES = ("robot.urdf", "gravity.csv", "friction_at_rest.csv", "payload.csv", "summary.txt")
+GRAVITY_SUMMARY = "gravity_summary.txt"
+NAMES = (URDF, "gravity.csv", "friction_at_rest.csv", "payload.csv", GRAVITY_SUMMARY)
 README = """\
 Gravity identified from standing poses.
 
-robot.urdf          the description with masses and centres of mass that give the identified gravity torques
-gravity.csv         base parameters of the gravity regressor, with sigma
+robot.urdf            the description with masses and centres of mass that give the identified gravity torques
+gravity.csv           base parameters of the gravity regressor, with sigma
 friction_at_rest.csv  per joint: band of the friction that holds it
-payload.csv         mass and centre of payloads in the tip's frame
+payload.csv           mass and centre of payloads in the tip's frame
 
 Use robot.urdf for gravity compensation, payload checks and collision detection at rest. Inertias about the centres of
 mass, motor inertias and friction in motion were not identified (they are the description's): do not use it for
@@ -581,8 +583,8 @@ class GravityResult:
             head += ["sigma_mass [kg]", "sigma_x [m]", "sigma_y [m]", "sigma_z [m]"]
             files.write_table(out / "payload.csv", head, payloads)
         if gravity.chain.inertias is not None and self.contradiction() is None:
-            files.write(out / "robot.urdf", urdf_text(gravity, self.source, str(self.verdict)))
-        files.write(out / "summary.txt", "\n".join([*self.lines(), "", README]))
+            files.write(out / URDF, urdf_text(gravity, self.source, str(self.verdict)))
+        files.write(out / GRAVITY_SUMMARY, "\n".join([*self.lines(), "", README]))
         return out
 
 

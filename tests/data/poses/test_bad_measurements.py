@@ -181,7 +181,7 @@ def test_a_pose_outside_the_joint_limits(write, good):
 
 def test_lost_turn_and_other_zero_are_asked_for(write, good):
     """A value that fits after a whole turn, and a column that fits after a right angle, say so."""
-    wound = write(POSE, put(5, 1, 6.0)(good))
+    wound = write(POSE, put(7, 1, 3.1)(put(5, 1, 6.0)(good)))
     refused(wound, r"\(-1 turn\) is inside: was the joint wound", 6, "q2", limits=WIDE)
     first = good[0][1] + np.pi / 2
     near = ([-2.9, good[0][1] - 0.1, -2.9], [2.9, good[0][1] + 0.1, 2.9])
