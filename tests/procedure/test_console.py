@@ -7,7 +7,7 @@ from rich.table import Table
 from calib.cli import command_tree
 from calib.cli.shared import MAX_LINES, command, say
 
-LISTINGS = {"formats", "explain"}  # what they print is what was asked for
+LISTINGS = {"docs", "formats", "explain"}  # what they print is what was asked for
 
 
 def test_every_command_has_the_option():

@@ -100,7 +100,7 @@ def test_the_cell_as_told_becomes_tables():
 @pytest.mark.parametrize(
     ("answers", "words"),
     [
-        ({"instrument_at": "3000,0,1"}, "are these mm"),
+        ({"instrument_at": "3000,0,1"}, "3000 mm are 3, or '3000 mm'"),
         ({"instrument_at": "3,0"}, "expected x,y,z in metres, or the word unknown"),
         ({"cone": "30"}, "--cone needs --instrument-at"),
         ({"instrument_at": "3,0,1", "cone": "wide"}, "instrument.sight: cannot read"),
@@ -110,7 +110,7 @@ def test_the_cell_as_told_becomes_tables():
         ({"box": "1,-1,-1,1,0,2"}, "the smaller one first"),
         ({"mounting": "on top"}, "expected one of in hand, to hand"),
         ({"carried": "0,0,0.1"}, "give --mounting, too"),
-        ({"mounting": "in hand", "carried": "40,0,60"}, "are these mm"),
+        ({"mounting": "in hand", "carried": "40,0,60"}, "40 mm are 0.04, or '40 mm'"),
         ({"mounting": "in hand", "stands": "0.5,0,0"}, "and a direction"),
         ({"mounting": "in hand", "stands": "0.5,0,0 facing up"}, "--stands .*expected x"),
         ({"mounting": "in hand", "lens": "nix.yaml"}, "no such file"),

@@ -51,7 +51,7 @@ def test_session_before_typed_settings_opens(old: Path) -> None:
     assert (found.poses.fit, found.instrument.tool) == (16, (0.3, 0.05, 0.02))
     assert found.seed == 1 and found.fit.tolerance_mm == 0.0 and found.dynamics.payloads == {"loaded": Payload(3.28)}
     then = tomllib.loads(OLD)
-    then["robot"] |= {"controller": ""}
+    then["robot"] |= {"controller": "", "external": []}
     then["instrument"] |= {"reference": False}
     then["fit"] |= {"deliverable": "urdf", "holdout": 0.0, "rounds": 3}
     then["dynamics"] |= {"holdout": 0.0, "goals": [], "hard": [], "front": 0, "sigma_percent": 0.0}
