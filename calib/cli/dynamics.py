@@ -156,7 +156,7 @@ def identify_dynamics(
 
 
 def _gravity(
-    robot: Path,
+    robot: Robot,
     recordings: list[str],
     validate: list[str],
     out: Path,

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calib.api.dynamic import DynamicsModel
 from calib.data.recordings.recording import Recording
@@ -59,7 +60,7 @@ class ParallelDynamics(DynamicsModel):
     """Identified dynamics of a parallel robot, as `calib.identify_dynamics` returns them."""
 
     @one_blas_thread()
-    def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    def torques(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> np.ndarray:
         """Return the torques (N, rows) that the model predicts without payload.
 
         The rows are those of the identification: torques of the actuators [N m or N], forces on the platform's

@@ -185,10 +185,8 @@ def _find_columns(table: Table, options: RecordingOptions, joints: Joints) -> tu
     notes += [_hide(header, family.columns) for family in absent if family.series]
     # columns that a series has by its own name have no other meaning
     assigned = {column for columns in columns_of.values() for column in columns}
-    candidates = []
-    for family in log_columns.families(header, joints):
-        if assigned.isdisjoint(family.columns):
-            candidates.append(family)
+    present = log_columns.families(header, joints)
+    candidates = [family for family in present if assigned.isdisjoint(family.columns)]
     by_series, rivals = log_columns.chosen(candidates)
     by_words = {name: family for name, family in by_series.items() if name not in columns_of}
     columns_of |= {name: list(family.columns) for name, family in by_words.items()}
