@@ -236,6 +236,17 @@ def _adapter(kind: type[T]) -> TypeAdapter[T]:
     return TypeAdapter(kind)
 
 
+def interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the values of a time series, linearly interpolated at other times: (m, k).
+
+    Args:
+        times: (m,) times of the result [s].
+        t: (N,) times of the series [s], rising.
+        values: (N, k) the series.
+    """
+    return np.column_stack([np.interp(times, t, column) for column in values.T])
+
+
 def evenly(count: int, max_rows: int) -> np.ndarray:
     """Return row numbers (m,) out of `count` rows, spread evenly from first to last: all, or `max_rows` of them."""
     return np.unique(np.linspace(0, count - 1, min(count, max_rows)).astype(int))

@@ -40,7 +40,8 @@ class ResultTable:
     def of_rows(cls, rows: Iterable[Sequence[object]], columns: Sequence[str]) -> Self:
         """Return the table of rows with one cell for each of the named columns."""
         cells = list(zip(*rows)) or [()] * len(columns)
-        return cls({name: _column(values) for name, values in zip(columns, cells, strict=True)})
+        arrays = map(_column, cells)
+        return cls(dict(zip(columns, arrays, strict=True)))
 
     def __getitem__(self, column: str) -> np.ndarray:
         """Return a column (m,).
@@ -88,7 +89,7 @@ class ResultTable:
         rows += list(self)[:SHOWN_ROWS]
         columns = []
         for cells in list(zip(*rows))[:SHOWN_COLUMNS]:
-            texts = [_shown(cell) for cell in cells]
+            texts = list(map(_shown, cells))
             width = max(map(len, texts))
             columns.append([text.ljust(width) for text in texts])
         lines = ["  ".join(cells).rstrip() for cells in zip(*columns)]
@@ -111,7 +112,9 @@ def _column(values: Sequence[object]) -> np.ndarray:
 
 def _shown(cell: object) -> str:
     """Return a cell as a text, with six digits of a number."""
-    return f"{cell:.6g}" if isinstance(cell, float) else str(cell)
+    if isinstance(cell, float):
+        return f"{cell:.6g}"
+    return str(cell)
 
 
 def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:

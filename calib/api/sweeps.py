@@ -84,10 +84,13 @@ def sweep(
     if workers != 1:
         with refused_as(UsageError, (pickle.PicklingError, AttributeError, TypeError), _UNSENT):
             pickle.dumps(tasks[0])
-    results: list[Mapping[str, object]] = [{} for _ in tasks]
+    results: list[Mapping[str, object]] = [{}] * len(tasks)
     with opened(workers) as crew:
         for finished, (number, result) in enumerate(crew.completed(_row, tasks), 1):
-            results[number] = result if isinstance(result, Mapping) else {ERROR: str(result)}
+            if isinstance(result, Mapping):
+                results[number] = result
+            else:
+                results[number] = {ERROR: str(result)}
             if progress is not None:
                 progress(f"run {finished} of {len(tasks)}")
     return _table(tasks, results)
@@ -99,12 +102,14 @@ _UNSENT = "workers: {}: define functions at the top of a module, or leave worker
 def _runs(over: Over) -> list[dict[str, object]]:
     """Return what each run varies, by name."""
     if not isinstance(over, Mapping):
-        runs = [dict(run) for run in over]
+        runs = list(map(dict, over))
     else:
         for name, values in over.items():
             is_several = isinstance(values, Sequence) and not isinstance(values, str)
             require(is_several, f"over: {name}: expected several values in a list, found {values!r}", UsageError)
-        runs = [dict(zip(over, values)) for values in product(*over.values())]
+        runs = []
+        for values in product(*over.values()):
+            runs.append(dict(zip(over, values)))
     require(len(over) > 0 and len(runs) > 0, "over: nothing to run: give one value or more for each name", UsageError)
     return runs
 
@@ -196,7 +201,12 @@ def _table(tasks: Sequence[_Task], results: Sequence[Mapping[str, object]]) -> R
         row = [_label(task.varied.get(name)) for name in varied]
         row += [result.get(name) for name in names]
         rows.append([*row, result.get(ERROR, "")])
-    titles = [f"{name} (set)" if name in names else name for name in varied]
+    titles = []
+    for name in varied:
+        # the result has a figure of the same name
+        if name in names:
+            name = f"{name} (set)"
+        titles.append(name)
     return ResultTable.of_rows(rows, [*titles, *names, ERROR])
 
 

@@ -68,12 +68,19 @@ class Axes:
 
     def units(self, unit: str) -> list[str]:
         """Return the units of the axes in a program's order, for a controller whose turning joints are in `unit`."""
-        return [unit if self.turning[index] else SLIDING_UNITS[unit] for index in self.order]
+        turning = self.turning
+        units = []
+        for index in self.order:
+            if turning[index]:
+                units.append(unit)
+            else:
+                units.append(SLIDING_UNITS[unit])
+        return units
 
     def labels(self) -> list[str]:
         """Return the axes' labels in a program's order: ``axis 1`` … of the arm, ``E1`` … of the external axes."""
-        arm = [f"axis {number}" for number, _ in enumerate(self.arm, 1)]
-        external = [f"E{number}" for number, _ in enumerate(self.external, 1)]
+        arm = [f"axis {number}" for number in range(1, len(self.arm) + 1)]
+        external = [f"E{number}" for number in range(1, len(self.external) + 1)]
         return arm + external
 
     def shown(self, controller: Controller, q: np.ndarray) -> np.ndarray:
@@ -96,8 +103,9 @@ class Axes:
         return q
 
     def _sizes(self, controller: Controller) -> np.ndarray:
+        sizes = ANGLES | LENGTHS
         units = self.units(controller.unit)
-        return np.array([(ANGLES | LENGTHS)[unit] for unit in units])
+        return np.array([sizes[unit] for unit in units])
 
     def _matrix(self, controller: Controller) -> np.ndarray:
         """Return the matrix (n, n) from a description's values to displayed ones, both in a program's order."""
@@ -161,7 +169,8 @@ def named_joints(names: Sequence[str], kinds: Sequence[str]) -> list[PlainJoint]
 
 def plain_axes(count: int) -> Axes:
     """Return the axes q1 … of an arm of `count` turning joints without external axes."""
-    return Axes.plain([PlainJoint(f"q{number}") for number in range(1, count + 1)])
+    joints = [PlainJoint(f"q{number}") for number in range(1, count + 1)]
+    return Axes.plain(joints)
 
 
 def as_described(
@@ -240,13 +249,19 @@ def _accepted(controller: Controller, axes: Axes) -> bool:
 
 def _is_numbered(axes: Axes) -> bool:
     """Return whether the arm's joints have one name, numbered from 0 or 1 on, and no other joint has that name."""
-    stems = [re.sub(r"\d+", "", joint.name) for joint in axes.joints]
-    numbers = [re.sub(r"\D+", "", axes.joints[index].name) for index in axes.arm]
-    first = 0 if numbers[0] == "0" else 1
-    expected = [str(number) for number in range(first, first + len(axes.arm))]
-    arm_stems = {stems[index] for index in axes.arm}
-    external_stems = {stems[index] for index in axes.external}
-    return numbers == expected and len(arm_stems) == 1 and not arm_stems & external_stems
+    arm_stems, external_stems = set(), set()
+    numbers = []
+    for index, joint in enumerate(axes.joints):
+        stem = re.sub(r"\d+", "", joint.name)
+        if index in axes.external:
+            external_stems.add(stem)
+            continue
+        arm_stems.add(stem)
+        numbers.append(re.sub(r"\D+", "", joint.name))
+    if len(arm_stems) != 1 or arm_stems & external_stems:
+        return False
+    count = len(numbers)
+    return numbers in (list(map(str, range(count))), list(map(str, range(1, count + 1))))
 
 
 def _refusal(controller: Controller, joints: tuple[NamedJoint, ...], is_stated: bool) -> str:
@@ -261,8 +276,10 @@ def _refusal(controller: Controller, joints: tuple[NamedJoint, ...], is_stated: 
     sliding = [joint.name for joint in joints if joint.kind not in TURNING]
     if sliding:
         summary += f", of which {', '.join(sliding)} slide"
-    counts = [count for count in controller.axes if count != len(SCARA) or not controller.scara]
-    takes = " or ".join(str(count) for count in counts)
+    counts = list(controller.axes)
+    if controller.scara and len(SCARA) in counts:
+        counts.remove(len(SCARA))
+    takes = " or ".join(map(str, counts))
     expected = f"{controller.title} takes {takes} turning joints"
     if controller.scara:
         expected += " or the four of a SCARA (the third slides)"

@@ -102,6 +102,14 @@ def _matrix(node: Mapping[str, object]) -> object:
     return values.reshape(int(rows), -1).tolist()
 
 
+def by_lower_case(table: Mapping[object, object]) -> dict[str, object]:
+    """Return a table with its keys as texts in lower case."""
+    result = {}
+    for key, value in table.items():
+        result[str(key).lower()] = value
+    return result
+
+
 def is_numeric(node: object) -> bool:
     """Return whether a node is a list of numbers, or of lists of numbers."""
     return as_numbers(node) is not None
@@ -115,4 +123,6 @@ def as_numbers(node: object) -> np.ndarray | None:
         values = np.array(node, dtype=float)
     except (TypeError, ValueError):
         return None
-    return values if values.size else None
+    if not values.size:
+        return None
+    return values

@@ -69,7 +69,9 @@ def measure_kind(
     tool = np.resize(np.array(tools), count)
     if kind in ("sockets", "plane"):
         return _touched(truth, kind, q, tool, sigma, with_sigma, file, rng)
-    gravity = torque(q) if torque else None
+    gravity = None
+    if torque:
+        gravity = torque(q)
     bases = evaluate(truth.deflection, q, gravity)
     sighting = see(truth, q, station, tool, bases)
     point = sighting.point.T
@@ -85,14 +87,21 @@ def measure_kind(
         "sigma": None,
     }
     if with_sigma and sigma:
-        common["sigma"] = np.full(count if kind in ("distance", "bar") else (count, 3), sigma)
+        shape: tuple[int, ...] = (count, 3)
+        if kind in ("distance", "bar"):
+            shape = (count,)
+        common["sigma"] = np.full(shape, sigma)
     if kind in ("pose", "position"):
         common["position"] = point + sigma * rng.normal(size=point.shape)
     if kind == "pose":
-        angle = sigma if sigma_rotation is None else sigma_rotation
+        angle = sigma
+        if sigma_rotation is not None:
+            angle = sigma_rotation
         turn = Rotation.from_rotvec(angle * rng.normal(size=point.shape))
         common["quaternion"] = (turn * Rotation.from_matrix(sighting.poses()[:, :3, :3])).as_quat()
-        common["sigma_rotation"] = np.full((count, 3), angle) if with_sigma and angle else None
+        common["sigma_rotation"] = None
+        if with_sigma and angle:
+            common["sigma_rotation"] = np.full((count, 3), angle)
     elif kind == "distance":
         gap = np.linalg.norm(point[0::2] - point[1::2], axis=1) + sigma * rng.normal(size=count // 2)
         common["distance"] = np.repeat(gap, 2)
@@ -163,11 +172,16 @@ def _touched(
         "tool_names": (truth.tool_names[tool[0]],),
         "file": file,
     }
-    spread = np.full((int(good.sum()), 3), sigma) if with_sigma and sigma else None
+    shape: tuple[int, ...] = (int(good.sum()), 3)
     if kind == "plane":
-        return Planes(sigma=None if spread is None else spread[:, 0], **common)
-    links = tuple((2 * k, 2 * k + 1, PAIR) for k in range(pairs))
-    return Sockets(sigma=spread, links=links, **common)
+        shape = shape[:1]
+    common["sigma"] = None
+    if with_sigma and sigma:
+        common["sigma"] = np.full(shape, sigma)
+    if kind == "plane":
+        return Planes(**common)
+    links = tuple((2 * pair, 2 * pair + 1, PAIR) for pair in range(pairs))
+    return Sockets(links=links, **common)
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

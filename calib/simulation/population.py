@@ -228,7 +228,9 @@ class PlantedArm:
             torque = gravity_of(calibrated.inputs.weighed, values)
         else:
             arm, torque = self._placed(calibrated, values, true), None
-        bases = evaluate(arm.deflection, values, torque) if arm.deflection.terms else None
+        bases = None
+        if arm.deflection.terms:
+            bases = evaluate(arm.deflection, values, torque)
         predicted = see(arm, values, bases=bases).point.T
         return np.linalg.norm(predicted - true[:, :3, 3], axis=1)
 
@@ -245,7 +247,10 @@ class PlantedArm:
             values: parameter of each joint of the term [N m or N], or one for all.
         """
         count = len(term.drive_terms(self.cell.nominal))
-        numbers = np.full(count, values) if np.ndim(values) == 0 else shaped(values, (count,), "values")
+        if np.ndim(values) == 0:
+            numbers = np.full(count, values)
+        else:
+            numbers = shaped(values, (count,), "values")
         return replace(self, friction=(*self.friction, (term, tuple(numbers.tolist()))))
 
     def __repr__(self) -> str:
@@ -258,7 +263,10 @@ def _series(motion: Motion, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray,
     Raises:
         UsageError: other than four arrays of these shapes.
     """
-    arrays = (motion.t, motion.q, motion.v, motion.a) if isinstance(motion, Reference) else tuple(motion)
+    if isinstance(motion, Reference):
+        arrays = (motion.t, motion.q, motion.v, motion.a)
+    else:
+        arrays = tuple(motion)
     require(len(arrays) == 4, f"motion: expected t, q, v, a, found {len(arrays)} arrays", UsageError)
     t = shaped(arrays[0], (None,), "t")
     shape = (len(t), n)

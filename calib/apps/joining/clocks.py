@@ -22,7 +22,7 @@ from calib.apps.joining.clock_steps import BACKLASH, Equations
 from calib.apps.joining.order import MAX_MISFIT
 from calib.apps.joining.stream_files import Stream
 from calib.errors import refuse_data
-from calib.records import evenly
+from calib.records import evenly, interpolated
 from calib.toolkit.chains import Chain, Deflection, Term, forward
 from calib.toolkit.installations import (
     EFFECTS,
@@ -260,8 +260,7 @@ def _step_lengths(positions: np.ndarray) -> np.ndarray:
 def _even(stream: Stream) -> np.ndarray:
     """Return a stream's values (m, k) interpolated at times `GRID` [s] apart."""
     t = np.arange(stream.t[0], stream.t[-1], GRID)
-    columns = [np.interp(t, stream.t, column) for column in stream.values.T]
-    return np.column_stack(columns)
+    return interpolated(t, stream.t, stream.values)
 
 
 def _cut(speed: np.ndarray) -> np.ndarray:

@@ -49,6 +49,7 @@ from calib.apps.joining.stated import check_columns, stated
 from calib.apps.joining.streams import join_streams
 from calib.arguments import checked
 from calib.errors import MeasurementError, UsageError, counted, finding, listing, one_of, refuse_data
+from calib.records import interpolated
 from calib.toolkit.chains import CalibratedChain, Chain, as_described, controllers, load_calibrated
 from calib.toolkit.installations import check_scale
 from calib.toolkit.pose_data import (
@@ -505,7 +506,7 @@ def _at_times(
             columns.append(joints.numbers(name, None))
     values = np.column_stack(columns)
     shifts = np.linspace(-STANDSTILL, STANDSTILL, 5)
-    around = np.stack([_interpolated(point_times + shift, t, values) for shift in shifts])
+    around = np.stack([interpolated(point_times + shift, t, values) for shift in shifts])
     motion, travel = np.ptp(around, axis=0), np.ptp(values, axis=0)
     still = (motion <= MAX_MOTION * travel + 1e-12).all(axis=1)
     interpolated = Table(joints.file, tuple(names), tuple(units), tuple(around[2].T), points.rows)
@@ -518,14 +519,3 @@ def _at_times(
         notes.append(f"outside the log: rows {listing(points.rows[~in_log])}")
     pose = np.where(in_log & still, np.arange(len(point_times)), -1)
     return interpolated, pose, tuple(notes)
-
-
-def _interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the values of a time series, linearly interpolated at other times: (m, k).
-
-    Args:
-        times: (m,) times of the result [s].
-        t: (N,) times of the series [s], rising.
-        values: (N, k) the series.
-    """
-    return np.column_stack([np.interp(times, t, column) for column in values.T])

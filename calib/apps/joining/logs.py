@@ -107,7 +107,9 @@ def log_of(table: Table) -> Log:
     for text in words_of(Path(table.file).stem.lower()):
         if UNIT_WORDS.get(text, "").lower() in UNITS.get(quantity, {}):
             unit = UNIT_WORDS[text]
-    t = seconds(table, clock) if clock else np.zeros(0)
+    t = np.zeros(0)
+    if clock:
+        t = seconds(table, clock)
     return Log(table, clock, t, quantity, unit)
 
 
@@ -127,7 +129,9 @@ def seconds(table: Table, name: str) -> np.ndarray:
     if table.units[column]:
         return times * table.factor(column, TIMES, "")
     timed = time_column([name])
-    unit = timed[1] if timed is not None else ""
+    unit = ""
+    if timed is not None:
+        unit = timed[1]
     return times * TIMES[unit or likely_unit(times) or "s"]
 
 
@@ -153,14 +157,15 @@ def join_logs(first: Table, second: Table, by: str = "") -> JoinedLogs:
     else:
         values, rows, notes = _by_time(base, added)
     names = _names(base, added)
-    header = ["t", *names[: len(base.names)], *names[len(base.names) :]]
-    t = base.t if len(base.t) else np.arange(len(base.table), dtype=float)
-    units = ["s" if len(base.t) else "", *_units(base), *_units(added)]
-    # as texts: times since 1970 have more digits than other numbers are written with
-    times = np.array([f"{time:.9f}" for time in t[rows]], dtype=object)
-    cells = (times, *base.values[rows].T, *values.T)
-    if not len(base.t):
-        header, units, cells = header[1:], units[1:], cells[1:]
+    header = list(names)
+    units = _units(base) + _units(added)
+    cells = [*base.values[rows].T, *values.T]
+    if len(base.t):
+        header.insert(0, "t")
+        units.insert(0, "s")
+        # as texts: times since 1970 have more digits than other numbers are written with
+        times = [f"{time:.9f}" for time in base.t[rows]]
+        cells.insert(0, np.array(times, dtype=object))
     table = Table(added.table.file, tuple(header), tuple(units), tuple(cells), base.table.rows[rows])
     notes += _mapping(base, names[: len(base.names)]) + _mapping(added, names[len(base.names) :])
     return JoinedLogs(table, np.flatnonzero(rows), (*first.notes, *second.notes, *notes))
@@ -221,7 +226,10 @@ def _names(base: Log, added: Log) -> list[str]:
             )
     names = []
     for log in (base, added):
-        names += [_with_quantity(name, log.quantity) if name in common else name for name in log.names]
+        for name in log.names:
+            if name in common:
+                name = _with_quantity(name, log.quantity)
+            names.append(name)
     return names
 
 
@@ -235,14 +243,21 @@ def _with_quantity(name: str, quantity: str) -> str:
 
 def _units(log: Log) -> list[str]:
     """Return the unit of each of a log's columns: from the header, else from the file's name."""
-    return [log.table.units[log.table.index(name)] or log.unit for name in log.names]
+    units = []
+    for name in log.names:
+        unit = log.table.units[log.table.index(name)]
+        units.append(unit or log.unit)
+    return units
 
 
 def _mapping(log: Log, names: Sequence[str]) -> list[str]:
     """Return a note on the columns of a log, by the names that they have in the joined table."""
     entries = []
     for name, new in zip(log.names, names):
-        entries.append(new if name.lstrip("- ") == new else f"{name} as {new}")
+        if name.lstrip("- ") == new:
+            entries.append(new)
+        else:
+            entries.append(f"{name} as {new}")
     note = f"columns {listing(entries, MAX_LISTED)}"
     if log.clock:
         note = f"times from '{log.clock}', {note}"

@@ -24,7 +24,9 @@ from calib.toolkit.recordings import SYNONYMS
 
 PLACEHOLDER = re.compile(r"\{(?:joint|n)\}")
 # units of groups of columns: name of the group → expression that their names match
-GROUPS = {"position": "|".join(POSITION.names), "joints": r"q(\d+|_.+)", **{name: rf"{name}_.+" for name in SYNONYMS}}
+GROUPS = {"position": "|".join(POSITION.names), "joints": r"q(\d+|_.+)"}
+for _series in SYNONYMS:
+    GROUPS[_series] = rf"{_series}_.+"
 
 
 @strict
@@ -50,8 +52,11 @@ def read_mapping(path: Path | None) -> JoinOptions:
     if path is None:
         return JoinOptions()
     tables = read_toml(path)
-    own_tables = {key: tables[key] for key in ("columns", "units") if key in tables}
-    return parse(JoinOptions, own_tables, str(path))
+    mapping = {}
+    for key in ("columns", "units"):
+        if key in tables:
+            mapping[key] = tables[key]
+    return parse(JoinOptions, mapping, str(path))
 
 
 def clock_names(columns: Mapping[str, str]) -> JoinOptions:
@@ -60,7 +65,8 @@ def clock_names(columns: Mapping[str, str]) -> JoinOptions:
     Args:
         columns: the toolkit's name of a column → the file's.
     """
-    return JoinOptions({name: heading for name, heading in columns.items() if name in CLOCKS})
+    clocks = {name: heading for name, heading in columns.items() if name in CLOCKS}
+    return JoinOptions(clocks)
 
 
 def mapped(tables: tuple[Table, Table], options: JoinOptions) -> tuple[tuple[Table, Table], list[str]]:
@@ -81,8 +87,10 @@ def mapped(tables: tuple[Table, Table], options: JoinOptions) -> tuple[tuple[Tab
             raise MeasurementError(f"[units] {name}: no column of this name; found: {', '.join(names)}", first.file)
     notes = []
     for table, renamed in zip(tables, (first, second)):
-        pairs = zip(renamed.header, table.header)
-        entries = [f"{new} = '{old}'" for new, old in pairs if new != old]
+        entries = []
+        for new, old in zip(renamed.header, table.header):
+            if new != old:
+                entries.append(f"{new} = '{old}'")
         if entries:
             notes.append(f"{table.file}: read as {', '.join(entries)}")
     return (first, second), notes
@@ -118,7 +126,9 @@ def _matches(table: Table, name: str, heading: str) -> Iterator[tuple[int, str]]
         expression = f"{re.escape(start)}(.+){re.escape(end)}"
     elif name in SYNONYMS and name not in OURS:
         expression = f"{re.escape(heading)}[\\W_]*(.+)"
+    if not expression:
+        return
     for column, old in enumerate(table.header):
-        match = re.fullmatch(expression, old) if expression else None
+        match = re.fullmatch(expression, old)
         if match:
             yield column, f"{name}_{match[1]}"

@@ -129,7 +129,7 @@ def _joint_columns(table: Table, options: FileOptions, chain: Chain | None) -> t
     """
     if chain is not None:
         return Sheet(table, options).find_joints(joints_of(chain))
-    names = {heading: name for name, heading in options.columns.items()}
+    names = dict(zip(options.columns.values(), options.columns))
     joints = [heading for heading in table.header if _JOINT.fullmatch(names.get(heading, heading))]
     message = f"the options state the unit of joints, but which of {', '.join(table.header)} are joints is not known"
     require(joints or JOINTS not in options.units, f"{table.file}: {message}: give --robot", UsageError)
@@ -179,10 +179,14 @@ def _exchanged(table: Table, columns: Sequence[str], names: Sequence[str], cells
         cells: their (m,) values.
         note: a remark for the user.
     """
-    remaining = [k for k, name in enumerate(table.header) if name not in columns]
-    header = [*names, *(table.header[k] for k in remaining)]
-    units = [*("" for _ in names), *(table.units[k] for k in remaining)]
-    values = [*cells, *(table.cells[k] for k in remaining)]
+    header = list(names)
+    units = [""] * len(names)
+    values = list(cells)
+    for name, unit, column in zip(table.header, table.units, table.cells):
+        if name not in columns:
+            header.append(name)
+            units.append(unit)
+            values.append(column)
     return replace(table, header=tuple(header), units=tuple(units), cells=tuple(values), notes=(*table.notes, note))
 
 
@@ -202,7 +206,9 @@ def _renamed(table: Table, options: FileOptions, joints: Sequence[str]) -> Table
         if heading not in names and heading in names.values():
             notes.append(f"{Path(table.file).name}: column {heading} is not read, since the options state another")
             continue
-        family = JOINTS if heading in joints else FAMILIES.get(_SUFFIX.sub("", name), "")
+        family = FAMILIES.get(_SUFFIX.sub("", name), "")
+        if heading in joints:
+            family = JOINTS
         unit = header_unit
         for key in (name, heading, family):
             stated_unit = options.units.get(key, "")

@@ -121,9 +121,10 @@ def in_controller(
         base = base_frame(controller, arm, world)
         tip = flange_frame(controller, arm, flange)
     for index, frame in enumerate(placed, 1):
-        is_base = frame.reference == base_name
-        form = controller.base_frame if is_base else controller.tool_frame
-        yield from frame_lines(frame.frame, form, controller, frame.pose, base if is_base else tip, index)
+        form, reference = controller.tool_frame, tip
+        if frame.reference == base_name:
+            form, reference = controller.base_frame, base
+        yield from frame_lines(frame.frame, form, controller, frame.pose, reference, index)
 
 
 def description_of(source: Path, chain: Chain) -> Description:

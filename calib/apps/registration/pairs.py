@@ -100,7 +100,9 @@ def _is_board_in_camera(pairs: PosePairs) -> bool | None:
         return True
     if of & LENS_WORDS and frame & BOARD_WORDS:
         return False
-    return True if pairs.camera.name.lower() in EASY_HANDEYE else None
+    if pairs.camera.name.lower() in EASY_HANDEYE:
+        return True
+    return None
 
 
 def _mounting_by_name(pairs: PosePairs, inverse: bool) -> str:
@@ -113,7 +115,9 @@ def _mounting_by_name(pairs: PosePairs, inverse: bool) -> str:
     board_in_camera = _is_board_in_camera(pairs)
     if board_in_camera is None:
         return ""
-    return IN_HAND if board_in_camera == inverse else TO_HAND
+    if board_in_camera == inverse:
+        return IN_HAND
+    return TO_HAND
 
 
 def _robot_is_inverse(pairs: PosePairs, reading: Reading, mounting: str) -> str:
@@ -151,7 +155,9 @@ def free_flyer(poses: np.ndarray, pairs: PosePairs, robot: Chain | None) -> tupl
         kind = "prismatic" if axis[0] == "t" else "revolute"
         joints.append(Joint(name, kind))
         elements.append(Element(f"robot.{name}", axis, owner=index, joint=index, placement=placements.get(name)))
-    base, tip = ("base", "tool") if robot is None else (robot.base, robot.tip)
+    base, tip = "base", "tool"
+    if robot is not None:
+        base, tip = robot.base, robot.tip
     chain = Chain(Path(pairs.file).stem, tuple(joints), tuple(elements), base=base, tip=tip)
     angles = Rotation.from_matrix(rotation.T @ poses[:, :3, :3]).as_euler("ZYX")
     return chain, np.hstack([poses[:, :3, 3] - middle, angles])

@@ -40,7 +40,8 @@ class Example:
     @property
     def text(self) -> str:
         """The example as the text of a CSV file."""
-        return "\n".join(",".join(row) for row in (self.header, *self.rows)) + "\n"
+        lines = map(",".join, (self.header, *self.rows))
+        return "\n".join(lines) + "\n"
 
 
 def example_of(session: Session, kind: str) -> Example:
@@ -59,7 +60,8 @@ def example_of(session: Session, kind: str) -> Example:
         joints = measured_columns(session)[: chain.n]
         rows = []
         for k, values in enumerate(q, 1):
-            rows.append((f"image_{k:02d}.png", *(f"{value:.3f}" for value in _shown(chain, values))))
+            cells = [f"{value:.3f}" for value in _shown(chain, values)]
+            rows.append((f"image_{k:02d}.png", *cells))
         return Example(("image", *joints), tuple(rows), WITH_IMAGES)
 
     header = measured_columns(session)
@@ -90,6 +92,9 @@ def _shown(chain: Chain, q: np.ndarray) -> list[float]:
     """Return joint values (n,) in the units in which they are shown: degrees and millimetres."""
     displayed = []
     for joint, value in zip(chain.joints, q):
-        factor, _ = JOINT["prismatic" if joint.kind == "prismatic" else "revolute"]
+        kind = "revolute"
+        if joint.kind == "prismatic":
+            kind = "prismatic"
+        factor, _ = JOINT[kind]
         displayed.append(factor * float(value))
     return displayed

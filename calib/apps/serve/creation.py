@@ -42,11 +42,19 @@ def creation_page(values: dict[str, str] | None = None, problem: str = "", had_f
         had_files: whether files came with them, which have to be chosen again.
     """
     choices = {"instrument": list(INSTRUMENTS), "program": ["none", *controllers()], "dynamics": ["yes", "no"]}
-    further = [question for question in QUESTIONS if question.name not in (*ALWAYS, *FILES, "details")]
-    first = [question for question in QUESTIONS if question.name in ALWAYS and question.name != "robot"]
-    certificate = [question for question in further if question.of is CertificateSection]
-    further = [question for question in further if question.of is Answers]
-    status = 400 if problem else 200
+    first, further, certificate = [], [], []
+    for question in QUESTIONS:
+        if question.name in (*FILES, "details"):
+            continue
+        if question.name in ALWAYS:
+            first.append(question)
+        elif question.of is CertificateSection:
+            certificate.append(question)
+        elif question.of is Answers:
+            further.append(question)
+    status = 200
+    if problem:
+        status = 400
     return page_of(
         "new.html",
         status,
@@ -84,8 +92,10 @@ async def create(request: Request) -> Response:
         try:
             await run_in_threadpool(_made, folder, values, uploaded)
         except (CalibError, OSError) as error:
+            message = str(error)
             foreseen = complaint(error)
-            message = foreseen[0] if foreseen else str(error)
+            if foreseen:
+                message = foreseen[0]
             message = message.replace(f"{temporary}/", "the uploaded ")
             return creation_page(values, message, bool(uploaded))
     return back()

@@ -22,7 +22,7 @@ import numpy as np
 
 from calib.config_types import shown
 from calib.data.images.lens import NAMES, Lens
-from calib.data.trees import as_numbers, read_tree
+from calib.data.trees import as_numbers, by_lower_case, read_tree
 from calib.errors import CalibError, MeasurementError, refused_as, suggestion
 
 # Distortion models of programs, and the models of this toolkit.
@@ -86,7 +86,7 @@ def read_lens(path: str | Path, size: tuple[int, int] = (0, 0)) -> Lens:
 def _cameras(node: object, name: str = "") -> Iterator[tuple[str, Node]]:
     """Yield name and table of each camera in a tree: each table with a camera matrix or focal lengths."""
     if isinstance(node, Mapping):
-        table = _by_lower_case(node)
+        table = by_lower_case(node)
         if _has_focal_lengths(table):
             yield name, table
             return
@@ -102,11 +102,6 @@ def _has_focal_lengths(table: Node) -> bool:
     if "intrinsics" in table and as_numbers(table["intrinsics"]) is not None:
         return True
     return bool(_key(table, MATRIX_KEYS) or _focal_keys(table))
-
-
-def _by_lower_case(table: Node) -> dict[str, object]:
-    """Return a table with its keys in lower case."""
-    return {str(key).lower(): value for key, value in table.items()}
 
 
 def _key(table: Node, keys: tuple[str, ...]) -> str:
@@ -134,7 +129,7 @@ def _intrinsics(table: Node, path: Path) -> np.ndarray:
     value = table[key]
     if isinstance(value, Mapping):
         # Zivid: a matrix by the names of its numbers
-        by_name = _by_lower_case(value)
+        by_name = by_lower_case(value)
         if _focal_keys(by_name):
             return _intrinsics(by_name, path)
     matrix = _numbers(value, key, path)
@@ -208,7 +203,7 @@ def _coefficients(table: Node, name: str, path: Path) -> np.ndarray:
         return _numbers(None, DISTORTION_KEYS[0], path)
     value = table[key]
     if isinstance(value, Mapping) and "data" not in value:
-        by_name = _by_lower_case(value)
+        by_name = by_lower_case(value)
         numbers = list(map(by_name.get, NAMES[MODELS[name]][4:]))
         while numbers and numbers[-1] is None:
             numbers.pop()

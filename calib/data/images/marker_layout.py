@@ -4,6 +4,7 @@ A board's markers are numbered row by row, so that the number of columns follows
 columns, that is taken whose flat board explains the markers' corners best (homography, RANSAC).
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -74,8 +75,12 @@ def layout_words(image: np.ndarray, board: Board) -> str:
             if candidate.legacy:
                 values += ", legacy = true"
             return f"{count}: {cause}; they fit {values}: state this in board.toml"
+    squares = int(ids.max() + 1)
+    # a marker in every other square
+    if board.kind == "charuco":
+        squares *= 2
     for columns in range(2, MAX_COLUMNS + 1):
-        rows = -(-int(ids.max() + 1) * (2 if board.kind == "charuco" else 1) // columns) + 1
+        rows = math.ceil(squares / columns) + 1
         for legacy in (False, True):
             candidate = _sized(board, columns, rows + rows % 2, legacy)
             if columns != board.columns and _explains(candidate, ids, pixels):
@@ -100,8 +105,10 @@ def _candidates(board: Board) -> Iterator[tuple[Board, str]]:
             candidate = _sized(board, width, height, legacy)
             if legacy and not has_two_patterns(candidate):
                 continue
-            causes = [difference, OLD_PATTERN if legacy else ""]
-            yield candidate, ", and ".join(cause for cause in causes if cause)
+            causes = [difference]
+            if legacy:
+                causes.append(OLD_PATTERN)
+            yield candidate, ", and ".join(filter(None, causes))
 
 
 def _sized(board: Board, columns: int, rows: int, legacy: bool) -> Board:

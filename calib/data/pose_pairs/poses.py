@@ -156,12 +156,16 @@ class PoseList:
             if self.convention:
                 orders = (self.convention, *(order for order in orders if order != self.convention))
             for order in orders:
-                numbers = self.turn if order == "x y z w" else np.roll(self.turn, -1, axis=1)
+                numbers = self.turn
+                if order != "x y z w":
+                    numbers = np.roll(numbers, -1, axis=1)
                 yield order, Rotation.from_quat(numbers).as_matrix()
             return
         values = self.turn * self._angle_factor()
         if not conventions:
-            conventions = (self.convention,) if self.convention else EULER
+            conventions = EULER
+            if self.convention:
+                conventions = (self.convention,)
         for convention in conventions:
             yield convention, from_angles(values, convention).as_matrix()
 

@@ -145,7 +145,9 @@ def _component_of_word(part: str, beside: list[str]) -> tuple[str, int] | None:
     if part in tuple("xyzw"):
         number = "xyzw".index(part)
         if not turns:
-            return ("position", number) if part != "w" else COMPONENTS["w"]
+            if part == "w":
+                return COMPONENTS["w"]
+            return "position", number
         if turns & {"rvec", "rotvec"}:
             return "vector", number
         if turns & {"euler", "rpy", "angle", "angles"}:

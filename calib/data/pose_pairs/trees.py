@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.pose_pairs.poses import PoseList, PosePairs, paired
-from calib.data.trees import as_numbers, is_numeric, read_tree
+from calib.data.trees import as_numbers, by_lower_case, is_numeric, read_tree
 from calib.errors import MeasurementError
 
 SUFFIXES = (".yaml", ".yml", ".json", ".xml", ".samples")
@@ -110,14 +110,14 @@ def _poses_in(sample: object) -> dict[str, Raw]:
 def _of_samples(samples: Sequence[object], path: Path) -> list[PoseList]:
     """Return two lists of poses, from samples with both poses."""
     names = list(_poses_in(samples[0]))
-    poses: dict[str, list[Raw]] = {name: [] for name in names}
+    poses: dict[str, list[Raw]] = {}
     for number, sample in enumerate(samples, 1):
         of_sample = _poses_in(sample)
         if list(of_sample) != names and set(of_sample) != set(names):
             message = f"sample {number} has {', '.join(of_sample) or 'no pose'}, sample 1 has {' and '.join(names)}"
             raise MeasurementError(f"{message}: every sample needs both poses; remove or complete it", path)
         for name in names:
-            poses[name].append(of_sample[name])
+            poses.setdefault(name, []).append(of_sample[name])
     return [_joined(name, poses[name], path) for name in names]
 
 
@@ -140,7 +140,8 @@ def _of_parallel(node: Mapping[str, object]) -> list[PoseList]:
         if isinstance(content, Mapping) and len(content) <= MAX_KEYS:
             # the poses of a PoseArray, with its header beside them
             for entry in content.values():
-                value = entry if isinstance(entry, list) else value
+                if isinstance(entry, list):
+                    value = entry
         if not isinstance(value, list) or len(value) < MIN_SAMPLES:
             continue
         complete = list(filter(None, map(pose_of, value)))
@@ -179,17 +180,24 @@ def _part(key: str, value: list[object]) -> tuple[str, str, np.ndarray, str] | N
     if numbers is None:
         return None
     numbers = numbers.reshape(len(value), -1)
-    match = _PARALLEL.fullmatch(key) if re.match(r"(?i)[rtq](vecs?)?_", key) else None
-    match = match or _PARALLEL_LAST.fullmatch(key) or _PARALLEL.fullmatch(key)
+    patterns = [_PARALLEL_LAST, _PARALLEL]
+    if re.match(r"(?i)[rtq](vecs?)?_", key):
+        patterns.reverse()
+    match = patterns[0].fullmatch(key) or patterns[1].fullmatch(key)
     if match is None:
         return None
     part = match["part"].lower().rstrip("s")
     if part in ("t", "tvec", "tran", "trans", "translation", "position"):
-        return (match["of"], "position", numbers, "") if numbers.shape[1] == 3 else None
+        if numbers.shape[1] != 3:
+            return None
+        return match["of"], "position", numbers, ""
     if numbers.shape[1] not in (3, 4, 9):
         return None
     # OpenCV's functions take rotation vectors and matrices under one name
-    return match["of"], "turn", numbers, "vector" if numbers.shape[1] == 3 else ""
+    convention = ""
+    if numbers.shape[1] == 3:
+        convention = "vector"
+    return match["of"], "turn", numbers, convention
 
 
 def pose_of(node: object) -> Raw | None:
@@ -200,7 +208,7 @@ def pose_of(node: object) -> Raw | None:
             position and an orientation in a list.
     """
     if isinstance(node, Mapping):
-        return _pose_of_table(_by_lower_case(node))
+        return _pose_of_table(by_lower_case(node))
     if not isinstance(node, list):
         return None
     if len(node) == 2 and not is_numeric(node):
@@ -214,11 +222,6 @@ def pose_of(node: object) -> Raw | None:
     if len(values) in (6, 7):
         return values[:3], values[3:], ""
     return None
-
-
-def _by_lower_case(table: Mapping[object, object]) -> dict[str, object]:
-    """Return a table with its keys in lower case."""
-    return {str(key).lower(): value for key, value in table.items()}
 
 
 def _pose_of_two(first: object, second: object) -> Raw | None:
@@ -262,9 +265,11 @@ def _position(table: Mapping[str, object]) -> np.ndarray | None:
         if key in table:
             value = table[key]
             if isinstance(value, Mapping):
-                return _components(_by_lower_case(value), "xyz")
+                return _components(by_lower_case(value), "xyz")
             numbers = as_numbers(value)
-            return numbers.ravel() if numbers is not None and numbers.size == 3 else None
+            if numbers is None or numbers.size != 3:
+                return None
+            return numbers.ravel()
     return _components(table, "xyz")
 
 
@@ -274,19 +279,21 @@ def _turn(table: Mapping[str, object]) -> tuple[np.ndarray, str] | None:
         if key in table:
             value = table[key]
             if isinstance(value, Mapping):
-                return _turn_of_components(_by_lower_case(value), "")
+                return _turn_of_components(by_lower_case(value), "")
             numbers = as_numbers(value)
             if numbers is None or numbers.size not in (3, 4, 9):
                 return None
+            if numbers.size != 3:
+                return numbers.ravel(), ""
             if key == "rpy":
                 convention = "xyz fixed"
-            return numbers.ravel(), convention if numbers.size == 3 else ""
+            return numbers.ravel(), convention
     return _turn_of_components(table, "q")
 
 
 def _turn_of_components(table: Mapping[str, object], mark: str) -> tuple[np.ndarray, str] | None:
     """Return the orientation of named numbers: x y z w (after `mark`), roll pitch yaw, rx ry rz, or a b c."""
-    quaternion = _components(table, ("qx", "qy", "qz", "qw") if mark else "xyzw")
+    quaternion = _components(table, [mark + axis for axis in "xyzw"])
     if quaternion is not None:
         return quaternion, "x y z w"
     for names, convention in ((("roll", "pitch", "yaw"), "xyz fixed"), (("rx", "ry", "rz"), ""), ("abc", "zyx moving")):
@@ -296,10 +303,14 @@ def _turn_of_components(table: Mapping[str, object], mark: str) -> tuple[np.ndar
     if mark:
         return None
     angles = _components(table, "xyz")
-    return None if angles is None else (angles, "")
+    if angles is None:
+        return None
+    return angles, ""
 
 
 def _components(table: Mapping[str, object], names: Sequence[str]) -> np.ndarray | None:
     """Return the numbers of a table under these names; None if one is missing or no number."""
     values = list(map(table.get, names))
-    return as_numbers(values) if None not in values else None
+    if None in values:
+        return None
+    return as_numbers(values)

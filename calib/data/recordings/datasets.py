@@ -48,9 +48,10 @@ def dataset_table(path: Path) -> Table:
         UsageError: pyarrow is not installed.
         MeasurementError: a file that cannot be read, or without columns of numbers.
     """
-    root = path if path.is_dir() else _root(path)
+    root = _root(path)
     files = [path]
     if path.is_dir():
+        root = path
         files = sorted((path / "data").rglob("*.parquet"))
         if not files:
             refuse_data(path, "has no file data/**/*.parquet: was the data set downloaded without its data?")
@@ -59,11 +60,15 @@ def dataset_table(path: Path) -> Table:
     for file in files:
         for name, values in _columns(file, names).items():
             columns.setdefault(name, []).append(values)
-    lengths = {sum(len(part) for part in parts) for parts in columns.values()}
+    arrays = {}
+    for name, parts in columns.items():
+        arrays[name] = np.concatenate(parts)
+    lengths = set(map(len, arrays.values()))
     if len(lengths) != 1:
         refuse_data(path, "has no columns of numbers, or files with different columns")
-    arrays = {name: np.concatenate(parts) for name, parts in columns.items()}
-    notes = [f"read as {'a LeRobot data set' if root else 'a Parquet file'}"]
+    notes = ["read as a Parquet file"]
+    if root:
+        notes = ["read as a LeRobot data set"]
     notes += _with_episodes(arrays)
     header = [name for name in arrays if name not in COUNTERS]
     count = lengths.pop()
@@ -146,7 +151,7 @@ def _headings(name: str, parts: Sequence[str], count: int) -> list[str]:
         count: number of its numbers.
     """
     if len(parts) != count:
-        parts = [str(number) for number in range(count)]
+        parts = list(map(str, range(count)))
     headings = []
     for part in parts:
         if QUANTITIES.keys() & set(words_of(name)):

@@ -8,7 +8,6 @@ reference, or columns that are not read. Of several topics with positions, the f
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 
 from calib.data.csv_table import Table
 from calib.data.joint_columns import joint_series, words_of
@@ -24,7 +23,9 @@ _WORDS = {
     "torque": "tau torque torques trq torq effort efforts eff moment drehmoment couple par coppia 力矩 扭矩",
     "current": "i current currents curr amps strom courant corriente corrente 电流",
 }
-QUANTITIES: Mapping[str, str] = {token: series for series, tokens in _WORDS.items() for token in tokens.split()}
+QUANTITIES: dict[str, str] = {}
+for _series, _tokens in _WORDS.items():
+    QUANTITIES.update(dict.fromkeys(_tokens.split(), _series))
 TIME_WORDS = {"t", "time", "times", "timestamp", "timestamps", "stamp", "clock", "header"}
 TIME_WORDS |= {"zeit", "zeitstempel", "temps", "tiempo", "tempo", "时间"}
 UNITS_OF_TIME = {"s": "s", "sec": "s", "secs": "s", "seconds": "s", "ms": "ms", "us": "us", "ns": "ns"}
@@ -43,7 +44,9 @@ REFERENCE = {
     "action",
     "d",
 }
+REFERENCE_SERIES = {"q": "q_ref"}
 FEEDFORWARD = {"ff", "feedforward"}
+FEEDFORWARD_SERIES = {"torque": "tau_ff"}
 # Words of a heading whose values are no measurement of the quantity itself.
 UNREAD = {"error", "errors", "err", "limit", "min", "max", "tolerance", "offset", "std", "sigma", "variance"}
 UNREAD |= {"external", "ext", "estimated", "model", "computed", "output", "acceleration", "accelerations", "hat"}
@@ -63,7 +66,10 @@ def time_column(header: Sequence[str]) -> tuple[int, str] | None:
         units = UNITS_OF_TIME.keys() & set(tokens)
         time_words = set(tokens) - units
         if time_words and len(units) <= 1 and time_words <= TIME_WORDS:
-            return column, UNITS_OF_TIME[units.pop()] if units else ""
+            unit = ""
+            if units:
+                unit = UNITS_OF_TIME[units.pop()]
+            return column, unit
     return None
 
 
@@ -88,8 +94,8 @@ class Family:
     @property
     def topic(self) -> str:
         """The pattern without the words of the quantity: equal for all quantities of one message."""
-        names = [name for name in re.split(r"[\W_]+", self.pattern) if name.lower() not in QUANTITIES]
-        return "/".join(names)
+        names = re.split(r"[\W_]+", self.pattern)
+        return "/".join([name for name in names if name.lower() not in QUANTITIES])
 
 
 def families(header: Sequence[str], joints: Joints) -> list[Family]:
@@ -138,9 +144,9 @@ def series_of(tokens: Sequence[str]) -> str:
         return ""
     series = quantities[-1]
     if FEEDFORWARD & set(tokens):
-        return "tau_ff" if series == "torque" else ""
+        return FEEDFORWARD_SERIES.get(series, "")
     if REFERENCE & set(tokens):
-        return "q_ref" if series == "q" else ""
+        return REFERENCE_SERIES.get(series, "")
     for (of_series, token), special in SPECIAL.items():
         if series == of_series and token in tokens:
             return special
@@ -167,13 +173,19 @@ def chosen(candidates: Sequence[Family]) -> tuple[dict[str, Family], tuple[str, 
     by_topic: dict[str, set[str]] = {}
     for family in candidates:
         by_topic.setdefault(family.topic, set()).add(family.series)
-    complete = [topic for topic, series in by_topic.items() if "q" in series and series & {"torque", "current"}]
+    complete = []
+    for topic, series in by_topic.items():
+        if "q" in series and series & {"torque", "current"}:
+            complete.append(topic)
     ranked: dict[tuple[bool, bool], list[Family]] = {}
     for family in candidates:
         ranked.setdefault((family.topic not in complete[:1], not family.by_name), []).append(family)
+    in_order: list[Family] = []
+    for rank in sorted(ranked):
+        in_order += ranked[rank]
     families_by_series: dict[str, Family] = {}
     rivals = []
-    for family in chain.from_iterable(ranked[rank] for rank in sorted(ranked)):
+    for family in in_order:
         first = families_by_series.setdefault(family.series, family)
         if family.series and first is not family and first.by_name == family.by_name:
             rivals.append(family.pattern)
@@ -246,7 +258,9 @@ def paste(header: Sequence[str], joints: Joints, needed: Sequence[str]) -> str:
             unknown = unknown[count:]
         elif groups:
             entries.append(f'{series} = "{groups.pop(first_group)}"')
-    return f"columns = {{ {', '.join(entries)} }}" if entries else ""
+    if not entries:
+        return ""
+    return f"columns = {{ {', '.join(entries)} }}"
 
 
 def _joint_by_joint(series: str, header: Sequence[str], columns: Sequence[int]) -> list[str]:
@@ -262,7 +276,9 @@ def mapping_line(header: Sequence[str], joints: Joints, columns_of: Mapping[str,
         joints: the robot's joints.
         columns_of: the columns of each series.
     """
-    pattern_of = {family.columns: family.pattern for family in families(header, joints)}
+    pattern_of = {}
+    for family in families(header, joints):
+        pattern_of[family.columns] = family.pattern
     entries = []
     for series in SYNONYMS:
         columns = tuple(columns_of.get(series, ()))

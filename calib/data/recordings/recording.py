@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from calib.data.recordings.column_faults import ColumnFault
 from calib.errors import MeasurementError, UsageError, one_of, refuse_data, refuse_option, refused_as
-from calib.records import frozen
+from calib.records import frozen, interpolated
 
 KINDS = ("torque", "current")
 SERIES = ("q", "v", "effort", "tau_link", "tau_motor", "q_link", "q_ref", "tau_ff")
@@ -258,8 +258,7 @@ def earlier(recording: Recording, lag: float) -> Recording:
     for name in LATE:
         values = getattr(recording, name)
         if values is not None:
-            columns = [np.interp(t, recording.t, column) for column in values.T]
-            shifted[name] = np.column_stack(columns)
+            shifted[name] = interpolated(t, recording.t, values)
     notes = (*recording.notes, f"torques are shifted {1e3 * lag:g} ms earlier, as the option lag states")
     return replace(recording, notes=notes, **shifted).take(covered)
 

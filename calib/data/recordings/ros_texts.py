@@ -133,7 +133,10 @@ def _message(cells: list[str], tool: str, header: tuple[str, ...]) -> _Message |
     message = _Message(time, names, {"q": groups[0]})
     letters = ["q", "v", "tau"]
     if len(header) == len(cells):
-        letters = [letter for name, letter in INTERFACES.items() if f"field.{name}0" in header]
+        letters = []
+        for name, letter in INTERFACES.items():
+            if f"field.{name}0" in header:
+                letters.append(letter)
     if len(letters) == len(groups):
         message.values = dict(zip(letters, groups))
     elif len(groups) == 2:
@@ -147,7 +150,10 @@ def _time(cells: list[str], tool: str) -> str:
     """Return the time of a row [s] as text, without loss of digits."""
     if tool == ROS2:
         return f"{cells[0]}.{int(cells[1]):09d}"
-    nanoseconds = int(cells[2]) if cells[2].isdigit() and int(cells[2]) else int(cells[0])
+    nanoseconds = int(cells[0])
+    # the header's stamp, where it is set
+    if cells[2].isdigit() and int(cells[2]):
+        nanoseconds = int(cells[2])
     return f"{nanoseconds // 10**9}.{nanoseconds % 10**9:09d}"
 
 
@@ -158,7 +164,7 @@ def _dynamic(message: _Message, cells: list[str]) -> _Message | None:
         message: the message without values.
         cells: the cells.
     """
-    columns: dict[str, list[str]] = {letter: [] for letter in INTERFACES.values()}
+    columns: dict[str, list[str]] = {}
     start = 0
     for _ in message.names:
         interfaces = _first_names(cells[start:])
@@ -168,7 +174,8 @@ def _dynamic(message: _Message, cells: list[str]) -> _Message | None:
             return None
         by_interface = dict(zip(interfaces, values))
         for interface, letter in INTERFACES.items():
-            columns[letter].append(by_interface.get(interface, "").strip())
+            cell = by_interface.get(interface, "")
+            columns.setdefault(letter, []).append(cell.strip())
         start += 2 * count
     if start != len(cells):
         return None

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.data.csv_table import Table
+from calib.records import interpolated
 
 # Longest time over which values are interpolated, in median steps of the series, and at least [s] (our choice).
 MAX_STEPS, MIN_GAP = 5.0, 0.01
@@ -75,6 +76,6 @@ def at_times(t: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray
     distance = np.minimum(np.abs(t[after] - times), np.abs(times - t[after - 1]))
     in_gap = (t[after] - t[after - 1] > max_gap) & (distance > SAME_TIME)
     in_gap |= (times < t[0] - SAME_TIME) | (times > t[-1] + SAME_TIME)
-    result = np.column_stack([np.interp(times, t, column) for column in values.T])
+    result = interpolated(times, t, values)
     result[in_gap] = np.nan
     return result

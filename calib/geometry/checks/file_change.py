@@ -83,8 +83,11 @@ def changed_since_fit(cell: Installation, blocks: Sequence[PoseMeasurements], fi
         if before < MIN_BEFORE * fitted:
             continue
         best = min(changes, key=lambda change: change.after)
-        others = [change.after for change in changes if change is not best]
-        if best.after > MAX_AFTER * fitted or best.after > MAX_RIVAL * min(others, default=np.inf):
+        rival = np.inf
+        for change in changes:
+            if change is not best:
+                rival = min(rival, change.after)
+        if best.after > MAX_AFTER * fitted or best.after > MAX_RIVAL * rival:
             continue
         name = Path(block.file).name or "measurements"
         values = {"before": before, "after": best.after, "change": best.text, "cure": CURES[best.kind]}

@@ -107,7 +107,9 @@ def _best_factor(fit: GeometricFit, rows: WhitenedRows) -> RowChange | None:
     rivals = [best_gain(rows, residuals, subject).gain for subject in _rivals(rows, list(zeros.values()), joint)]
     if cost - best.gain > MAX_RIVAL_LEFT * (cost - max(rivals)):
         return None
-    return best if holds_on_held_out(rows, best) else None
+    if not holds_on_held_out(rows, best):
+        return None
+    return best
 
 
 def _zero_columns(fit: GeometricFit, rows: WhitenedRows) -> Iterator[tuple[str, np.ndarray]]:

@@ -69,7 +69,9 @@ def direction(arm: np.ndarray, measured: np.ndarray) -> Direction:
     inverse = median_misfit(arm, opposite)
     smaller, larger = sorted((direct, inverse))
     if smaller < limit:
-        is_inverse = inverse < direct if larger > CLEAR_RATIO * smaller else None
+        is_inverse = None
+        if larger > CLEAR_RATIO * smaller:
+            is_inverse = inverse < direct
         return Direction(direct, inverse, is_inverse, True)
     part_direct = min(_misfits_of_parts(arm, measured), default=direct)
     part_inverse = min(_misfits_of_parts(arm, opposite), default=inverse)

@@ -244,7 +244,9 @@ def _unexplained_function(samples: MotionSamples, offsets: bool = True) -> Calla
 
     # Bodies and offsets are free, the drives' other parameters not negative.
     drives = samples.drives.reshape(m, n, n, 4)
-    free_columns = [samples.inertial, drives[..., 3]] if offsets else [samples.inertial]
+    free_columns = [samples.inertial]
+    if offsets:
+        free_columns.append(drives[..., 3])
     free = weighted_rows(np.concatenate(free_columns, axis=2))
     free = free @ spanning(free.T @ free)
     positive = weighted_rows(drives[..., :3].reshape(m, n, -1))

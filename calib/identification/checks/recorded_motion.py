@@ -17,6 +17,7 @@ from calib.data.recordings.recording import Recording
 from calib.dynamics.bodies import Bodies, bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics, regressor
 from calib.identification.rows import Case, segments
+from calib.records import interpolated
 from calib.robot.chain import Chain
 from calib.trajectories.errors import BadInput
 from calib.trajectories.recall import Recalled, find_periods, sliding_products
@@ -166,7 +167,7 @@ def _on_grid(recording: Recording) -> tuple[np.ndarray, np.ndarray]:
         recording: recording of n joints.
     """
     grid = _coarse(recording.t)
-    return grid, _sampled(recording.t, recording.q, grid)
+    return grid, interpolated(grid, recording.t, recording.q)
 
 
 def _coarse(t: np.ndarray) -> np.ndarray:
@@ -176,11 +177,6 @@ def _coarse(t: np.ndarray) -> np.ndarray:
     stops = np.append(t[before_gap] + MAX_GAP, t[-1])
     pieces = [np.arange(start, stop, STEP) for start, stop in zip(starts, stops)]
     return np.concatenate(pieces)
-
-
-def _sampled(t: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
-    """Return values (M, n), recorded at times `t` (M,), interpolated linearly at the times `grid` (N,), as (N, n)."""
-    return np.column_stack([np.interp(grid, t, column) for column in values.T])
 
 
 def _one_period(motion: DesignedMotion, speed: float = 1.0) -> np.ndarray:
@@ -265,8 +261,8 @@ def share_of_nominal(
             judged.
     """
     grid = _coarse(t)
-    torque = _smooth(_sampled(t, effort, grid))
-    positions = _sampled(t, q, grid)
+    torque = _smooth(interpolated(grid, t, effort))
+    positions = interpolated(grid, t, q)
     q = _smooth(positions, 0)
     v = _smooth(positions, 1)
     a = _smooth(positions, 2)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.identification.checks.recorded_motion import CREEP, MotionSamples, spanning
+from calib.records import interpolated
 
 LAGS = 0.25
 """Largest lag that is tried [s]."""
@@ -336,8 +337,7 @@ def _turning(samples: MotionSamples, rate: float) -> list[np.ndarray]:
     regressors = []
     for early in (-FREE_TIME, FREE_TIME):
         shifted = samples.index + early * rate
-        shifted_velocities = [np.interp(shifted, times, velocity) for velocity in samples.velocity.T]
-        v = np.stack(shifted_velocities, axis=1)
+        v = interpolated(shifted, times, samples.velocity)
         sign = np.tanh(v / CREEP)[:, :, None]
         regressors.append(sign * np.eye(v.shape[1]))
     return regressors

@@ -78,7 +78,9 @@ class FrictionTerm:
             UsageError: a joint that the arm does not have, or a function that is no friction term
                 (`calib.identification.friction.function_tables.knots_of`).
         """
-        numbers = range(1, chain.n + 1) if self.joints is None else self.joints
+        numbers = self.joints
+        if numbers is None:
+            numbers = range(1, chain.n + 1)
         terms = []
         for number in numbers:
             if isinstance(number, bool) or number not in range(1, chain.n + 1):
@@ -97,9 +99,14 @@ class FrictionTerm:
             if not math.isfinite(fastest):
                 fastest = FASTEST[joint.kind]
             return -fastest, fastest
-        turn = math.pi if joint.kind == "revolute" else 1.0
-        lower = joint.lower if math.isfinite(joint.lower) else -turn
-        upper = joint.upper if math.isfinite(joint.upper) else turn
+        lower, upper = joint.lower, joint.upper
+        reach = 1.0
+        if joint.kind == "revolute":
+            reach = math.pi
+        if not math.isfinite(lower):
+            lower = -reach
+        if not math.isfinite(upper):
+            upper = reach
         return lower, upper
 
     def _table(self, lower: float, upper: float, title: str) -> tuple[float, ...]:

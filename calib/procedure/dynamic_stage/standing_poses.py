@@ -182,7 +182,7 @@ class GravityModel:
         count = self.chain.n
         estimate = self.standard[: 10 * count].reshape(-1, 10)
         reference = self.reference[: 10 * count].reshape(-1, 10)
-        return np.array([_with_centre(old, new) for old, new in zip(reference, estimate)])
+        return np.array(list(map(_with_centre, reference, estimate)))
 
     def payload(self, label: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Return first moments and mass (4,) of a payload in the tip's frame, and their covariance (4, 4).
@@ -205,6 +205,11 @@ def _with_centre(reference: np.ndarray, estimate: np.ndarray) -> np.ndarray:
     body = np.concatenate([np.zeros(6), estimate[6:10]])
     _, _, steiner = urdf_write.centred(body)
     return np.concatenate([moments - steiner, estimate[6:10]])
+
+
+def _torques(poses: Sequence[StandingPoses]) -> np.ndarray:
+    """Return the torques (N, n) of the poses of all files."""
+    return np.concatenate([block.torque for block in poses])
 
 
 def _regressor(model: IdentificationModel, poses: StandingPoses) -> np.ndarray:
@@ -326,10 +331,14 @@ def fitted(chain: Chain, options: IdentifyOptions, poses: Sequence[StandingPoses
     q = np.concatenate([block.q for block in poses])
     zero = np.zeros(q.shape)
     base = base_parameters.find(model, States(q, zero, zero), loads)
-    columns = [_regressor(model, block)[..., base.kept] for block in poses]
+    columns, torques, approaches = [], [], []
+    for block in poses:
+        columns.append(_regressor(model, block)[..., base.kept])
+        torques.append(block.torque)
+        if block.approach is not None:
+            approaches.append(block.approach)
     W = np.concatenate(columns)
-    torque = np.concatenate([block.torque for block in poses])
-    approaches = [block.approach for block in poses if block.approach is not None]
+    torque = np.concatenate(torques)
     sided = len(approaches) == len(poses)
     count, n = torque.shape
     if W.shape[0] * n < ROWS * base.b:
@@ -420,11 +429,11 @@ class GravityResult:
         predict = self.gravity.torque
         if described:
             predict = self.gravity.described
-        return np.concatenate([block.torque - predict(block) for block in self.unseen])
+        return _torques(self.unseen) - np.concatenate(list(map(predict, self.unseen)))
 
     def unexplained(self, described: bool = False) -> float:
         """Return the share of the held-out torques that is not explained."""
-        torque = np.concatenate([block.torque for block in self.unseen])
+        torque = _torques(self.unseen)
         return float(np.linalg.norm(self.errors(described)) / np.linalg.norm(_varying(torque)))
 
     def contradiction(self) -> Verdict | None:
@@ -442,7 +451,7 @@ class GravityResult:
             blocks = [_regressor(model, block) @ gravity.reference for block in self.training]
             columns.append(_varying(np.concatenate(blocks)))
         W = np.array(columns).T
-        torque = _varying(np.concatenate([block.torque for block in self.training]))
+        torque = _varying(_torques(self.training))
         size = np.linalg.norm(assumed)
         expected = W @ assumed
         if not np.linalg.norm(expected):
@@ -512,7 +521,7 @@ class GravityResult:
             )
         if np.isnan(sigma).all():
             result.append("with columns approach1 … (+1, -1: the side from which a joint came) friction is estimated")
-        result += [self._payload_line(label) for label in self._labels()]
+        result += map(self._payload_line, self._labels())
         if chain.inertias is None:
             result.append("the description has no masses: gravity.csv is written, but no robot.urdf")
         verdict = self.verdict
@@ -548,9 +557,9 @@ class GravityResult:
         states = base_parameters.random_samples(model, lower=lower, upper=upper)
         zero = np.zeros(states.q.shape)
         possible = base_parameters.find(model, States(states.q, zero, zero), _loads(self.training))
-        missing = [name for name in possible.names if name not in gravity.base.names]
         if possible.b <= gravity.base.b:
             return []
+        missing = [name for name in possible.names if name not in gravity.base.names]
         count = possible.b - gravity.base.b
         names = ""
         if missing:
@@ -674,11 +683,10 @@ def identify_gravity(
     """
     settings = read_options(options)
     chain = load_calibrated(robot, base, tip).chain
-    blocks = [read_poses(name, chain, settings) for name in recordings]
-    if validate:
-        training, unseen = blocks, [read_poses(name, chain, settings) for name in validate]
-    else:
-        training, unseen = divided(blocks, seed)
+    training = [read_poses(name, chain, settings) for name in recordings]
+    unseen = [read_poses(name, chain, settings) for name in validate]
+    if not validate:
+        training, unseen = divided(training, seed)
     gravity = fitted(chain, settings, training)
     return GravityResult(gravity, tuple(training), tuple(unseen), Path(resolve(robot)))
 
