@@ -63,7 +63,7 @@ from calib.toolkit.pose_data import (
     read_fit_options,
     read_table,
 )
-from calib.toolkit.recordings import dataset_table, is_dataset
+from calib.toolkit.recordings import dataset_table, is_dataset, series_of, words_of
 from calib.toolkit.result_folders import joints_of, lines_of
 
 METHODS = ("name", "time", "row", "geometry", "motion")
@@ -508,8 +508,10 @@ def _at_times(
     shifts = np.linspace(-STANDSTILL, STANDSTILL, 5)
     around = np.stack([interpolated(point_times + shift, t, values) for shift in shifts])
     motion, travel = np.ptp(around, axis=0), np.ptp(values, axis=0)
-    still = (motion <= MAX_MOTION * travel + 1e-12).all(axis=1)
-    interpolated = Table(joints.file, tuple(names), tuple(units), tuple(around[2].T), points.rows)
+    # torques and currents are never at rest
+    may_be_position = np.array([series_of(words_of(name)) in ("", "q") for name in names])
+    still = (motion <= MAX_MOTION * travel + 1e-12)[:, may_be_position].all(axis=1)
+    at_points = Table(joints.file, tuple(names), tuple(units), tuple(around[2].T), points.rows)
 
     notes = [f"{len(points)} points, joined by time with a log of {t[-1] - t[0]:.4g} s"]
     moving = in_log & ~still
@@ -518,4 +520,4 @@ def _at_times(
     if not in_log.all():
         notes.append(f"outside the log: rows {listing(points.rows[~in_log])}")
     pose = np.where(in_log & still, np.arange(len(point_times)), -1)
-    return interpolated, pose, tuple(notes)
+    return at_points, pose, tuple(notes)
