@@ -28,6 +28,7 @@ from calib import files
 from calib.data.csv_table import read_header, read_table
 from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_files import read_at_rest
+from calib.data.schema import refuse
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
 from calib.dynamics.base import Base
@@ -64,6 +65,10 @@ SAME = 0.02
 HELD_OUT = 0.25
 # least rows of torques per base parameter
 ROWS = 2.0
+# rows of torques per parameter, and held-out poses, below which nothing passes: errors of so few tell little
+FEW_ROWS, FEW_HELD_OUT = 4.0, 5
+# sigmas below zero from which on friction is called negative
+NEGATIVE = 3.0
 # unexplained share of the torques' variation up to which a model passes, and above which it fails (those of motion)
 PASS, FAIL = 0.10, 0.30
 # prior deviations by which what the poses do not tell is divided: share of a mass, and first moment per mass [m]
@@ -134,7 +139,9 @@ class GravityModel:
         model: its bodies and payloads, and an offset of each torque.
         base: base parameters of the gravity regressor, of which `values` are those identified.
         values, covariance: (b,) base parameters, (b, b) their covariance.
-        friction: (n,) band of the friction at rest [N m or N], ± this; (n,) its sigma where it was estimated, else NaN.
+        friction: (n,) band of the friction at rest [N m or N], ± this, with its sign where it was estimated; (n,) its
+            sigma where it was estimated, else NaN.
+        rows: torques per parameter.
         reference: (p,) standard parameters of the description; zero where it has no masses.
     """
 
@@ -145,6 +152,14 @@ class GravityModel:
     covariance: np.ndarray
     friction: tuple[np.ndarray, np.ndarray]
     reference: np.ndarray
+    rows: float = np.inf
+
+    def held(self, poses: StandingPoses) -> np.ndarray:
+        """Return the friction (N, n) that holds joints of known approach; zero where it is unknown."""
+        if poses.approach is None:
+            return np.zeros(poses.q.shape)
+        band, sigma = self.friction
+        return poses.approach * np.where(np.isnan(sigma), 0.0, band)
 
     def torque(self, poses: StandingPoses) -> np.ndarray:
         """Return the gravity torques (N, n) at poses, offsets included."""
@@ -295,6 +310,11 @@ def read_poses(path: str, chain: Chain, options: IdentifyOptions) -> StandingPos
             "has currents: gravity at rest is identified from torques; write columns tau1 … with gain x current [N m]",
             path,
         )
+    columns = [f"q{joint}" for joint in range(1, chain.n + 1)]
+    columns += [f"tau{joint}" for joint in range(1, chain.n + 1)]
+    values = np.hstack([recording.q, recording.effort])
+    message = "found {:g} where a number is needed; leave such rows out, or measure them again"
+    refuse(recording, ~np.isfinite(values), columns, lambda row, k: message.format(values[row, k]))
     groups: Sequence[np.ndarray] = list(np.arange(len(recording.q))[:, None])
     if stamped:
         groups = _standing_rows(recording)
@@ -303,21 +323,41 @@ def read_poses(path: str, chain: Chain, options: IdentifyOptions) -> StandingPos
         q.append(recording.q[rows].mean(axis=0))
         torque.append(recording.effort[rows].mean(axis=0))
     approach = None
-    table = read_table(path)
-    names = [f"approach{joint}" for joint in range(1, chain.n + 1)]
-    if all(name in table for name in names):
-        sides = np.column_stack([table.numbers(name, None) for name in names])
-        approach = np.array([np.sign(sides[rows[0]]) for rows in groups])
+    sides = _approaches(path, chain.n)
+    if sides is not None:
+        approach = np.array([sides[rows[0]] for rows in groups])
     return StandingPoses(path, np.array(q), np.array(torque), approach, tuple(settings.payload))
 
 
-def fitted(chain: Chain, options: IdentifyOptions, poses: Sequence[StandingPoses]) -> GravityModel:
+def _approaches(path: str, n: int) -> np.ndarray | None:
+    """Return the columns ``approach1`` … (N, n) of a table; None without them.
+
+    Raises:
+        MeasurementError: some joints have none, or values other than +1, -1 and 0.
+    """
+    table = read_table(path)
+    names = [f"approach{joint}" for joint in range(1, n + 1)]
+    absent = [name for name in names if name not in table]
+    if len(absent) == n:
+        return None
+    if absent:
+        raise MeasurementError(
+            f"has columns of approach for some joints, but no {listing(absent, 3)}: write 0 where it is unknown", path
+        )
+    sides = np.column_stack([table.numbers(name, None) for name in names])
+    message = "found {:g}: an approach is +1 (the joint moved upwards before it stood), -1 (downwards) or 0 (unknown)"
+    refuse(table, ~np.isin(sides, (-1.0, 0.0, 1.0)), names, lambda row, k: message.format(sides[row, k]))
+    return sides
+
+
+def fitted(chain: Chain, options: IdentifyOptions, poses: Sequence[StandingPoses], held_out: int = 0) -> GravityModel:
     """Return the gravity model of an arm, fitted to standing poses by weighted least squares.
 
     Args:
         chain: the arm.
         options: options with gravity and payloads.
         poses: the poses of each file.
+        held_out: number of poses of these files that are held out.
 
     Raises:
         MeasurementError: too few poses for the parameters.
@@ -341,27 +381,36 @@ def fitted(chain: Chain, options: IdentifyOptions, poses: Sequence[StandingPoses
             approaches.append(block.approach)
     W = np.concatenate(columns)
     torque = np.concatenate(torques)
-    sided = len(approaches) == len(poses)
     count, n = torque.shape
     if W.shape[0] * n < ROWS * base.b:
-        needed = int(np.ceil(ROWS * base.b / n))
+        needed = np.ceil(ROWS * base.b / n)
+        measured = f"{count} standing poses"
+        if held_out:
+            needed = np.ceil(needed / (1.0 - HELD_OUT))
+            measured = f"{count + held_out} standing poses, {held_out} of them held out,"
         raise MeasurementError(
-            f"{count} standing poses for {base.b} parameters of gravity and offsets: measure at least {needed}, spread "
-            "over the joints' ranges",
+            f"{measured} for {base.b} parameters of gravity and offsets: measure at least {needed:.0f}, spread over "
+            "the joints' ranges",
             poses[0].name,
         )
-    if sided:
+    sided = np.zeros(n, dtype=bool)
+    if len(approaches) == len(poses):
         approach = np.concatenate(approaches)
-        W = np.concatenate([W, approach[:, :, None] * np.eye(n)], axis=2)
-    values, covariance, residual = _least_squares(W, torque)
-    friction = np.quantile(np.abs(residual), 0.95, axis=0), np.full(n, np.nan)
-    if sided:
-        friction = np.abs(values[base.b :]), np.sqrt(np.diag(covariance))[base.b :]
+        sided = (approach > 0.0).any(axis=0) & (approach < 0.0).any(axis=0)
+        W = np.concatenate([W, (approach[:, :, None] * np.eye(n))[..., sided]], axis=2)
+    values, covariance, residual, sigma = _least_squares(W, torque)
+    band = np.maximum(np.quantile(np.abs(residual), 0.95, axis=0), sigma)
+    deviation = np.full(n, np.nan)
+    band[sided] = values[base.b :]
+    deviation[sided] = np.sqrt(np.diag(covariance))[base.b :]
+    friction = band, deviation
+    per_parameter = count * n / W.shape[2]
     reference = np.zeros(model.p)
     if chain.inertias is not None:
         arm = standard_parameters(chain)
         reference[: len(arm)] = arm
-    return GravityModel(chain, model, base, values[: base.b], covariance[: base.b, : base.b], friction, reference)
+    parameters = covariance[: base.b, : base.b]
+    return GravityModel(chain, model, base, values[: base.b], parameters, friction, reference, per_parameter)
 
 
 def _loads(blocks: Sequence[StandingPoses]) -> tuple[tuple[str, ...], ...]:
@@ -369,8 +418,11 @@ def _loads(blocks: Sequence[StandingPoses]) -> tuple[tuple[str, ...], ...]:
     return tuple(dict.fromkeys(block.carried for block in blocks))
 
 
-def _least_squares(W: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return estimate (b,), covariance (b, b) and residuals (N, n), with each joint weighted by its residuals.
+def _least_squares(W: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return estimate (b,), covariance (b, b), residuals (N, n) and their sigma (n,), which weighs the joints.
+
+    A joint's degrees of freedom are its rows less their leverage. Its residual at equal weights counts as one more row:
+    few rows cannot give a joint a weight that leaves it no residual.
 
     Args:
         W: (N, n, b) regressor.
@@ -381,15 +433,20 @@ def _least_squares(W: np.ndarray, torque: np.ndarray) -> tuple[np.ndarray, np.nd
     sizes = np.maximum(np.linalg.norm(W.reshape(-1, b), axis=0), 1e-12)
     values, residual = np.zeros(b), torque
     inverse = np.zeros((b, count * n))
+    before = None
     for _ in range(ROUNDS):
         weighted = (W / sizes / sigma[:, None]).reshape(-1, b)
         inverse = np.linalg.pinv(weighted)
         values = inverse @ (torque / sigma).ravel() / sizes
         residual = torque - W @ values
-        degrees = max(count - b / n, 1.0)
-        sigma = np.maximum(np.sqrt(np.sum(residual**2, axis=0) / degrees), 1e-6)
+        leverage = np.sum(weighted * inverse.T, axis=1).reshape(count, n)
+        degrees = np.sum(1.0 - leverage, axis=0).clip(min=0.0)
+        squares = np.sum(residual**2, axis=0)
+        if before is None:
+            before = squares / np.maximum(degrees, 1.0)
+        sigma = np.maximum(np.sqrt((squares + before) / (degrees + 1.0)), 1e-6)
     covariance = inverse @ inverse.T / np.outer(sizes, sizes)
-    return values, covariance, residual
+    return values, covariance, residual, sigma
 
 
 def divided(blocks: Sequence[StandingPoses], seed: int) -> tuple[list[StandingPoses], list[StandingPoses]]:
@@ -398,12 +455,20 @@ def divided(blocks: Sequence[StandingPoses], seed: int) -> tuple[list[StandingPo
     Args:
         blocks: the poses of each file.
         seed: seed of the random choice.
+
+    Raises:
+        MeasurementError: a file with one distinct pose.
     """
     random = np.random.default_rng(seed)
     training, unseen = [], []
     for block in blocks:
         _, pose = np.unique(np.round(block.q / SAME), axis=0, return_inverse=True)
         distinct = int(pose.max()) + 1
+        if distinct == 1:
+            raise MeasurementError(
+                f"has one distinct pose (rows: {len(block.q)}): measure others too, spread over the joints' ranges",
+                block.name,
+            )
         chosen = random.permutation(distinct)[: max(1, round(HELD_OUT * distinct))]
         out = np.isin(pose.ravel(), chosen)
         training.append(block.where(~out))
@@ -431,7 +496,8 @@ class GravityResult:
         predict = self.gravity.torque
         if described:
             predict = self.gravity.described
-        return _torques(self.unseen) - np.concatenate(list(map(predict, self.unseen)))
+        errors = [block.torque - self.gravity.held(block) - predict(block) for block in self.unseen]
+        return np.concatenate(errors)
 
     def unexplained(self, described: bool = False) -> float:
         """Return the share of the held-out torques that is not explained."""
@@ -493,6 +559,11 @@ class GravityResult:
         if self.gravity.chain.inertias is not None:
             reason += f" (description: {100 * self.unexplained(True):.3g} %)"
         reason += ", for gravity at rest only"
+        if self.gravity.chain.inertias is not None and share > self.unexplained(True):
+            return Verdict("fail", reason + "; the description is better", "", "use the description as it is")
+        doubt = self._doubt()
+        if doubt is not None and share <= FAIL:
+            return Verdict(doubt.level, f"{reason}; {doubt.reason}", "", doubt.advice)
         if share <= PASS:
             return Verdict("pass", reason)
         advice = "are torques those of the motors at rest, and are joints, signs and units the description's?"
@@ -500,6 +571,24 @@ class GravityResult:
         if share <= FAIL:
             level = "marginal"
         return Verdict(level, reason, "", advice)
+
+    def _doubt(self) -> Verdict | None:
+        """Return what keeps a model from passing that predicts well: friction below zero, or few rows."""
+        gravity = self.gravity
+        band, sigma = gravity.friction
+        negative = np.flatnonzero(band < -NEGATIVE * sigma)
+        if len(negative):
+            joints = listing([gravity.chain.joint_names[joint] for joint in negative], 3)
+            level = "marginal"
+            if gravity.chain.inertias is None:
+                level = "fail"
+            advice = "are the columns approach1 … reversed, or have the torques the other sign?"
+            return Verdict(level, f"friction at rest is negative: {joints}", "", advice)
+        held_out = len(self.errors())
+        if gravity.rows < FEW_ROWS or held_out < FEW_HELD_OUT:
+            few = f"few poses: {gravity.rows:.2g} torques per parameter and {held_out} held-out poses"
+            return Verdict("marginal", few, "", f"measure {FEW_ROWS:g} per parameter and {FEW_HELD_OUT} held-out poses")
+        return None
 
     def lines(self) -> list[str]:
         """Return the lines for the console and ``summary.txt``."""
@@ -518,11 +607,15 @@ class GravityResult:
             basis = f"± {deviation:.2g}, from both approaches"
             if np.isnan(deviation):
                 basis = "band of 95 %"
+            friction = f"± {width:.3g}" if width >= 0.0 else f"{width:.3g}"
             result.append(
-                f"{joint.name}: held out {error:.3g} {unit} rms; friction at rest ± {width:.3g} {unit} ({basis})"
+                f"{joint.name}: held out {error:.3g} {unit} rms; friction at rest {friction} {unit} ({basis})"
             )
         if np.isnan(sigma).all():
             result.append("with columns approach1 … (+1, -1: the side from which a joint came) friction is estimated")
+        without = [block.name for block in self.training if block.approach is None]
+        if without and len(without) < len(self.training):
+            result.append(f"columns approach1 … of the other files are not used: {listing(without, 3)} has none")
         result += map(self._payload_line, self._labels())
         if chain.inertias is None:
             result.append("the description has no masses: gravity.csv is written, but no robot.urdf")
@@ -687,9 +780,11 @@ def identify_gravity(
     chain = load_calibrated(robot, base, tip).chain
     training = [read_poses(name, chain, settings) for name in recordings]
     unseen = [read_poses(name, chain, settings) for name in validate]
+    held_out = 0
     if not validate:
         training, unseen = divided(training, seed)
-    gravity = fitted(chain, settings, training)
+        held_out = sum(len(block.q) for block in unseen)
+    gravity = fitted(chain, settings, training, held_out)
     return GravityResult(gravity, tuple(training), tuple(unseen), Path(resolve(robot)))
 
 

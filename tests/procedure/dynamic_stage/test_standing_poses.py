@@ -10,6 +10,7 @@ import pinocchio
 import pytest
 
 from calib import cli
+from calib.errors import MeasurementError
 from calib.procedure.dynamic_stage.standing_poses import identify_gravity, stand
 from calib.robot.chain import Chain
 from calib.robot.formats.urdf_write import write_new
@@ -183,8 +184,98 @@ def test_too_few_poses_and_corners_are_said(tmp_path, arm, capsys):
     q = drawn(4)
     few = write(tmp_path / "few.csv", q, held(model, q))
     assert cli.run(["identify", str(urdf), few, "--out", str(tmp_path / "out")]) == 2
-    assert "standing poses for" in capsys.readouterr().err
+    assert "4 standing poses, 1 of them held out" in capsys.readouterr().err
     q = drawn(80)
     q[:, 1:4] = [0.3, 0.0, 0.5]
     corner = identify_gravity(urdf, [write(tmp_path / "corner.csv", q, held(model, q))])
     assert any("need other poses" in line for line in corner.lines())
+
+
+def sided(model: pinocchio.Model, q: np.ndarray, side: np.ndarray, **options: object) -> np.ndarray:
+    """Return torques with friction of the stated approaches, and noise."""
+    noise = np.random.default_rng(1).normal(0.0, 0.02, q.shape)
+    return torques(model, q, **options) + STICTION * side + noise  # type: ignore[arg-type]
+
+
+def test_friction_of_known_approach_is_no_error(tmp_path, arm, monkeypatch):
+    """Held-out poses are predicted with the friction of their approach; with payloads too."""
+    urdf, _, model = arm
+    monkeypatch.chdir(tmp_path)
+    q = drawn(40)
+    side = sides(q)
+    write(Path("empty.csv"), q, sided(model, q, side), side)
+    write(Path("loaded.csv"), q, sided(model, q, side, load=PAYLOAD), side)
+    Path("o.toml").write_text(OPTIONS)
+    for result in [
+        identify_gravity(urdf, ["empty.csv"]),
+        identify_gravity(urdf, ["empty.csv", "loaded.csv"], (), Path("o.toml")),
+    ]:
+        assert result.verdict == "pass"
+        assert np.sqrt(np.mean(result.errors() ** 2)) < 0.04
+
+
+def test_reversed_approach_columns_do_not_pass(tmp_path, arm):
+    urdf, _, model = arm
+    q = drawn(40)
+    side = sides(q)
+    result = identify_gravity(urdf, [write(tmp_path / "p.csv", q, sided(model, q, side), -side)])
+    assert result.verdict == "marginal" and "friction at rest is negative" in result.verdict.reason
+    assert "approach1 … reversed" in result.verdict.advice
+
+
+def test_few_poses_do_not_pass(tmp_path, arm):
+    """Without friction: the band is neither zero nor far above the noise of 0.02 N m."""
+    urdf, _, model = arm
+    q = drawn(8)
+    result = identify_gravity(urdf, [write(tmp_path / "p.csv", q, sided(model, q, np.zeros(q.shape)))])
+    assert result.verdict != "pass"
+    band, _ = result.gravity.friction
+    assert np.all(band > 0.004) and np.all(band < 0.2)
+
+
+def test_a_worse_model_than_the_description_fails(tmp_path, arm):
+    urdf, _, model = arm
+    described = pinocchio.buildModelFromXML(urdf.read_text())
+    q, other = drawn(40), drawn(20, 5)
+    fit = write(tmp_path / "fit.csv", q, held(model, q))
+    result = identify_gravity(urdf, [fit], [write(tmp_path / "other.csv", other, torques(described, other))])
+    assert result.verdict == "fail" and "the description is better" in result.verdict.reason
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda table: table.__setitem__((3, 8), np.nan), "row 4, column 'tau2': found nan"),
+        (lambda table: table.__setitem__((3, 15), 2.0), "row 4, column 'approach2': found 2"),
+        (lambda table: table.__setitem__((slice(None), slice(7)), 0.3), "one distinct pose"),
+    ],
+)
+def test_invalid_cells_and_equal_poses_are_refused(tmp_path, arm, change, words):
+    urdf, _, model = arm
+    q = drawn(20)
+    table = np.hstack([q, torques(model, q), sides(q)])
+    change(table)
+    path = write(tmp_path / "p.csv", table[:, :7], table[:, 7:14], table[:, 14:])
+    with pytest.raises(MeasurementError, match=words):
+        identify_gravity(urdf, [path])
+
+
+def test_missing_approach_columns_are_said(tmp_path, arm):
+    urdf, _, model = arm
+    q = drawn(20)
+    told = Path(write(tmp_path / "told.csv", q, torques(model, q), sides(q)))
+    untold = write(tmp_path / "untold.csv", q, torques(model, q))
+    lines = identify_gravity(urdf, [str(told), untold]).lines()
+    assert any("are not used" in line and "untold.csv has none" in line for line in lines)
+    told.write_text(told.read_text().replace("approach2", "other"))
+    with pytest.raises(MeasurementError, match="no approach2"):
+        identify_gravity(urdf, [str(told)])
+
+
+def test_the_needed_number_contains_the_held_out_poses(tmp_path, arm):
+    urdf, _, model = arm
+    q = drawn(40)
+    with pytest.raises(MeasurementError, match="5 standing poses, 1 of them held out") as caught:
+        identify_gravity(urdf, [write(tmp_path / "five.csv", q[:5], torques(model, q[:5]))])
+    needed = int(re.search(r"at least (\d+)", str(caught.value)).group(1))
+    identify_gravity(urdf, [write(tmp_path / "enough.csv", q[:needed], torques(model, q[:needed]))])
