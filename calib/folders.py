@@ -21,6 +21,9 @@ from calib.records import plain_text, read_rows
 
 Row = TypeVar("Row")
 
+GRAVITY_SUMMARY = "gravity_summary.txt"
+"""File that identifies the gravity of standing poses."""
+
 METRICS, SESSION, STATE = "metrics.json", "session.toml", "state.json"
 """Files that identify results and sessions; the metrics are written last and mark a folder as complete."""
 REPORT, CERTIFICATE = "report.json", "certificate.html"

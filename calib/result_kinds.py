@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from zipfile import BadZipFile, ZipFile
 
-from calib.folders import METRICS, OFFSETS, PARAMETERS, SESSION
+from calib.folders import GRAVITY_SUMMARY, METRICS, OFFSETS, PARAMETERS, SESSION
 
 
 @dataclass(frozen=True)
@@ -139,6 +139,8 @@ def refusal(path: str | Path, verb: str) -> str:
         what = (
             "contains no result" if Path(path).is_dir() else "is a file" if Path(path).is_file() else "does not exist"
         )
+        if (Path(path) / GRAVITY_SUMMARY).is_file():
+            what = "has the gravity of standing poses only: use robot.urdf in it"
         return f"{path} {what}; give {TAKES[verb]}"
     advice = kind.advice.get(verb, f"give {TAKES[verb]}")
     return f"{path} is {kind.noun}; {advice.format(folder=path)}"

@@ -121,7 +121,8 @@ def identify_dynamics(
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.report.dynamics_section import read_lines
 
-    if _gravity(robot, recordings, validate or [], out, options, base, tip, seed):
+    unused = method, friction, excitation
+    if _gravity(robot, recordings, validate or [], out, options, base, tip, seed, unused):
         return
     check_destination("identify", robot, out, [options, *recordings, *(validate or [])])
 
@@ -164,14 +165,33 @@ def _gravity(
     base: str | None,
     tip: str | None,
     seed: int,
+    unused: tuple[str | None, str | None, Path | None],
 ) -> bool:
-    """Identify gravity and write it, if all files are standing poses; return whether they are."""
+    """Identify gravity and write it, if all files are standing poses; return whether they are.
+
+    Args:
+        unused: method, friction and excitation, which standing poses do not use; None where they are not stated.
+    """
+    from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage import standing_poses
+    from calib.procedure.dynamic_stage.inputs import with_choices
     from calib.procedure.robot_kinds import stage_of
 
     named = [*recordings, *validate]
-    if stage_of(robot, "identify") is not None or not standing_poses.stand(robot, named, options, base, tip):
+    if stage_of(robot, "identify") is not None:
         return False
+    if not standing_poses.stand(robot, named, options, base, tip):
+        still = standing_poses.standing_files(robot, named, options, base, tip)
+        if still:
+            names = ", ".join(still)
+            say(f"standing poses: {names}; the other files are motions. Identify each kind by its own command")
+        return False
+    method, friction, excitation = unused
+    with_choices(read_options(options), method, friction, seed)
+    names = ("method", "friction", "excitation")
+    stated = [f"--{name}" for name, value in zip(names, (method, friction, excitation)) if value is not None]
+    if stated:
+        say(f"not used for standing poses: {', '.join(stated)}")
     standing_poses.check_target(out, [options, *named])
     result = standing_poses.identify_gravity(robot, recordings, validate, options, base, tip, seed)
     result.write(out)

@@ -152,7 +152,7 @@ def gather(
         UsageError: without a recording, and for unknown options.
         MeasurementError: for a recording that cannot be used.
     """
-    options = _with_choices(options or IdentifyOptions(), method, friction, seed)
+    options = with_choices(options or IdentifyOptions(), method, friction, seed)
     if not recordings:
         raise UsageError("no recording given")
     sources = [*recordings, *validate]
@@ -263,7 +263,7 @@ def _path(recording: str | Path | Recording, unnamed: str = "recording") -> str:
     return f"{file}@{t.min():.6g}:{t.max():.6g}"
 
 
-def _with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
+def with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
     """Return the options with the method, friction model and seed that the command states; None: as in the options.
 
     Args:

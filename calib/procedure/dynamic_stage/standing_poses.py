@@ -20,6 +20,7 @@ Source: W. Khalil and E. Dombre (2002), Modeling, Identification and Control of 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -32,10 +33,11 @@ from calib.data.schema import refuse
 from calib.dynamics import base as base_parameters
 from calib.dynamics import drives
 from calib.dynamics.base import Base
-from calib.dynamics.bodies import standard_parameters
+from calib.dynamics.bodies import standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import States
 from calib.errors import MeasurementError, UsageError, listing
+from calib.folders import GRAVITY_SUMMARY
 from calib.identification.identify_options import IdentifyOptions, read_options
 from calib.identification.settings import make_bodies
 from calib.procedure.findings import Verdict
@@ -67,6 +69,10 @@ HELD_OUT = 0.25
 ROWS = 2.0
 # rows of torques per parameter, and held-out poses, below which nothing passes: errors of so few tell little
 FEW_ROWS, FEW_HELD_OUT = 4.0, 5
+# F of four load parameters of one file, and sigmas of the mass, from which on an undeclared load is stated
+LOAD_F, LOAD_SIGMAS = 10.0, 5.0
+# label of a load that the options do not declare
+UNDECLARED = "undeclared"
 # sigmas below zero from which on friction is called negative
 NEGATIVE = 3.0
 # unexplained share of the torques' variation up to which a model passes, and above which it fails (those of motion)
@@ -83,13 +89,14 @@ EXACT = 1e-8
 ALIKE = 0.9
 # residual with that direction over the one with the stated gravity, from which on it is believed
 BETTER = 0.7
+# unexplained share of the training's torques up to which a cause is named, friction within its band included
+EXPLAINED = 0.35
 # cosine to an axis of the base from which on gravity is taken to be along it
 SNAP = 0.985
 # torques that hold less than this share of the described masses' gravity hold none
 ABSENT = 0.1
 # identified masses below this share of the described ones are not believed: then only first moments change
 LEAST_SHARE = 0.3
-GRAVITY_SUMMARY = "gravity_summary.txt"
 NAMES = (URDF, "gravity.csv", "friction_at_rest.csv", "payload.csv", GRAVITY_SUMMARY)
 README = """\
 Gravity identified from standing poses.
@@ -265,6 +272,15 @@ def stand(
         if stamped and not len(_standing_rows(recording)):
             return False
     return True
+
+
+def standing_files(
+    robot: str | Path, recordings: Sequence[str], options: Path | None, base: str | None, tip: str | None
+) -> list[str]:
+    """Return which of several files are tables of standing poses; the arguments are those of `stand`."""
+    if len(recordings) < 2:
+        return []
+    return [name for name in recordings if stand(robot, [name], options, base, tip)]
 
 
 def _moves(recording: Recording) -> bool:
@@ -519,32 +535,39 @@ class GravityResult:
             blocks = [_regressor(model, block) @ gravity.reference for block in self.training]
             columns.append(_varying(np.concatenate(blocks)))
         W = np.array(columns).T
-        torque = _varying(_torques(self.training))
+        torques = np.concatenate([block.torque - gravity.held(block) for block in self.training])
+        torque = _varying(torques)
         size = np.linalg.norm(assumed)
         expected = W @ assumed
         if not np.linalg.norm(expected):
             return None
         direction = np.linalg.lstsq(W, torque, rcond=None)[0]
-        factor = max(float(expected @ torque / (expected @ expected)), 0.0)
-        before = np.linalg.norm(torque - factor * expected)
-        after = np.linalg.norm(torque - W @ direction)
         scale = np.linalg.norm(direction)
         if scale < ABSENT * size:
             reason = f"the torques vary by {100 * scale / size:.2g} % of the described masses' gravity"
             return Verdict("fail", reason, "", "are they compensated for gravity already? Log them before compensation")
-        if direction @ assumed < ALIKE * scale * size and after < BETTER * before:
-            believed = direction / scale * size
-            # an arm on a wall or a ceiling stands along an axis
-            upright = np.round(believed / size)
-            if np.linalg.norm(upright) == 1.0 and upright @ believed > SNAP * size:
-                believed = upright * size
+        believed = direction / scale * size
+        # an arm on a wall or a ceiling stands along an axis
+        upright = np.round(believed / size)
+        if np.linalg.norm(upright) == 1.0 and upright @ believed > SNAP * size:
+            believed = upright * size
+        before = _misfit(expected, torque)
+        turned = direction @ assumed < ALIKE * scale * size
+        causes = _column_faults(expected.reshape(torques.shape), torques)
+        if turned:
             option = ", ".join(f"{component:.4g}" for component in np.round(believed, 3) + 0.0)
             reason = f"gravity ({option}) m/s² explains the torques with the described masses, the stated does not"
             advice = (
                 "is the arm mounted otherwise, or have its torques the other sign? Both are the same at rest: "
                 f"gravity = [{option}] in the options"
             )
+            causes.append((_misfit(W @ believed, torque), reason, advice))
+        misfit, reason, advice = min(causes)
+        if misfit < BETTER * before and misfit <= EXPLAINED:
             return Verdict("fail", reason, "", advice)
+        if turned and np.linalg.norm(torque - W @ direction) < BETTER * before * np.linalg.norm(torque):
+            advice = "compare joints, signs, units and mounting with the description"
+            return Verdict("fail", "the torques contradict gravity of the described masses", "", advice)
         return None
 
     @property
@@ -559,18 +582,20 @@ class GravityResult:
         if self.gravity.chain.inertias is not None:
             reason += f" (description: {100 * self.unexplained(True):.3g} %)"
         reason += ", for gravity at rest only"
-        if self.gravity.chain.inertias is not None and share > self.unexplained(True):
-            return Verdict("fail", reason + "; the description is better", "", "use the description as it is")
         doubt = self._doubt()
-        if doubt is not None and share <= FAIL:
-            return Verdict(doubt.level, f"{reason}; {doubt.reason}", "", doubt.advice)
+        if doubt is not None:
+            reason += f"; {doubt.reason}"
+        if self.gravity.chain.inertias is not None and share > self.unexplained(True):
+            advice = "use the description as it is" if doubt is None else doubt.advice
+            return Verdict("fail", reason + "; the description is better", "", advice)
+        if share <= FAIL and doubt is not None:
+            return Verdict(doubt.level, reason, "", doubt.advice)
         if share <= PASS:
             return Verdict("pass", reason)
         advice = "are torques those of the motors at rest, and are joints, signs and units the description's?"
-        level = "fail"
         if share <= FAIL:
-            level = "marginal"
-        return Verdict(level, reason, "", advice)
+            return Verdict("marginal", reason, "", advice)
+        return Verdict("fail", reason, "", advice)
 
     def _doubt(self) -> Verdict | None:
         """Return what keeps a model from passing that predicts well: friction below zero, or few rows."""
@@ -584,11 +609,48 @@ class GravityResult:
                 level = "fail"
             advice = "are the columns approach1 … reversed, or have the torques the other sign?"
             return Verdict(level, f"friction at rest is negative: {joints}", "", advice)
+        load = self._load()
+        if load is not None:
+            return load
         held_out = len(self.errors())
         if gravity.rows < FEW_ROWS or held_out < FEW_HELD_OUT:
             few = f"few poses: {gravity.rows:.2g} torques per parameter and {held_out} held-out poses"
             return Verdict("marginal", few, "", f"measure {FEW_ROWS:g} per parameter and {FEW_HELD_OUT} held-out poses")
         return None
+
+    def _load(self) -> Verdict | None:
+        """Return a verdict where a load that one file has and others do not explains much more, else None."""
+        if len(self.training) < 2:
+            return None
+        gravity = self.gravity
+        chain = gravity.chain
+        bodies = with_payload(gravity.model.bodies, np.asarray(chain.tail), UNDECLARED, on=chain.n - 1)
+        model = replace(gravity.model, bodies=bodies)
+        first = 10 * bodies.labels.index(UNDECLARED) + 6
+        torque = np.concatenate([block.torque - gravity.held(block) for block in self.training])
+        columns = np.concatenate([_regressor(gravity.model, block)[..., gravity.base.kept] for block in self.training])
+        *_, residual, sigma = _least_squares(columns, torque)
+        squares = float(np.sum((residual / sigma) ** 2))
+        best = None
+        for block in self.training:
+            loads = []
+            for other in self.training:
+                carried = replace(other, carried=(*other.carried, UNDECLARED))
+                load = _regressor(model, carried)[..., first : first + 4]
+                loads.append(load * float(other is block))
+            W = np.concatenate([columns, np.concatenate(loads)], axis=2)
+            values, covariance, residual, _ = _least_squares(W, torque)
+            unexplained = float(np.sum((residual / sigma) ** 2))
+            degrees = max(torque.size - W.shape[2], 1)
+            ratio = (squares - unexplained) / 4.0 / (unexplained / degrees)
+            mass, deviation = values[-1], np.sqrt(covariance[-1, -1])
+            if mass > LOAD_SIGMAS * deviation and ratio > LOAD_F and (best is None or ratio > best[0]):
+                best = ratio, block.name, mass, deviation
+        if best is None:
+            return None
+        _, name, mass, deviation = best
+        reason = f"a load of {mass:.3g} ± {deviation:.1g} kg in {name} that the options do not declare explains them"
+        return Verdict("marginal", reason, "", f'declare it: [payload.tool], [files."{name}"] payload = ["tool"]')
 
     def lines(self) -> list[str]:
         """Return the lines for the console and ``summary.txt``."""
@@ -688,6 +750,38 @@ class GravityResult:
             files.write(out / URDF, urdf_text(gravity, self.source, str(self.verdict)))
         files.write(out / GRAVITY_SUMMARY, "\n".join([*self.lines(), "", README]))
         return out
+
+
+def _misfit(expected: np.ndarray, torque: np.ndarray) -> float:
+    """Return the share of torques that expected ones times a positive factor do not explain."""
+    factor = max(float(expected @ torque / max(expected @ expected, 1e-12)), 0.0)
+    return float(np.linalg.norm(torque - factor * expected) / max(np.linalg.norm(torque), 1e-12))
+
+
+def _column_faults(expected: np.ndarray, torques: np.ndarray) -> list[tuple[float, str, str]]:
+    """Return misfit, reason and advice for a torque column with the other sign, and for two exchanged ones.
+
+    Args:
+        expected: (N, n) gravity torques of the description, as a matrix of varying torques.
+        torques: (N, n) torques.
+    """
+    n = torques.shape[1]
+    varying = torques - torques.mean(axis=0)
+    faults = []
+    for joint in range(n):
+        signs = np.ones(n)
+        signs[joint] = -1.0
+        reason = f"with tau{joint + 1} reversed the described masses explain the torques, as they are they do not"
+        advice = f"has tau{joint + 1} the other sign? Reverse that column"
+        faults.append((_misfit(expected.ravel(), (signs * varying).ravel()), reason, advice))
+    for first, second in combinations(range(n), 2):
+        order = np.arange(n)
+        order[[first, second]] = second, first
+        names = f"tau{first + 1} and tau{second + 1}"
+        reason = f"with {names} exchanged the described masses explain the torques, as they are they do not"
+        misfit = _misfit(expected.ravel(), varying[:, order].ravel())
+        faults.append((misfit, reason, f"are {names} exchanged? Exchange their names in the header"))
+    return faults
 
 
 def _varying(torque: np.ndarray) -> np.ndarray:

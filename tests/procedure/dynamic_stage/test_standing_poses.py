@@ -279,3 +279,68 @@ def test_the_needed_number_contains_the_held_out_poses(tmp_path, arm):
         identify_gravity(urdf, [write(tmp_path / "five.csv", q[:5], torques(model, q[:5]))])
     needed = int(re.search(r"at least (\d+)", str(caught.value)).group(1))
     identify_gravity(urdf, [write(tmp_path / "enough.csv", q[:needed], torques(model, q[:needed]))])
+
+
+@pytest.mark.parametrize(
+    ("order", "signs", "words"),
+    [
+        ([0, 1, 2, 3, 4, 5, 6], [1, -1, 1, 1, 1, 1, 1], "tau2 the other sign"),
+        ([0, 1, 2, 3, 4, 5, 6], [1, 1, 1, -1, 1, 1, 1], "tau4 the other sign"),
+        ([0, 3, 2, 1, 4, 5, 6], [1, 1, 1, 1, 1, 1, 1], "tau2 and tau4 exchanged"),
+        ([0, 1, 2, 3, 4, 5, 6], [-1, -1, -1, -1, -1, -1, -1], r"gravity = \[0, 0, 9.81\]"),
+    ],
+)
+def test_the_cause_that_explains_the_torques_is_named(tmp_path, arm, order, signs, words):
+    """One reversed torque is not gravity upside down; what the advice says makes a good fit."""
+    urdf, _, model = arm
+    q = drawn(40)
+    wrong = held(model, q)[:, order] * signs
+    result = identify_gravity(urdf, [write(tmp_path / "wrong.csv", q, wrong)])
+    assert result.verdict == "fail" and re.search(words, result.verdict.advice)
+    if "gravity" not in words:
+        followed = identify_gravity(urdf, [write(tmp_path / "right.csv", q, (wrong * signs)[:, order])])
+        assert followed.verdict != "fail"
+
+
+def test_no_cause_is_named_where_none_explains(tmp_path, arm):
+    urdf, _, _ = arm
+    q = drawn(40)
+    noise = np.random.default_rng(3).normal(0.0, 20.0, q.shape)
+    result = identify_gravity(urdf, [write(tmp_path / "p.csv", q, noise)])
+    assert result.verdict == "fail"
+    assert "gravity = " not in result.verdict.advice and "tau" not in result.verdict.advice
+
+
+def test_an_undeclared_load_is_stated(tmp_path, arm):
+    urdf, _, model = arm
+    q, other = drawn(30), drawn(30, 5)
+    empty = write(tmp_path / "empty.csv", q, held(model, q))
+    loaded = write(tmp_path / "loaded.csv", other, held(model, other, load=PAYLOAD))
+    result = identify_gravity(urdf, [empty, loaded])
+    assert result.verdict != "pass"
+    assert re.search(r"a load of 2\.\d+ ± [\d.]+ kg in .*loaded.csv", result.verdict.reason)
+    same = write(tmp_path / "same.csv", other, held(model, other))
+    assert "a load of" not in identify_gravity(urdf, [empty, same]).verdict.reason
+
+
+def test_options_of_motions_are_not_used(tmp_path, arm, capsys):
+    urdf, _, model = arm
+    q = drawn(40)
+    poses = write(tmp_path / "p.csv", q, held(model, q))
+    words = ["identify", str(urdf), poses, "--out", str(tmp_path / "out")]
+    assert cli.run([*words, "--friction", "nonsense"]) == 2
+    assert "--friction nonsense: expected" in capsys.readouterr().err
+    assert cli.run([*words, "--method", "wls"]) in (0, 1)
+    assert "not used for standing poses: --method" in capsys.readouterr().out
+    assert cli.run(["export", str(tmp_path / "out"), "--into", str(tmp_path / "new")]) == 2
+    assert "use robot.urdf in it" in capsys.readouterr().err
+
+
+def test_poses_mixed_with_a_motion_are_said(tmp_path, arm, capsys):
+    urdf, _, model = arm
+    q = drawn(20)
+    poses = write(tmp_path / "poses.csv", q, held(model, q))
+    path = 0.3 * np.sin(np.arange(300)[:, None] / 100.0 * np.arange(1, 8))
+    motion = write(tmp_path / "motion.csv", path, torques(model, path))
+    assert cli.run(["identify", str(urdf), poses, motion, "--out", str(tmp_path / "out")]) == 2
+    assert "poses.csv; the other files are motions" in " ".join(capsys.readouterr().out.split())
