@@ -60,6 +60,8 @@ _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
 _CHUNK = 20_000
 # Bytes of a file by which its encoding is told (our choice).
 HEAD = 1 << 16
+# First bytes of a Parquet file.
+PARQUET = b"PAR1"
 # Letters of a line (our choice).
 LONGEST = 1 << 20
 # A row this many times as wide as the header probably has decimal commas.
@@ -268,7 +270,14 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
     try:
         check_regular(path)
         with open(path, "rb") as beginning:
-            encoding = encoding_of(beginning.read(HEAD))
+            head = beginning.read(HEAD)
+        if head.startswith(PARQUET):
+            refuse_data(
+                path,
+                "is a Parquet file, as LeRobot writes: calib identify and calib join read it as a motion; save "
+                "measured poses as CSV",
+            )
+        encoding = encoding_of(head)
         raw = open(path, encoding=encoding, newline="")  # noqa: SIM115 (closed below)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         reason = getattr(error, "strerror", None) or error
