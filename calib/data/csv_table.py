@@ -56,10 +56,14 @@ _DETACHED_UNIT = re.compile(r"[ ]+([\[(])")
 # A cell of a spreadsheet, not a comment.
 _ERROR = re.compile(r"#(REF!|N/A|NUM!|DIV/0!|VALUE!|NAME\?|NULL!)", re.I)
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
+# 1.045,8959 and 1,045.8959
+_GROUPED = re.compile(r"^[+-]?(\d{1,3}(\.\d{3})+,\d*|\d{1,3}(,\d{3})+\.\d*)$")
 # Rows read at a time.
 _CHUNK = 20_000
 # Bytes of a file by which its encoding is told (our choice).
 HEAD = 1 << 16
+# Minus sign of typeset numbers (U+2212).
+MINUS = "\u2212"
 # First bytes of a Parquet file.
 PARQUET = b"PAR1"
 # Letters of a line (our choice).
@@ -551,6 +555,9 @@ def _read_cells(
 def as_column(column: Sequence[str]) -> np.ndarray:
     """Return a column's cells as floats if all of them are numbers or empty, else as texts."""
     joined = "".join(column)
+    if MINUS in joined:
+        column = [cell.replace(MINUS, "-") for cell in column]
+        joined = joined.replace(MINUS, "-")
     try:
         if "_" in joined or not joined.isascii():
             raise ValueError("digits that Python alone takes for such")
@@ -595,6 +602,8 @@ def _not_a_number(cell: str | float) -> str:
     text = str(cell)
     if _DECIMAL_COMMA.match(text):
         return f"found '{text}', with a decimal comma: save the table with decimal points (1.5, not 1,5)"
+    if _GROUPED.match(text):
+        return f"found '{text}', with separators between thousands: save the table without them (1045.9)"
     content = "an empty or NaN cell" if text.lower() in ("", "nan") else f"'{text}'"
     advice = "rows are counted without the header; leave such rows out, or measure them again"
     return f"found {content} where a number is needed; {advice}"
