@@ -59,3 +59,21 @@ def test_typeset_numbers(tmp_path):
     (tmp_path / "m.csv").write_text("q1;q2;x;y;z\n" + "1,5;2,5;1.045,8959;0,5;0,5\n" * 3)
     with pytest.raises(MeasurementError, match="separators between thousands"):
         read_measurements(tmp_path / "m.csv", ROBOT, None)
+
+
+def test_unread_angles_are_said(tmp_path):
+    """Three columns of unknown names whose numbers may be angles: the note says what to state."""
+    rows = np.random.default_rng(3).uniform(-1.0, 1.0, (9, 8))
+    path = tmp_path / "m.csv"
+    np.savetxt(path, rows, delimiter=",", header="q1,q2,x,y,z,u1st,v2nd,w3rd", comments="")
+    (block,) = read_measurements(path, ROBOT)
+    assert any("look like three angles" in note and 'rx = "u1st"' in note for note in block.notes)
+
+
+def test_row_of_german_units(tmp_path):
+    """Units in a row below the names are read."""
+    path = tmp_path / "m.csv"
+    path.write_text("q1;q2;X;Y;Z\nGrad;Grad;mm;mm;mm\n" + "90,5;45,5;100,5;200,5;300,5\n10,5;4,5;10,5;20,5;30,5\n" * 3)
+    (block,) = read_measurements(path, ROBOT)
+    np.testing.assert_allclose(block.position[0], [0.1005, 0.2005, 0.3005])
+    np.testing.assert_allclose(block.q[0], np.deg2rad([90.5, 45.5]))
