@@ -56,10 +56,16 @@ _DETACHED_UNIT = re.compile(r"[ ]+([\[(])")
 # A cell of a spreadsheet, not a comment.
 _ERROR = re.compile(r"#(REF!|N/A|NUM!|DIV/0!|VALUE!|NAME\?|NULL!)", re.I)
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
+# 1.045,8959 and 1,045.8959
+_GROUPED = re.compile(r"^[+-]?(\d{1,3}(\.\d{3})+,\d*|\d{1,3}(,\d{3})+\.\d*)$")
 # Rows read at a time.
 _CHUNK = 20_000
 # Bytes of a file by which its encoding is told (our choice).
 HEAD = 1 << 16
+# Minus sign of typeset numbers (U+2212).
+MINUS = "\u2212"
+# First bytes of a Parquet file.
+PARQUET = b"PAR1"
 # Letters of a line (our choice).
 LONGEST = 1 << 20
 # A row this many times as wide as the header probably has decimal commas.
@@ -268,7 +274,14 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
     try:
         check_regular(path)
         with open(path, "rb") as beginning:
-            encoding = encoding_of(beginning.read(HEAD))
+            head = beginning.read(HEAD)
+        if head.startswith(PARQUET):
+            refuse_data(
+                path,
+                "is a Parquet file, as LeRobot writes: calib identify and calib join read it as a motion; save "
+                "measured poses as CSV",
+            )
+        encoding = encoding_of(head)
         raw = open(path, encoding=encoding, newline="")  # noqa: SIM115 (closed below)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         reason = getattr(error, "strerror", None) or error
@@ -542,6 +555,9 @@ def _read_cells(
 def as_column(column: Sequence[str]) -> np.ndarray:
     """Return a column's cells as floats if all of them are numbers or empty, else as texts."""
     joined = "".join(column)
+    if MINUS in joined:
+        column = [cell.replace(MINUS, "-") for cell in column]
+        joined = joined.replace(MINUS, "-")
     try:
         if "_" in joined or not joined.isascii():
             raise ValueError("digits that Python alone takes for such")
@@ -586,6 +602,8 @@ def _not_a_number(cell: str | float) -> str:
     text = str(cell)
     if _DECIMAL_COMMA.match(text):
         return f"found '{text}', with a decimal comma: save the table with decimal points (1.5, not 1,5)"
+    if _GROUPED.match(text):
+        return f"found '{text}', with separators between thousands: save the table without them (1045.9)"
     content = "an empty or NaN cell" if text.lower() in ("", "nan") else f"'{text}'"
     advice = "rows are counted without the header; leave such rows out, or measure them again"
     return f"found {content} where a number is needed; {advice}"

@@ -18,6 +18,9 @@ from calib.errors import MeasurementError, counted, listing, refuse_option
 from calib.records import frozen
 from calib.units import DEG
 
+# least number of rows of each of two conventions (our choice)
+MIN_RUN = 3
+
 
 @dataclass(frozen=True)
 class Bounds:
@@ -135,6 +138,23 @@ def more_rows(source: Rows, bad: np.ndarray, columns: Sequence[str]) -> str:
     return f" (and in {counted(count, 'more row')}{extent}{by_column})"
 
 
+def two_conventions(source: Rows, in_other_unit: np.ndarray, other_unit: str, unit: str) -> str:
+    """Return as text that a run of rows is in another unit than the others; "" where that is not so.
+
+    Args:
+        source: file and row numbers.
+        in_other_unit: (m,) whether a row is impossible in `unit`.
+        other_unit: the unit in which these rows probably are.
+        unit: the unit of the other rows.
+    """
+    rows = np.flatnonzero(in_other_unit)
+    count = len(rows)
+    if min(count, len(in_other_unit) - count) < MIN_RUN or rows[-1] - rows[0] >= count:
+        return ""
+    run = f"rows {source.rows[rows[0]]} to {source.rows[rows[-1]]}"
+    return f"{run} look like {other_unit}, the others like {unit}: two conventions in one file; split it"
+
+
 @dataclass(frozen=True)
 class Column:
     """One column of a table, or a family of columns (x, y, z).
@@ -166,6 +186,10 @@ class Column:
         unit = {"angle": " rad", "length": " m"}.get(self.dimension, "")
 
         def other_unit(row: int, k: int) -> str:
+            too_large = (np.abs(values) > self.most).any(axis=1)
+            split = two_conventions(source, too_large, self.likely, unit.strip())
+            if split:
+                return f"found {values[row, k]:g}{unit}; {split}"
             header = f"{columns[k]} [{self.likely}]"
             return f"found {values[row, k]:g}{unit}; if it is in {self.likely}, name the column '{header}'"
 

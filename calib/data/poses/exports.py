@@ -25,7 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.csv_table import Table, as_column, encoding_of
+from calib.data.csv_table import MINUS, Table, as_column, encoding_of
 from calib.data.poses.columns import SUFFIXES
 from calib.data.poses.robodk import recognises
 from calib.errors import listing
@@ -52,7 +52,7 @@ UNITS = {
     **dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m"),
     **dict.fromkeys(("rad", "radians"), "rad"),
     **dict.fromkeys(("cm", "centimeter", "centimeters"), "cm"),
-    **dict.fromkeys(("deg", "degree", "degrees"), "deg"),
+    **dict.fromkeys(("deg", "degree", "degrees", "°", "grad", "grados", "gradi"), "deg"),
 }
 _STATED = re.compile(r"(?i)\b(?:length )?units?\b[\s:=,;]*([a-z]+)")
 _NUMBER = {mark: re.compile(rf"[+-]?(\d+\{mark}?\d*|\{mark}\d+)([eE][+-]?\d+)?|nan") for mark in ".,"}
@@ -108,7 +108,7 @@ def translated(path: str | Path) -> InstrumentExport | None:
     with open(path, "rb") as file:
         beginning = file.read(HEAD)
         encoding = encoding_of(beginning)
-        head = beginning.decode(encoding, errors="replace")
+        head = beginning.decode(encoding, errors="replace").replace(MINUS, "-")
         lines = head.splitlines()
         grid = _grid(lines)
         if grid is None:
@@ -121,7 +121,7 @@ def translated(path: str | Path) -> InstrumentExport | None:
         is_plain = not preset and grid.mark == "." and encoding != "utf-16" and not differs
         if is_plain and _first_content(lines) == grid.first - 1:
             return None
-        text = (beginning + file.read()).decode(encoding, errors="replace")
+        text = (beginning + file.read()).decode(encoding, errors="replace").replace(MINUS, "-")
 
     length_unit = _length_unit(preset, head, lines[: grid.first])
     export = InstrumentExport()

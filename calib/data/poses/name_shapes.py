@@ -32,6 +32,14 @@ UNIT_WORDS = frozenset(("mm", "cm", "deg", "rad"))
 # three angles by names of their own, in the order of rx ry rz
 ANGLE_NAMES = (("roll", "pitch", "yaw"), ("alpha", "beta", "gamma"), ("phi", "theta", "psi"))
 ANGLE_NAMES += (("a", "b", "c"), ("o", "a", "t"))
+# roll, pitch and yaw in German, French, Spanish, Italian
+ANGLE_NAMES += (
+    ("rollwinkel", "nickwinkel", "gierwinkel"),
+    ("rollen", "nicken", "gieren"),
+    ("roulis", "tangage", "lacet"),
+)
+ANGLE_NAMES += (("alabeo", "cabeceo", "guiñada"), ("alabeo", "cabeceo", "guinada"))
+ANGLE_NAMES += (("rollio", "beccheggio", "imbardata"),)
 AXES = "xyz"
 QUATERNION = ("qx", "qy", "qz", "qw")
 ANGLES = ("rx", "ry", "rz")

@@ -11,10 +11,22 @@ from calib.data.csv_table import Table
 from calib.data.poses.columns import POSITION, QUATERNION, SIGMA, TURNS, Sheet
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
-from calib.data.schema import BOUNDS, Column, Joints, Rows, check_travel, joint_unit, max_travel, refuse
+from calib.data.schema import (
+    BOUNDS,
+    Column,
+    Joints,
+    Rows,
+    check_travel,
+    joint_unit,
+    max_travel,
+    refuse,
+    two_conventions,
+)
 from calib.errors import MeasurementError, refuse_data, require
 from calib.units import ANGLES, DEG
 
+# share of rows with an impossible angle from which on the columns are in degrees (our choice)
+MOST_ROWS = 0.5
 # offsets of a joint's zero that are tried where values are outside the limits [rad]
 QUARTERS = (math.pi / 2.0, -math.pi / 2.0, math.pi, -math.pi)
 
@@ -38,8 +50,17 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
         message = f"all {len(q)} rows have the same joint values: one pose determines no parameter"
         refuse_data(table.file, message, columns[0], int(table.rows[-1]))
     bounded = np.isfinite(lower) & np.isfinite(upper)
+    sliding = np.array([kind == "prismatic" for kind in kinds])
+    plain = np.array([unit in ("", "rad", "m") for unit in units])
+    # degrees from 0 to 360 exceed limits in degrees, too: all joints together show the unit, not one alone
+    too_large = np.abs(q[:, ~sliding & plain]) > BOUNDS.max_turn
+    rows_in_degrees = too_large.any(axis=1)
+    in_degrees = bool(np.mean(rows_in_degrees) > MOST_ROWS)
+    split = two_conventions(table, rows_in_degrees, "deg", "rad")
 
     def advice(j: int, unit: str) -> str:
+        if split and plain[j] and not sliding[j]:
+            return split
         if units[j] in ("", "rad", "m"):
             return f"looks like {unit}; if so, name the column '{columns[j]} [{unit}]'"
         return f"the column is read as [{units[j]}]: is it in another unit (counts, grad), or of another joint?"
@@ -50,7 +71,11 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
     def says(row: int, j: int) -> str:
         unit, mistaken_unit, factor = joint_unit(kinds[j])
         fault = f"{q[row, j]:g} {unit} is outside the limits {lower[j]:g} to {upper[j]:g} {unit} of {joints[j]}"
+        if split and rows_in_degrees[row]:
+            return f"{fault}: {advice(j, mistaken_unit)}"
         fits_other_unit = not outside(q[:, j] * factor, lower[j], upper[j]).any()
+        if in_degrees and plain[j] and not sliding[j] and abs(q[row, j]) > BOUNDS.max_turn:
+            return f"{fault}: {advice(j, mistaken_unit)}"
         if units[j] in ("", "rad", "m") and np.abs(q[:, j]).max() > BOUNDS.max_turn and fits_other_unit:
             return f"{fault}: {advice(j, mistaken_unit)}"
         turns = _turns_beyond(float(q[row, j]), float(lower[j]), float(upper[j]))
@@ -65,7 +90,6 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
                 return f"{fault}: {question}. Or {otherwise}"
         return f"{fault}: {otherwise}"
 
-    sliding = np.array([kind == "prismatic" for kind in kinds])
     if sheet.options.check_limits:
         refuse(table, outside(q, lower, upper) & bounded, columns, says)
     free = ~bounded if sheet.options.check_limits else sliding
@@ -78,8 +102,8 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
         where = f"most in row {table.rows[row_of_worst]}, by {excess[row_of_worst, j]:.2g} {joint_unit(kinds[j])[0]}"
         notes.append(f"{joints[j]} is outside its limits in {share}, {where}; these rows are used")
     turning = [j for j in range(len(joints)) if not sliding[j]]
-    in_degrees = turning and all(units[j] in ("deg", "°", "degrees") for j in turning)
-    if in_degrees and np.abs(q[:, turning]).max() < BOUNDS.max_turn * DEG:
+    stated_degrees = turning and all(units[j] in ("deg", "°", "degrees") for j in turning)
+    if stated_degrees and np.abs(q[:, turning]).max() < BOUNDS.max_turn * DEG:
         notes.append("all joint values are below 6.6 deg: are they radians instead of degrees?")
     return tuple(notes)
 

@@ -56,6 +56,7 @@ from calib.data.poses.columns import (
     SIGMA_ROTATION,
     SUFFIXES,
     TIME,
+    TURNS,
     Layout,
     Sheet,
     Undecided,
@@ -79,6 +80,11 @@ from calib.data.poses.silent_units import with_silent_units
 from calib.data.poses.unnamed import arrangements
 from calib.data.schema import Joints, refuse
 from calib.records import FieldValues
+from calib.units import ANGLES
+
+# Largest number that is an angle [deg], and least spread of each of three angles over the poses [rad] (our choice).
+MAX_ANGLE = 360.0
+MIN_SPREAD = 0.3
 
 
 def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
@@ -276,8 +282,39 @@ def read_measurements(
     else:
         block = read_groups(sheet, layout, q)
     ignored = tuple(name for name in sheet.table.header if name not in layout.used)
+    if layout.kind == Positions.kind and not options.kind:
+        notes += _unread_angles(sheet.table, ignored)
     station = options.station or Path(path).stem
     return [replace(block, station=station, ignored=ignored, notes=(*notes, *block.notes))]
+
+
+def _unread_angles(table: Table, ignored: Sequence[str]) -> tuple[str, ...]:
+    """Return a note on the first three neighbouring columns that are not read and look like angles; () without such.
+
+    Args:
+        table: the table.
+        ignored: names of the columns that are not read.
+    """
+    for first in range(len(table.header) - 2):
+        names = table.header[first : first + 3]
+        cells = table.cells[first : first + 3]
+        if not set(names) <= set(ignored) or any(values.dtype != float for values in cells):
+            continue
+        if not set(map(str.lower, table.units[first : first + 3])) <= {"", *ANGLES}:
+            continue
+        values = np.stack(cells, axis=1)
+        largest = np.abs(values).max(initial=0.0)
+        # numbers of rows and of points are whole
+        is_fractional = (values % 1.0 != 0.0).any(axis=0).all()
+        is_spread = (np.ptp(values, axis=0) > MIN_SPREAD).all()
+        if len(values) and largest <= MAX_ANGLE and is_fractional and is_spread:
+            columns = ", ".join(names)
+            mapping = ", ".join(f'{angle} = "{name}"' for angle, name in zip(TURNS.names, names))
+            return (
+                f"{columns} are not read, and look like three angles beside the position: only positions are fitted. "
+                f"If they are the orientation, state it in the options: columns = {{ {mapping} }}",
+            )
+    return ()
 
 
 def _ask_for_names(path: str | Path, robot: Joints, options: FileOptions) -> None:

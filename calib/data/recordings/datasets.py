@@ -27,8 +27,13 @@ from calib.workers.extras import needing
 INFO = Path("meta") / "info.json"
 # Time between two episodes [s] (our choice): longer than any gap that is bridged.
 BREAK = 1.0
+# Column of the number of each row's episode.
+EPISODE = "episode_index"
 # Columns of LeRobot that are no measurements.
-COUNTERS = ("episode_index", "frame_index", "index", "task_index", "next.done", "next.reward")
+COUNTERS = (EPISODE, "frame_index", "index", "task_index", "next.done", "next.reward")
+# Letters of a cell that a message quotes.
+TEXT = 20
+EFFORT_WORDS = frozenset(word for word, series in QUANTITIES.items() if series in ("torque", "current"))
 # Columns whose numbers are positions of joints, where their names do not say what they are.
 POSITIONS = ("observation.state", "action")
 
@@ -36,6 +41,11 @@ POSITIONS = ("observation.state", "action")
 def is_dataset(path: Path) -> bool:
     """Return whether `path` is the folder of a LeRobot data set, or a Parquet file."""
     return (path / INFO).is_file() or path.suffix.lower() == ".parquet"
+
+
+def is_dataset_without_meta(path: Path) -> bool:
+    """Return whether `path` is a folder with a data set's Parquet files and without ``meta/info.json``."""
+    return path.is_dir() and not (path / INFO).is_file() and any(path.rglob("*.parquet"))
 
 
 def dataset_table(path: Path) -> Table:
@@ -69,9 +79,13 @@ def dataset_table(path: Path) -> Table:
     notes = ["read as a Parquet file"]
     if root:
         notes = ["read as a LeRobot data set"]
+    count = lengths.pop()
+    if not count:
+        refuse_data(path, "has no rows: was the recording stopped before its first sample, or the copy not finished?")
     notes += _with_episodes(arrays)
     header = [name for name in arrays if name not in COUNTERS]
-    count = lengths.pop()
+    if EPISODE in arrays and np.ptp(arrays[EPISODE]) > 0:
+        header.append(EPISODE)
     cells = tuple(frozen(arrays[name]) for name in header)
     rows = frozen(np.arange(1, count + 1), int)
     return Table(str(path), tuple(header), ("",) * len(header), cells, rows, tuple(notes))
@@ -137,7 +151,36 @@ def _columns(file: Path, names: dict[str, list[str]]) -> dict[str, np.ndarray]:
                 matrix = np.array(rows, dtype=float)
                 headings = _headings(name, names.get(name, []), matrix.shape[1])
                 result.update(zip(headings, matrix.T))
+            elif rows and _is_measured(name):
+                _refuse_uneven(file, name, rows)
+        elif pyarrow.types.is_string(kind) and len(column) and _is_measured(name):
+            text = str(column[0])[:TEXT]
+            refuse_data(file, f"is text ('{text} …'), not lists of numbers: write it again as numbers", name)
     return result
+
+
+def _is_measured(name: str) -> bool:
+    """Return whether a column is the state or an effort, without which a data set is no recording."""
+    return name == POSITIONS[0] or bool(EFFORT_WORDS.intersection(words_of(name)))
+
+
+def _refuse_uneven(file: Path, name: str, rows: Sequence[Sequence[float] | None]) -> None:
+    """Raise MeasurementError for lists of which some are empty, or shorter than others.
+
+    Args:
+        file: the file.
+        name: the column.
+        rows: its lists.
+    """
+    widths = np.array([-1 if row is None else len(row) for row in rows])
+    width = int(widths.max())
+    uneven = np.flatnonzero(widths < width)
+    if not len(uneven):
+        refuse_data(file, "is null in every row: was it recorded?", name)
+    first = int(uneven[0])
+    content = "null" if widths[first] < 0 else f"a list of {widths[first]} numbers"
+    message = f"is {content}, {len(uneven)} of {len(rows)} rows are not lists of {width} numbers: leave these rows out"
+    refuse_data(file, message, name, first + 1)
 
 
 def _headings(name: str, parts: Sequence[str], count: int) -> list[str]:
@@ -169,10 +212,10 @@ def _with_episodes(arrays: dict[str, np.ndarray]) -> list[str]:
     Args:
         arrays: the columns; ``timestamp`` is replaced.
     """
-    if "timestamp" not in arrays or "episode_index" not in arrays:
+    if "timestamp" not in arrays or EPISODE not in arrays:
         return []
     t = arrays["timestamp"].copy()
-    edges = np.flatnonzero(np.diff(arrays["episode_index"])) + 1
+    edges = np.flatnonzero(np.diff(arrays[EPISODE])) + 1
     for first in edges:
         t[first:] += t[first - 1] + BREAK - t[first]
     arrays["timestamp"] = t

@@ -55,6 +55,7 @@ class Recording:
         notes: remarks on unusual values that were accepted, for messages.
         jumps: descriptions of position jumps.
         faults: columns that are constant although the measured quantity changes.
+        breaks: times of the last samples before intended breaks, such as those between a data set's episodes [s].
     """
 
     t: np.ndarray
@@ -75,6 +76,7 @@ class Recording:
     notes: tuple[str, ...] = ()
     jumps: tuple[str, ...] = ()
     faults: tuple[ColumnFault, ...] = ()
+    breaks: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         one_of(self.kind, KINDS, "kind", MeasurementError, self.file)

@@ -11,7 +11,7 @@ their own: ``calib join``.
 """
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -26,7 +26,7 @@ from calib.data.joint_columns import words_of
 from calib.data.recordings import log_columns
 from calib.data.recordings.archives import read_archive
 from calib.data.recordings.checks import check_recording
-from calib.data.recordings.datasets import dataset_table, is_dataset
+from calib.data.recordings.datasets import EPISODE, INFO, dataset_table, is_dataset, is_dataset_without_meta
 from calib.data.recordings.recording import Ends, Recording, earlier, in_pieces, named, parse_cut, rows_used
 from calib.data.recordings.recording_options import (
     MEASURED,
@@ -38,10 +38,10 @@ from calib.data.recordings.recording_options import (
     plain_stems,
     stem_of,
 )
-from calib.data.recordings.stamps import in_seconds
+from calib.data.recordings.stamps import in_seconds, likely_unit
 from calib.data.recordings.topics import of_one_topic
 from calib.data.schema import Joints
-from calib.errors import MeasurementError, refuse_data
+from calib.errors import MeasurementError, UsageError, refuse_data
 from calib.files import check_regular
 from calib.records import FieldValues
 from calib.units import TIMES
@@ -50,13 +50,24 @@ _LOG = logging.getLogger(__name__)
 NO_JOINTS = Joints(())
 # Largest number of files that are looked at for a missing quantity (our choice).
 MAX_BESIDE = 50
+# Name in a message of a file that is not known.
+OTHER_FILE = "OTHER.csv"
 # Letter of the heading of a column that is not looked at.
 HIDDEN = "\0"
+# Series of which a log needs one beside the positions.
+EFFORTS = frozenset(("torque", "current", "tau_link", "tau_motor"))
+QUANTITY_NOUNS = {"q": "positions", "torque": "torques"}
 # What a note says of columns without any number.
 ABSENT = "not provided, NaN or empty in every row"
 
 
-def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
+def read_log(
+    path: Path,
+    joints: Joints | None,
+    options: RecordingOptions,
+    ends: Ends = (None, None),
+    companions: Sequence[Path] = (),
+) -> Recording:
     """Return the recording in a CSV table from ends[0] to ends[1] [s]; values are not checked.
 
     The speed is about 20 MB/s.
@@ -66,12 +77,13 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
         joints: the robot's joints, in whose order columns are put; None: as in the file.
         options: options for reading the file.
         ends: begin and end of the part to read; None: no bound.
+        companions: other recordings of the same command, which may have what this one lacks.
     """
-    table = dataset_table(path) if is_dataset(path) else _numbered_brackets(read_table(path, doubles=True))
+    table = _log_table(path)
     robot_joints = joints or NO_JOINTS
     joint_names = robot_joints.names
     columns_of, column_notes = _find_columns(table, options, robot_joints)
-    advice = _advice(table, columns_of, robot_joints)
+    advice = _advice(table, columns_of, robot_joints, companions)
     renamed = one_effort({name: name for name in columns_of}, options, table.header, path, advice)
     columns_of = {name: columns_of[file_name] for name, file_name in renamed.items()}
     n = len(columns_of["q"])
@@ -87,6 +99,7 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
     table, t, row_notes = of_one_topic(table, columns_of, t)
     rows, notes = rows_used(t, ends, options.samples, path)
     table = table.where(rows)
+    breaks = _episode_ends(table, t[rows])
     read_columns: set[int] = set()
     for columns in columns_of.values():
         read_columns.update(columns)
@@ -100,6 +113,8 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
             values = [_values(table, column, name, options) for column in columns]
             series["effort" if name == kind else name] = np.column_stack(values)
 
+    if EPISODE in table:
+        read_columns.add(table.index(EPISODE))
     unused = [column for column in range(len(table.header)) if column not in read_columns]
     notes = [*table.notes, *column_notes, *time_notes, *row_notes, *notes]
     if unused:
@@ -120,8 +135,23 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
         file=str(path),
         rows=table.rows,
         notes=tuple(notes),
+        breaks=breaks,
         **series,
     )
+
+
+def _episode_ends(table: Table, t: np.ndarray) -> tuple[float, ...]:
+    """Return the times [s] of the last sample of each episode of a data set but the last; () for other tables.
+
+    Args:
+        table: the table.
+        t: (N,) time stamps [s] of its rows.
+    """
+    if EPISODE not in table:
+        return ()
+    episode = table.numbers(EPISODE, None, gaps=True)
+    ends = np.flatnonzero(np.diff(episode) != 0)
+    return tuple(t[ends].tolist())
 
 
 def read_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
@@ -256,18 +286,37 @@ def _stated_columns(table: Table, options: RecordingOptions, joints: Joints) -> 
     return columns_of
 
 
-def _advice(table: Table, columns_of: dict[str, list[int]], joints: Joints) -> str:
+def _log_table(path: Path) -> Table:
+    """Return the table of a log: a CSV file, a Parquet file or a data set's folder."""
+    if is_dataset(path):
+        return dataset_table(path)
+    return _numbered_brackets(read_table(path, doubles=True))
+
+
+def _lacking(columns_of: Mapping[str, Sequence[int]]) -> list[str]:
+    """Return which of positions (``q``) and efforts (``torque``) a log does not have.
+
+    Args:
+        columns_of: the columns of each series that were found.
+    """
+    lacking = [] if "q" in columns_of else ["q"]
+    if EFFORTS.isdisjoint(columns_of):
+        lacking.append("torque")
+    return lacking
+
+
+def _advice(table: Table, columns_of: dict[str, list[int]], joints: Joints, companions: Sequence[Path]) -> str:
     """Return advice for a table without positions or without torques: a line to paste, or to join two files.
 
     Args:
         table: the table.
         columns_of: the columns of each series that were found.
         joints: names of the robot's joints.
+        companions: other recordings of the same command.
     """
-    efforts = {"torque", "current", "tau_link", "tau_motor"} & columns_of.keys()
-    needed = [] if "q" in columns_of else ["q"]
-    if not efforts:
-        needed.append("torque")
+    needed = _lacking(columns_of)
+    if not needed:
+        return ""
     read_columns: set[int] = set()
     for columns in columns_of.values():
         read_columns.update(columns)
@@ -277,31 +326,81 @@ def _advice(table: Table, columns_of: dict[str, list[int]], joints: Joints) -> s
     line = log_columns.paste(header, joints, needed)
     if line:
         return f". If these are meant, state them in the options (--options FILE), joints in this order: {line}"
-    if columns_of.keys() - {"t"}:
-        quantities = " and ".join({"q": "positions", "torque": "torques"}[name] for name in needed)
-        return (
-            f". Are the {quantities} in another file? If its times are of the same clock, join them first: "
-            f"calib join {table.file} {_file_beside(Path(table.file), needed)} --out log.csv"
-        )
-    return ""
+    if not columns_of.keys() - {"t"}:
+        return ""
+    quantities = " and ".join(map(QUANTITY_NOUNS.__getitem__, needed))
+    path = Path(table.file)
+    for companion in companions:
+        if companion != path and _supplies(companion, needed, joints) is not None:
+            return (
+                f". {companion} has {quantities}: if its times are of the same clock, join the two first: "
+                f"calib join {path} {companion} --out log.csv"
+            )
+    return (
+        f". Are the {quantities} in another file? If its times are of the same clock, join them first: "
+        f"calib join {path} {_file_beside(table, columns_of, joints)} --out log.csv"
+    )
 
 
-def _file_beside(path: Path, needed: Sequence[str]) -> str:
-    """Return the first table in the folder of `path` whose columns or name tell a needed series; ``OTHER.csv`` if none.
+def _file_beside(table: Table, columns_of: dict[str, list[int]], joints: Joints) -> str:
+    """Return the first log in a table's folder that has what the table lacks, at the same times; ``OTHER.csv`` if none.
 
     Args:
-        path: the table that lacks them.
-        needed: the toolkit's names of the series.
+        table: the table.
+        columns_of: the columns of each series that were found.
+        joints: names of the robot's joints.
     """
+    path = Path(table.file)
+    span = _span(table, columns_of)
+    if span is None:
+        return OTHER_FILE
     for candidate in sorted(path.parent.glob("*.csv"))[:MAX_BESIDE]:
         if candidate.name == path.name:
             continue
-        with suppress(MeasurementError):
-            header, _ = read_header(candidate)
-            quantities = {log_columns.series_of(words_of(name)) for name in (*header, candidate.stem)}
-            if quantities.intersection(needed):
-                return str(candidate)
-    return "OTHER.csv"
+        times = _supplies(candidate, _lacking(columns_of), joints)
+        if times is not None and times[0] < span[1] and span[0] < times[1]:
+            return str(candidate)
+    return OTHER_FILE
+
+
+def _supplies(path: Path, needed: Sequence[str], joints: Joints) -> tuple[float, float] | None:
+    """Return the first and last time [s] of a log that has the needed series and lacks others; None for another file.
+
+    A log that has positions and torques is complete: it belongs to no other.
+
+    Args:
+        path: the file.
+        needed: the toolkit's names of the series.
+        joints: names of the robot's joints, all of which it must have.
+    """
+    with suppress(MeasurementError, UsageError, OSError):
+        if not is_dataset(path):
+            header, _ = read_header(path)
+            quantities = set(map(log_columns.series_of, map(words_of, (*header, path.stem))))
+            if not quantities & {*needed, *EFFORTS}:
+                return None
+        table = _log_table(path)
+        columns_of, _ = _find_columns(table, RecordingOptions(), joints)
+        lacking = _lacking(columns_of)
+        if lacking and set(lacking).isdisjoint(needed):
+            return _span(table, columns_of)
+    return None
+
+
+def _span(table: Table, columns_of: Mapping[str, Sequence[int]]) -> tuple[float, float] | None:
+    """Return the first and last time stamp in a log [s]; None without stamps.
+
+    Args:
+        table: the table.
+        columns_of: the columns of each series that were found.
+    """
+    if "t" not in columns_of or not len(table):
+        return None
+    (column,) = columns_of["t"]
+    stamps = _values(table, column, "t", RecordingOptions())
+    if not table.units[column]:
+        stamps = stamps * TIMES[likely_unit(stamps) or "s"]
+    return float(np.nanmin(stamps)), float(np.nanmax(stamps))
 
 
 def _stamp_column(table: Table, names: Sequence[str]) -> list[int]:
@@ -405,6 +504,15 @@ def _stamps(table: Table, columns_of: dict[str, list[int]], options: RecordingOp
         table.fail(f"{message}; found: {', '.join(table.header)}")
     (column,) = columns_of["t"]
     t = _values(table, column, "t", options)
+    if len(t) > 1 and np.all(t == t[0]):
+        heading = table.header[column]
+        if options.rate:
+            return np.arange(len(t)) / options.rate, [f"'{heading}' stands still: times are from the option rate"]
+        table.fail(
+            f"all {len(t)} stamps are {t[0]:g}: the clock was not recorded. If the samples are even, state their rate "
+            "in Hz in the options (--options): recording.rate = …",
+            heading,
+        )
     if table.units[column] or options.units.get("t"):
         return t - t[0], []
     named_column = log_columns.time_column([table.header[column]])
@@ -419,7 +527,10 @@ Reader = Callable[[Path, Joints | None, RecordingOptions], Recording]
 
 
 def read_recording(
-    path: str | Path, joints: Joints | None = None, options: RecordingOptions | None = None
+    path: str | Path,
+    joints: Joints | None = None,
+    options: RecordingOptions | None = None,
+    companions: Sequence[str | Path] = (),
 ) -> Recording:
     """Return the recording at `path` after all checks; the path may contain a cut in time (``log.npz@0:9.4``).
 
@@ -427,16 +538,19 @@ def read_recording(
         path: the file.
         joints: the robot's joints; columns are put in their order if the file names its joints. None: as in the file.
         options: options for reading the file; None: the defaults.
+        companions: other recordings of the same command, with or without a cut; one of them may have the series that
+            this file lacks, which the error then says.
 
     Raises:
         MeasurementError: an invalid file or value; the message contains row and column.
         UsageError: an invalid cut.
     """
     file, start, stop = parse_cut(str(path))
+    files = [Path(parse_cut(str(companion))[0]) for companion in companions]
     options = options or RecordingOptions()
     for name, unit in options.units.items():
         check_units(name, [unit] * len(joints.names if joints else ()), joints, file)
-    reader = _reader(Path(file), (start, stop))
+    reader = _reader(Path(file), (start, stop), files)
     recording = _described(reader(Path(file), joints, options), options, joints)
     for note in recording.notes:
         if note.startswith("read as"):
@@ -499,18 +613,26 @@ def _described(recording: Recording, options: RecordingOptions, joints: Joints |
     return replace(recording, **changes)
 
 
-def _reader(path: Path, ends: Ends) -> Reader:
+def _reader(path: Path, ends: Ends, companions: Sequence[Path]) -> Reader:
     """Return the function that reads a file, chosen by the file's first bytes or suffix; a folder is a ROS bag.
 
     Args:
         path: the file.
         ends: begin and end of the cut [s]; (None, None) without a cut.
+        companions: other recordings of the same command.
     """
+    table_reader = partial(read_log, ends=ends, companions=companions)
     try:
         if path.exists():
             check_regular(path)
         if is_dataset(path) and path.exists():
-            return partial(read_log, ends=ends)
+            return table_reader
+        if is_dataset_without_meta(path):
+            refuse_data(
+                path,
+                f"has Parquet files and no {INFO}: it is a LeRobot data set without its folder meta; copy that folder, "
+                "too, or name one .parquet file",
+            )
         if path.is_dir() or path.suffix in (".bag", ".mcap", ".db3"):
             from calib.data.recordings.bags import read_bag
 
@@ -529,4 +651,4 @@ def _reader(path: Path, ends: Ends) -> Reader:
         refuse_data(path, f"{fault}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder")
     if len(head) == 1 << 16 and b"\n" not in head:
         refuse_data(path, "has a first line of more than 64 kB: it is not a table; was it saved as CSV?")
-    return partial(read_log, ends=ends)
+    return table_reader

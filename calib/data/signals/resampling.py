@@ -423,7 +423,12 @@ def _sampling_report(
     jitter = (steps - np.maximum(np.round(steps), 1)) * clock.period
     rms_jitter = np.sqrt(np.mean(jitter[steps < LONG_STOP] ** 2))
     lost = np.maximum(np.round(step[~is_gap] / clock.period) - 1, 0)
-    gaps = [(float(t[i]), float(step[i])) for i in np.flatnonzero(is_gap)]
+    gaps = []
+    for i in np.flatnonzero(is_gap):
+        # a break was intended: no sample is missing in it
+        to_breaks = np.abs(np.subtract(recording.breaks, t[i]))
+        if to_breaks.min(initial=np.inf) > clock.period:
+            gaps.append((float(t[i]), float(step[i])))
     return SamplingReport(
         clock=clock,
         rate=rate,

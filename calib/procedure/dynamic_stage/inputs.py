@@ -178,16 +178,17 @@ def gather(
         notes += remarks(chain, bodies=False)
     names = case_names(paths)
     motions: list[Motion] = []
+    files = [source for source in sources if not isinstance(source, Recording)]
     for name, path, recording in zip(names, paths, sources):
         if progress is not None:
             progress(f"reading {name}")
         file_options = options.file_settings(path)
         if len(motions) < len(recordings):
-            motion = read_motion(recording, joints, file_options)
+            motion = read_motion(recording, joints, file_options, companions=files)
             motion = _referred(motion, recording, joints, options, designed)
         else:
             # unseen recordings are judged in the band of the first training recording
-            motion = read_motion(recording, joints, file_options, motions[0])
+            motion = read_motion(recording, joints, file_options, motions[0], files)
         motions.append(motion)
         notes += [f"{name}: {note}" for note in motion.notes]
 
@@ -314,7 +315,11 @@ def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, g
 
 
 def read_motion(
-    given: str | Path | Recording, chain: Chain | Joints, own: FileSettings, like: Motion | None = None
+    given: str | Path | Recording,
+    chain: Chain | Joints,
+    own: FileSettings,
+    like: Motion | None = None,
+    companions: Sequence[str | Path] = (),
 ) -> Motion:
     """Return the filtered motion of a recording, checked against the robot's joints and limits.
 
@@ -324,13 +329,14 @@ def read_motion(
         own: the options for this recording.
         like: motion whose identification band is used if the options state no band; the cutoff of the position filter
             still follows from the recording. None: both follow from the recording.
+        companions: other files of the same command, one of which may have what this one lacks.
     """
     joints = chain if isinstance(chain, Joints) else joints_of(chain)
     if isinstance(given, Recording):
         pieces = in_pieces(given, own.recording.samples)
         recording = check_recording(earlier(pieces, own.recording.lag), joints)
     else:
-        recording = read_recording(given, joints, own.recording)
+        recording = read_recording(given, joints, own.recording, companions)
     sampled = resample(recording, own.filter.clock, own.filter.gap)
 
     options = own.filter

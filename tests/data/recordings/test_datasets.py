@@ -12,6 +12,7 @@ from calib.data.recordings.datasets import dataset_table
 from calib.data.recordings.recording_files import read_recording
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.schema import Joints
+from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
@@ -98,3 +99,56 @@ def test_two_data_sets_of_a_motion_are_joined(tmp_path, series):
     assert run(["join", str(folder), str(tmp_path / "torque.csv"), "--out", str(tmp_path / "log.csv")]) == 0
     np.testing.assert_allclose(read_recording(tmp_path / "log.csv", ROBOT).effort, series["tau"], atol=1e-6)
     assert "t" in read_table(tmp_path / "log.csv").header
+
+
+def test_breaks_between_episodes_are_no_gaps(tmp_path, series):
+    """No sample is missing between episodes, however many there are."""
+    recording = read_recording(dataset(tmp_path / "set", series, NAMES, "observation.effort"), ROBOT)
+    assert len(recording.breaks) == EPISODES - 1
+    report = resample(recording).report
+    assert report.gaps == () and report.lost == 0
+    assert not any("episode_index" in note for note in recording.notes)
+
+
+def changed(path: Path, name: str, values: list[object]) -> Path:
+    """Replace a column of a data set's only file."""
+    from pyarrow import array
+
+    file = path / "data" / "chunk-000" / "file-000.parquet"
+    content = parquet.read_table(file)
+    content = content.set_column(content.column_names.index(name), name, array(values))
+    parquet.write_table(content, file)
+    return path
+
+
+@pytest.mark.parametrize(
+    "row, says",
+    [(None, "row 1.*is null, 1 of 2400 rows are not lists of 4"), ([0.0], "a list of 1 numbers"), ("[0, 1]", "text")],
+)
+def test_damaged_state_is_said(tmp_path, series, row, says):
+    """Rows of the state without numbers, too short, or written as text are not taken for a missing state."""
+    path = dataset(tmp_path / "set", series, NAMES, "observation.effort")
+    state = [row] + [[0.0, 1.0, 2.0, 3.0]] * 2399
+    if isinstance(row, str):
+        state = [row] * 2400
+    with pytest.raises(MeasurementError, match=f"observation.state.*{says}|{says}"):
+        read_recording(changed(path, "observation.state", state), ROBOT)
+
+
+def test_damaged_data_sets_are_said(tmp_path, series):
+    """Stamps that stand still, a folder without meta, a file without rows; poses are not read from Parquet."""
+    path = dataset(tmp_path / "set", series, NAMES, "observation.effort", version=3)
+    file = path / "data" / "chunk-000" / "file-000.parquet"
+    with pytest.raises(MeasurementError, match="is a Parquet file"):
+        read_table(file)
+    parquet.write_table(parquet.read_table(file).slice(0, 0), tmp_path / "none.parquet")
+    with pytest.raises(MeasurementError, match="has no rows"):
+        read_recording(tmp_path / "none.parquet", ROBOT)
+    alone = changed(path, "episode_index", [0] * 2400)
+    alone = changed(alone, "timestamp", [0.0] * 2400)
+    with pytest.raises(MeasurementError, match=r"all 2400 stamps are 0.*recording\.rate"):
+        read_recording(alone, ROBOT)
+    assert read_recording(alone, ROBOT, RecordingOptions(rate=200.0)).t[1] == pytest.approx(0.005)
+    (path / "meta" / "info.json").unlink()
+    with pytest.raises(MeasurementError, match="LeRobot data set without its folder meta"):
+        read_recording(path, ROBOT)
