@@ -78,7 +78,7 @@ def test_group_of_external_axes_is_chosen(tmp_path, name, group):
 
 def test_a_group_is_refused_where_programs_have_none(tmp_path):
     names, kinds = CELLS["rail"]
-    with pytest.raises(UsageError, match="--external-group: programs for KUKA .* have no groups of axes"):
+    with pytest.raises(UsageError, match=r"--external-group: programs for KUKA .* have no groups of axes"):
         written(tmp_path, "krl", names, kinds, external_group=2)
 
 
