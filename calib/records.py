@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, get_args, 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.errors import CalibError, UsageError
+from calib.errors import CalibError, UsageError, refused_as
 from calib.units import is_number
 
 if TYPE_CHECKING:
@@ -281,14 +281,25 @@ class Frozen:
                 object.__setattr__(self, field.name, frozen(value, kind))
 
 
+def as_numbers(values: ArrayLike, name: str) -> np.ndarray:
+    """Return `values` as a float array.
+
+    Raises:
+        UsageError: values that are no numbers, or rows of unequal lengths; the message begins with `name`.
+    """
+    with refused_as(UsageError, (TypeError, ValueError), f"{name}: expected numbers: {{}}"):
+        return np.asarray(values, dtype=float)
+
+
 def shaped(values: ArrayLike, shape: tuple[int | None, ...], name: str) -> np.ndarray:
     """Return `values` as a finite float array of the given shape; None in `shape` allows any length.
 
     Raises:
         CalibError: another shape, or a value that is not finite; the message gives both shapes, or the index of the
             value.
+        UsageError: values that are no numbers.
     """
-    array = np.asarray(values, dtype=float)
+    array = as_numbers(values, name)
     fits = array.ndim == len(shape)
     for length, expected_length in zip(array.shape, shape):
         fits = fits and expected_length in (None, length)

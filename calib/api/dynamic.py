@@ -24,7 +24,7 @@ from calib.identification.registry import METHODS
 from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
 from calib.procedure.excitation import coefficients
 from calib.procedure.robot_kinds import Mechanism, stage_of
-from calib.records import Floats, as_subclass, plain, shaped
+from calib.records import Floats, as_numbers, as_subclass, plain, shaped
 from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain, like_joints
 from calib.workers.threads import one_blas_thread
@@ -120,8 +120,8 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
             q, v, a: (N, n) or (n,) joint positions, velocities and accelerations.
         """
         positions = self.robot.joint_rows(q)
-        velocities = shaped(np.atleast_2d(np.asarray(v, dtype=float)), positions.shape, "v")
-        accelerations = shaped(np.atleast_2d(np.asarray(a, dtype=float)), positions.shape, "a")
+        velocities = shaped(np.atleast_2d(as_numbers(v, "v")), positions.shape, "v")
+        accelerations = shaped(np.atleast_2d(as_numbers(a, "a")), positions.shape, "a")
         return positions, velocities, accelerations
 
     @checked

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from inspect import signature
 from itertools import product
+from numbers import Real
 from typing import Protocol, TypeVar, get_args, get_type_hints
 
 from calib.api.result_table import ResultTable
@@ -44,6 +45,14 @@ class _Task:
     varied: Mapping[str, object] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class _Row:
+    """The cells of a run's row by column, and whether they are of the user's function `figures`."""
+
+    cells: Mapping[str, object]
+    chosen: bool = False
+
+
 @checked
 def sweep(
     verb: Callable[..., R],
@@ -59,7 +68,8 @@ def sweep(
         table = calib.sweep(calib.fit_geometry, robot, measured, over={"loss": ["none", "huber"], "model": MODELS})
         table["verdict"], table["findings.cross_validated"]
 
-    A run that fails has its error in the column ``error``, and NaN in the others. No files are written.
+    A run that fails, whatever it raises, has the reason in the column ``error``, and NaN in the others. No files are
+    written.
 
     Args:
         verb: `fit_geometry`, `identify_dynamics`, `select_poses`, or any function whose result has ``to_dict``.
@@ -67,15 +77,16 @@ def sweep(
             (`read_poses`, `read_recording`).
         over: what varies: fields of the verb's settings, or arguments of the verb itself. A mapping of names to values
             stands for all combinations of them, a sequence of mappings for one run each.
-        figures: function of a result that returns the columns of its row, numbers or texts; None: the verdict and all
-            single numbers of ``to_dict``, with names such as ``fit.parameters``.
+        figures: function of a result that returns the columns of its row, a mapping of names to numbers or texts, by
+            other names than ``error`` and those that vary; None: the verdict and all single numbers of ``to_dict``,
+            with names such as ``fit.parameters``.
         workers: number of local processes, or the address of a Dask scheduler. With several, functions must be defined
             at the top of a module, and the script needs ``if __name__ == "__main__"``.
         progress: called with a text for each finished run; None for no report.
 
     Raises:
-        UsageError: a name that is neither a setting nor an argument, a wrong value, or what processes
-            cannot be sent.
+        UsageError: a name that is neither a setting nor an argument, a wrong value, figures that are no columns, or
+            what processes cannot be sent.
     """
     from calib.workers import workers as opened
 
@@ -87,8 +98,10 @@ def sweep(
     results: list[Mapping[str, object]] = [{}] * len(tasks)
     with opened(workers) as crew:
         for finished, (number, result) in enumerate(crew.completed(_row, tasks), 1):
-            if isinstance(result, Mapping):
-                results[number] = result
+            if isinstance(result, _Row):
+                if result.chosen:
+                    _check_figures(result.cells, tasks[number].varied)
+                results[number] = result.cells
             else:
                 results[number] = {ERROR: str(result)}
             if progress is not None:
@@ -164,19 +177,57 @@ def _settings_class(verb: Callable[..., object]) -> type | None:
 
 
 @one_blas_thread()
-def _row(task: _Task) -> Mapping[str, object]:
+def _row(task: _Task) -> _Row:
     """Run a task and return the figures of its result, or its error."""
+    # whatever a run raises, the others go on
     try:
         result = task.verb(*task.arguments, **task.options)
-    except CalibError as error:
-        return {ERROR: brief(error)}
-    if task.figures is not None:
-        return dict(task.figures(result))
+        if task.figures is None:
+            return _Row(_all_numbers(result))
+    except Exception as error:
+        return _Row({ERROR: _reason(error)})
+    try:
+        return _Row(task.figures(result), chosen=True)
+    except Exception as error:
+        return _Row({ERROR: f"figures: {_reason(error)}"})
+
+
+def _all_numbers(result: Summarised) -> Mapping[str, object]:
+    """Return the verdict of a result, where it has one, and all its single numbers, by name."""
     numbers = dict(_numbers(result.to_dict()))
     verdict = getattr(result, "verdict", None)
     if verdict is None:
         return numbers
     return {VERDICT: verdict.level, **numbers}
+
+
+def _reason(error: Exception) -> str:
+    """Return an error as a cell: its message, after the name of its class where it is no error of this toolkit."""
+    if isinstance(error, CalibError):
+        return brief(error)
+    return f"{type(error).__name__}: {brief(error)}"
+
+
+def _check_figures(cells: object, varied: Mapping[str, object]) -> None:
+    """Raise an error for figures that are no columns of the table.
+
+    Args:
+        cells: what the user's function returned.
+        varied: what varies, by name.
+
+    Raises:
+        UsageError: no mapping, a name that the table has otherwise, or a value other than a number or a text.
+    """
+    kind = type(cells).__name__
+    is_mapping = isinstance(cells, Mapping)
+    require(is_mapping, f"figures: expected a mapping of names to numbers or texts, found {kind}", UsageError)
+    for name, value in dict(cells).items():  # type: ignore[call-overload]
+        require(isinstance(name, str), f"figures: expected names as texts, found {name!r}", UsageError)
+        is_free = name != ERROR and name not in varied
+        require(is_free, f"figures: '{name}' is a column of the sweep itself: choose another name", UsageError)
+        is_cell = value is None or isinstance(value, (Real, str))
+        message = f"figures: {name}: expected a number or a text, found {type(value).__name__}"
+        require(is_cell, message, UsageError)
 
 
 def _numbers(values: Mapping[str, object], start: str = "") -> Iterator[tuple[str, float]]:

@@ -51,7 +51,7 @@ class Controller:
     axes: tuple[int, ...] = ()
     external: int = 0
     scara: bool = False
-    rail_group: int = 2
+    rail_group: int = 0
     suffixes: tuple[str, ...] = ()
     saved: tuple[str, ...] = ()
     signs: tuple[int, ...] = ()

@@ -6,10 +6,11 @@ A loss may also be a function ρ as `scipy.optimize.least_squares` takes it (`Lo
 """
 
 from collections.abc import Callable
+from inspect import signature
 
 import numpy as np
 
-from calib.errors import UsageError
+from calib.errors import UsageError, require
 
 Loss = Callable[[np.ndarray], np.ndarray]
 """A loss ρ(z) of squared residuals z = (r/σ)² (m,): rows ρ, ρ' and (unused) ρ'', each (m,).
@@ -91,6 +92,15 @@ def check_loss(loss: Loss) -> None:
 
 def _loss_rows(loss: Loss, z: np.ndarray) -> np.ndarray:
     """Return ρ and ρ' (2, m) of squared residuals z (m,)."""
+    takes_one_argument = True
+    try:
+        signature(loss).bind(z)
+    except TypeError:
+        takes_one_argument = False
+    except ValueError:
+        # functions of some C modules have no signature
+        pass
+    require(takes_one_argument, f"loss: {loss_name(loss)} must take one argument, z = (r/σ)²", UsageError)
     values = np.asarray(loss(z), dtype=float)
     if values.ndim != 2 or len(values) not in (2, 3) or values.shape[1] != len(z):
         raise UsageError(

@@ -43,7 +43,8 @@ from calib.procedure.dynamic_stage.verdict import (
     with_prior,
 )
 from calib.procedure.findings import Verdict, lines_of, settle
-from calib.records import field_values
+from calib.records import as_numbers, field_values, shaped
+from calib.robot.calibrated import like_joints
 from calib.workers.threads import one_blas_thread
 
 # Names of settings that apply to serial arms only.
@@ -61,19 +62,24 @@ class ParallelDynamics(DynamicsModel):
 
     @one_blas_thread()
     def torques(self, q: ArrayLike, v: ArrayLike, a: ArrayLike) -> np.ndarray:
-        """Return the torques (N, rows) that the model predicts without payload.
+        """Return the torques that the model predicts without payload: (N, rows) of a motion, (rows,) of one state.
 
         The rows are those of the identification: torques of the actuators [N m or N], forces on the platform's
         coordinates [N or N m] (always for redundant actuators), or the actuators' power [W].
 
         Args:
-            q, v, a: (N, n) positions, velocities and accelerations of the actuated joints.
+            q, v, a: (N, n) or (n,) positions, velocities and accelerations of the actuated joints.
+
+        Raises:
+            CalibError: an array of a wrong shape.
         """
         dynamics: Any = self.found.dynamics
-        q = np.asarray(q, dtype=float)
-        v = np.asarray(v, dtype=float)
-        a = np.asarray(a, dtype=float)
-        return dynamics.model.torque(dynamics.values, q, v, a, ())
+        count = dynamics.model.mechanism.robot.n
+        positions = shaped(np.atleast_2d(as_numbers(q, "q")), (None, count), "q")
+        velocities = shaped(np.atleast_2d(as_numbers(v, "v")), positions.shape, "v")
+        accelerations = shaped(np.atleast_2d(as_numbers(a, "a")), positions.shape, "a")
+        torques = dynamics.model.torque(dynamics.values, positions, velocities, accelerations, ())
+        return like_joints(q, torques)
 
 
 def identify_parallel(

@@ -46,7 +46,7 @@ from numpy.typing import ArrayLike
 from calib.config_types import ParsedTable
 from calib.errors import CalibError, RobotError, one_of, refuse_robot
 from calib.folders import read_covariance, write_covariance
-from calib.records import Floats, frozen, shaped
+from calib.records import Floats, as_numbers, frozen, shaped
 from calib.robot import description
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, gravity_torques, joint_frames, sweep, tip_jacobian
@@ -326,8 +326,10 @@ class CalibratedChain:
 
         Raises:
             CalibError: joint values of a wrong shape.
+            UsageError: joint values that are no numbers.
         """
-        return shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, self.chain.n), "q")
+        rows = np.atleast_2d(as_numbers(q, "q"))
+        return shaped(rows, (None, self.chain.n), "q")
 
     def without_corrections(self) -> CalibratedChain:
         """Return the robot without its joint corrections, as a URDF can describe it."""

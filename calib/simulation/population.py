@@ -54,6 +54,8 @@ DEFAULT_SPEED = 1.0
 ACCELERATION = 15.0
 # Sampling rate of random motions [Hz].
 RATE = 500.0
+# Fewest samples of a period of random motions: four of the fifth, the fastest, harmonic.
+MIN_SAMPLES = 20
 # Share of the joints' ranges that random motions use.
 RANGE_SHARE = 0.8
 # Streams of random numbers of one arm: measurements and logs.
@@ -118,7 +120,13 @@ class PlantedArm:
         return replace(arm, plant=plant, sensors=arm.sensors or self.torque_sensors)
 
     def postures(self, count: int, seed: int = 0) -> Floats:
-        """Return random joint values (count, n) [rad or m] within the joints' limits; collisions are not checked."""
+        """Return random joint values (count, n) [rad or m] within the joints' limits; collisions are not checked.
+
+        Raises:
+            UsageError: a negative number or seed.
+        """
+        require(count >= 0, f"count = {count}: expected 0 or more", UsageError)
+        _check_seed(seed)
         return random_joints(self.cell.nominal, count, np.random.default_rng([self.seed, seed]))
 
     def poses(self, q: ArrayLike) -> Floats:
@@ -168,7 +176,16 @@ class PlantedArm:
             seconds: duration of the period [s].
             seed: seed of the coefficients.
             rate: samples per second [Hz].
+
+        Raises:
+            UsageError: a duration or rate of which no motion follows, or a negative seed.
         """
+        _check_seed(seed)
+        require(0 < seconds < np.inf, f"seconds = {seconds}: expected a duration above 0", UsageError)
+        require(0 < rate < np.inf, f"rate = {rate}: expected a number above 0 [Hz]", UsageError)
+        samples = seconds * rate
+        message = f"seconds = {seconds}, rate = {rate}: expected {MIN_SAMPLES} samples or more, found {samples:.3g}"
+        require(samples >= MIN_SAMPLES, message, UsageError)
         lower, upper = self.cell.nominal.sampling_limits()
         middle = 0.5 * (lower + upper)
         half = 0.5 * RANGE_SHARE * (upper - lower)
@@ -246,7 +263,14 @@ class PlantedArm:
             term: the torque per unit of its parameter, as a function.
             values: parameter of each joint of the term [N m or N], or one for all.
         """
-        count = len(term.drive_terms(self.cell.nominal))
+        terms = term.drive_terms(self.cell.nominal)
+        planted = set()
+        for earlier, _ in self.friction:
+            planted.update(drive_term.name for drive_term in earlier.drive_terms(self.cell.nominal))
+        for drive_term in terms:
+            message = f"FrictionTerm {term.name}: the arm has {drive_term.name} already: choose another name"
+            require(drive_term.name not in planted, message, UsageError)
+        count = len(terms)
         if np.ndim(values) == 0:
             numbers = np.full(count, values)
         else:
@@ -255,6 +279,11 @@ class PlantedArm:
 
     def __repr__(self) -> str:
         return f"<PlantedArm {self.cell.nominal.name}: seed {self.seed}>"
+
+
+def _check_seed(seed: int) -> None:
+    """Raise a UsageError for a negative seed."""
+    require(seed >= 0, f"seed = {seed}: expected a whole number, 0 or more", UsageError)
 
 
 def _series(motion: Motion, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -300,6 +329,7 @@ def population(
         RobotError: the robot is not found, or its file is invalid.
     """
     require(count >= 1, f"count = {count}: ask for one arm or more", UsageError)
+    _check_seed(seed)
     described = robot if isinstance(robot, CalibratedChain) else load_calibrated(robot, base, tip)
     nominal = as_calibrated(described).chain
     arms = []

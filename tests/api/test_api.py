@@ -369,6 +369,9 @@ def test_session_in_python_is_the_commands(logs, tmp_path, monkeypatch, capsys):
     assert cli.run(["new", "free", "--robot", robot, "--instrument", "cmm", "--no-plan"]) == 0
     free = tomllib.loads((tmp_path / "free/session.toml").read_text())
     assert not free["poses"]["plan"] and not free["dynamics"]["plan"]
+    (free,) = calib.run_sessions(["free"], plots=False)
+    assert free.state == "waits" and "Provide free/3-measured/measured.csv" in str(free)
+    assert not list((tmp_path / "free/2-poses").glob("*")), "no poses are chosen"
     own, other = (tomllib.loads((tmp_path / name / "session.toml").read_text()) for name in ("script", "command"))
     assert made == Path("script") and own | {"created": ""} == other | {"created": ""}
     script, command = calib.run_sessions(["script", "command/session.toml"], plots=False)

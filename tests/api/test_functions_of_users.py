@@ -85,6 +85,7 @@ def test_a_loss_of_scipy_withstands_gross_rows(robot):
 @pytest.mark.parametrize(
     ("loss", "message"),
     [
+        (lambda: 1.0, r"loss: function\(\) must take one argument, z = \(r/σ\)²"),
         (lambda z: z, r"loss: expected rows rho, rho', rho''"),
         (lambda z: np.array([z**2, z, z]), "row 1 is not the derivative of row 0: at z = 0.0001 it is 0.0001"),
         (lambda z: np.array([-z, 0.0 * z - 1.0]), "rho' is -1 .*must not be negative"),

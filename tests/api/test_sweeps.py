@@ -1,5 +1,7 @@
 """Sweeps run many settings over one data set in memory, and give a table; files are neither read nor written."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,18 @@ def soft_l1(z: np.ndarray) -> np.ndarray:
 
 def model_and_error(fit: calib.GeometryFit) -> dict[str, object]:
     return {"model": fit.selection.chosen, "rms": fit.selection.cross_validated}
+
+
+@dataclass
+class FewFigures:
+    rms: float
+
+    def to_dict(self) -> dict[str, object]:
+        return {"rms": self.rms}
+
+
+def interrupted(rms: float) -> FewFigures:
+    raise KeyboardInterrupt
 
 
 def test_a_grid_gives_a_row_for_each_combination():
@@ -39,6 +53,48 @@ def test_runs_have_figures_of_ones_own_and_errors_in_a_column():
     assert table.columns[1:] == ("model", "rms", "error") and table["model"][0] == "offsets"
     assert np.isfinite(table["rms"][0]) and np.isnan(table["rms"][1])
     assert table["error"][0] == "" and "2 usable rows" in table["error"][1]
+
+
+def boom(result: object) -> dict[str, object]:
+    raise ValueError("boom")
+
+
+def slip(z: np.ndarray) -> np.ndarray:
+    raise ZeroDivisionError("no such loss")
+
+
+def test_whatever_a_run_raises_the_others_go_on():
+    """Errors of the user's own functions have their class in the table; Ctrl-C still ends a sweep."""
+    over = {"loss": [slip, soft_l1]}
+    table = calib.sweep(calib.fit_geometry, ARM.nominal, MEASURED, over=over, figures=model_and_error)
+    assert table["error"][0] == "ZeroDivisionError: no such loss" and table["error"][1] == ""
+    table = calib.sweep(FewFigures, over={"rms": [1.0, 2.0]}, figures=boom)
+    assert list(table["error"]) == ["figures: ValueError: boom"] * 2
+    with pytest.raises(KeyboardInterrupt):
+        calib.sweep(interrupted, over={"rms": [1.0]})
+
+
+@pytest.mark.parametrize(
+    ("figures", "message"),
+    [
+        (lambda result: None, "figures: expected a mapping of names to numbers or texts, found NoneType"),
+        (lambda result: np.ones(3), "figures: expected a mapping .* found ndarray"),
+        (lambda result: {"all": np.ones(3)}, "figures: all: expected a number or a text, found ndarray"),
+        (lambda result: {"error": 1.0}, "figures: 'error' is a column of the sweep itself"),
+        (lambda result: {"rms": 1.0}, "figures: 'rms' is a column of the sweep itself"),
+        (lambda result: {1: 1.0}, "figures: expected names as texts, found 1"),
+    ],
+)
+def test_figures_that_are_no_columns_are_refused_at_the_first_run(figures, message):
+    runs: list[float] = []
+
+    def few(rms: float) -> FewFigures:
+        runs.append(rms)
+        return FewFigures(rms)
+
+    with pytest.raises(UsageError, match=message):
+        calib.sweep(few, over={"rms": [1.0, 2.0]}, figures=figures)
+    assert runs == [1.0]
 
 
 @pytest.mark.slow

@@ -114,7 +114,12 @@ def test_tables_are_within_a_millionth_of_their_function(kink):
         ({"of": "speed"}, "of 'speed' is not one of velocity, position"),
         ({"slope": 3.0}, "slope: expected a function, found 3.0"),
         ({"name": "Fa 1"}, "name 'Fa 1': expected letters"),
-        ({"name": "Fc"}, "Fc1 is already a parameter"),
+        ({"name": "Fc"}, "FrictionTerm Fc: the name is already a parameter of the drives"),
+        ({"name": "Fs"}, "FrictionTerm Fs: the name is already a parameter of the drives"),
+        ({"joints": 3}, "joints: expected several numbers, such as .3., found 3"),
+        ({"joints": []}, "joints: found no joint"),
+        ({"joints": [2, 2]}, "joints: 2 appears more than once"),
+        ({"joints": [1.5]}, "joints: expected whole numbers, found 1.5"),
     ],
 )  # fmt: skip
 def test_functions_that_are_no_friction_are_refused(folder, robot, change, message):

@@ -1,12 +1,15 @@
 """The dynamics of three parallel robots, planar and spatial, redundant or not, against Pinocchio's constrained ones."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from closed_tree import ClosedTree
 
 from calib.dynamics import base as bases
-from calib.errors import UsageError
+from calib.errors import CalibError, UsageError
 from calib.parallel.design_goal import LoadedPlatform
+from calib.parallel.identification import ParallelDynamics
 from calib.parallel.mechanism.closure import ClosedRobot
 from calib.parallel.mechanism.parallel_model import ParallelModel, make_parallel_model, rows_named
 from calib.parallel.mechanism.velocities import of_platform
@@ -111,6 +114,20 @@ def test_dualv_has_16_base_parameters():
 def expressed(model: ParallelModel, base: bases.Base, name: str) -> dict[str, float]:
     row = base.transform[base.names.index(name)]
     return {model.names[k]: row[k] for k in np.flatnonzero(np.abs(row) > 1e-9)}
+
+
+def test_one_state_gives_one_row_of_torques():
+    """As with serial arms, torques of (n,) are (rows,), those of (N, n) are (N, rows)."""
+    known, rng = find("fivebar").mechanism, np.random.default_rng(4)
+    model = make_parallel_model(known, ["Ia"])
+    values, states = rng.normal(size=model.p), model.sample(3, rng)
+    dynamics = SimpleNamespace(found=SimpleNamespace(dynamics=SimpleNamespace(model=model, values=values)))
+    torques = ParallelDynamics.torques(dynamics, states.q, states.v, states.a)
+    single = ParallelDynamics.torques(dynamics, states.q[1], states.v[1], states.a[1])
+    assert torques.shape == (3, 2) and single.shape == (2,)
+    np.testing.assert_allclose(single, torques[1], rtol=1e-6)
+    with pytest.raises(CalibError, match="v: expected an array of shape"):
+        ParallelDynamics.torques(dynamics, states.q, states.v[1], states.a)
 
 
 def test_redundant_actuators_lack_motor_rows():

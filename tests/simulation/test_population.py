@@ -10,6 +10,9 @@ NOTHING = calib.PlantedErrors(length=0, angle=0, offset=0, compliance=0, harmoni
 EXACT = calib.SimulatedInstrument(position_sigma=0.0, orientation_sigma=0.0, encoder_sigma=0.0)
 
 
+FRICTION = calib.FrictionTerm("Fa", lambda v: np.tanh(5.0 * v), lambda v: 5.0 * (1.0 - np.tanh(5.0 * v) ** 2))
+
+
 def rms(errors: np.ndarray) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
@@ -64,12 +67,11 @@ def test_every_kind_of_measurement_is_made(kind):
 
 def test_logs_have_the_planted_friction():
     """Noise-free torques with a further friction term differ from those without by this term alone."""
-    term = calib.FrictionTerm("Fa", lambda v: np.tanh(5.0 * v), lambda v: 5.0 * (1.0 - np.tanh(5.0 * v) ** 2))
     arm = calib.population("tx40", 1, seed=3, errors=calib.PlantedErrors(unmodelled=0.0), torque_sensors=True)[0]
     motion = arm.motion(seconds=2.0)
     states = motion.q, motion.v, motion.a
     amounts = np.arange(1.0, 7.0)
-    more = arm.with_friction(term, amounts).torques(*states) - arm.torques(*states)
+    more = arm.with_friction(FRICTION, amounts).torques(*states) - arm.torques(*states)
     np.testing.assert_allclose(more, amounts * np.tanh(5.0 * motion.v), atol=1e-4)
 
 
@@ -90,6 +92,14 @@ def test_an_arm_is_identified_from_its_log():
     ("make", "message"),
     [
         (lambda arm: calib.population("ur5", 0), "count = 0: ask for one arm or more"),
+        (lambda arm: calib.population("ur5", 1, seed=-1), "seed = -1: expected a whole number, 0 or more"),
+        (lambda arm: arm.postures(-1), "count = -1: expected 0 or more"),
+        (lambda arm: arm.postures(1, seed=-1), "seed = -1"),
+        (lambda arm: arm.motion(0), "seconds = 0: expected a duration above 0"),
+        (lambda arm: arm.motion(5, rate=-1), "rate = -1: expected a number above 0"),
+        (lambda arm: arm.motion(5, rate=1), "expected 20 samples or more, found 5"),
+        (lambda arm: arm.nominal.forward("a"), "q: expected numbers: could not convert"),
+        (lambda arm: arm.with_friction(FRICTION, 1.0).with_friction(FRICTION, 1.0), "the arm has Fa1 already"),
         (lambda arm: calib.PlantedErrors(length=-1.0), "length: expected 0 or more, found -1"),
         (lambda arm: calib.SimulatedInstrument(position_sigma=-1.0), "position_sigma = -1.0: expected 0 or more"),
         (lambda arm: arm.record(arm.motion(2.0)), "the description of ur5 has no masses"),

@@ -124,7 +124,7 @@ def program_files(
 
     Raises:
         UsageError: an unknown controller, a program name that the controller does not accept, another number of axes,
-            or a digital output that the controller does not have.
+            or a digital output or groups of axes that the controller does not have.
     """
     settings = settings or ProgramSettings()
     if name == CSV:
@@ -134,6 +134,9 @@ def program_files(
     if not re.fullmatch(controller.names, stem):
         rule = _name_rule(controller.names)
         raise UsageError(f"{out}: '{stem}' is no name for a program of {controller.title}: {rule}")
+
+    if settings.external_group is not None and not controller.rail_group:
+        raise UsageError(f"--external-group: programs for {controller.title} have no groups of axes; leave it out")
 
     moving = not (source or is_program(path)) and is_motion(path)
     if moving:

@@ -198,12 +198,15 @@ class HandEye(Placements):
 
     def lines(self, *first: str) -> Iterator[str]:
         """Yield the console lines: verdict, both transforms in the words of their users, residual, remarks."""
+        failed = self.verdict.level == "fail"
         yield str(self.verdict)
         for frame in self.transforms:
             yield str(frame)
-            if not self.is_open:
+            if not self.is_open and not failed:
                 yield f"URDF: {frame.urdf_origin}"
                 yield f"ROS: {frame.ros_command}"
+        if failed:
+            yield "the verdict is fail: no frames are printed for use"
         if self.is_open:
             yield (
                 "the poses turn about one axis only: positions of camera and board along it are not identifiable, only "

@@ -7,12 +7,18 @@ The parameter is identified with all others. The function is made a table over t
 read back without the function. URDF and MJCF have no place for it; exports say so.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
+from typing import cast
 
-from calib.dynamics.drives import DriveTerm, term
+import numpy as np
+
+from calib.dynamics.drives import LINK_SIDE, MOTOR_SIDE, STANDARD, DriveTerm, term
+from calib.dynamics.shapes import STEPS
 from calib.errors import UsageError, one_of, require
 from calib.identification.friction.function_tables import Function, knots_of
 from calib.robot.chain import Chain, Joint
@@ -20,6 +26,9 @@ from calib.robot.chain import Chain, Joint
 # Speeds of the table as a multiple of the joint's limit, and for joints without one [rad/s, m/s] (our choice).
 BEYOND_LIMIT = 2.0
 FASTEST = {"revolute": 10.0, "prismatic": 5.0}
+# Starts of the names of the drives' own parameters, also of those that the ladder of friction may add.
+DRIVE_NAMES = {*STANDARD, *LINK_SIDE, *MOTOR_SIDE}
+DRIVE_NAMES.update(offer.label for offer in itertools.chain(*STEPS.values()))
 SHAPES = {"velocity": "velocity_table", "position": "position_table"}
 
 
@@ -39,7 +48,8 @@ class FrictionTerm:
         joints: numbers of the joints that have the term, from 1; None for all.
 
     Raises:
-        UsageError: a name that is not an identifier, an argument of another kind.
+        UsageError: a name that is not an identifier or one of the drives' parameters, such as ``Fv``; joints that are
+            none, repeated or no whole numbers; an argument of another kind.
     """
 
     name: str
@@ -54,12 +64,29 @@ class FrictionTerm:
             f"FrictionTerm: name {self.name!r}: expected letters, digits and _, such as 'Fa'",
             UsageError,
         )
+        is_taken = self.name in DRIVE_NAMES
+        message = f"FrictionTerm {self.name}: the name is already a parameter of the drives: choose another name"
+        require(not is_taken, message, UsageError)
+        if self.joints is not None:
+            self._check_joints(self.joints)
         one_of(self.of, SHAPES, f"FrictionTerm {self.name}: of", UsageError)
         for role in ("function", "slope"):
             value = getattr(self, role)
             require(
                 callable(value), f"FrictionTerm {self.name}: {role}: expected a function, found {value!r}", UsageError
             )
+
+    def _check_joints(self, joints: object) -> None:
+        """Raise a UsageError for joints other than several different whole numbers."""
+        title = f"FrictionTerm {self.name}: joints"
+        is_several = isinstance(joints, (Sequence, np.ndarray)) and not isinstance(joints, str) and np.ndim(joints) == 1
+        require(is_several, f"{title}: expected several numbers, such as [3], found {joints!r}", UsageError)
+        numbers = list(cast(Sequence[object], joints))
+        require(len(numbers) > 0, f"{title}: found no joint; None stands for all", UsageError)
+        for number in numbers:
+            is_whole = isinstance(number, Integral) and not isinstance(number, bool)
+            require(is_whole, f"{title}: expected whole numbers, found {number!r}", UsageError)
+            require(numbers.count(number) == 1, f"{title}: {number} appears more than once", UsageError)
 
     @cached_property
     def _tables(self) -> dict[tuple[float, float], tuple[float, ...]]:

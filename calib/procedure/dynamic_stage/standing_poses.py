@@ -701,7 +701,8 @@ class GravityResult:
         centre, sigma = _centre(values, covariance)
         coordinates = []
         for coordinate, deviation in zip(1e3 * centre, 1e3 * sigma):
-            coordinates.append(f"{coordinate:.1f} ± {deviation:.1g}")
+            digits = np.format_float_positional(deviation, precision=2, unique=False, fractional=False, trim="-")
+            coordinates.append(f"{coordinate:.1f} ± {digits}")
         position = ", ".join(coordinates)
         mass = f"{values[3]:.4g} ± {np.sqrt(covariance[3, 3]):.2g} kg"
         return f"payload {label}: {mass} at {position} mm in '{self.gravity.chain.tip}'"

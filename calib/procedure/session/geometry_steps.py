@@ -259,6 +259,8 @@ def select(session: Session, say: Say) -> list[str]:
     Raises:
         UsageError: if a pose list contains measurements, which would be overwritten.
     """
+    if not session.settings.poses.plan:
+        return ["no poses were chosen, since plan = false: the measured files may contain any poses"]
     chain = chain_of(session)
     for name in (folder.POSES, folder.UNSEEN):
         path = session.path(f"2-poses/{name}")

@@ -143,7 +143,7 @@ class PosesSection:
     Attributes:
         fit: number of poses to choose for the fit
         validation: number of additional poses, never fitted; 0: no validation
-        plan: true: the chosen poses are measured; false: the measured files contain other poses
+        plan: true: poses are chosen, and are measured; false: none are chosen, the measured files contain any poses
         index: observability index that the chosen poses maximise
         method: search method for the poses
         constraints: a TOML file next to this one; see `calib formats constraints`

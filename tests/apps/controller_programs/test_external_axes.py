@@ -76,6 +76,12 @@ def test_group_of_external_axes_is_chosen(tmp_path, name, group):
     assert np.abs(q - poses(kinds)).max() < 2e-3
 
 
+def test_a_group_is_refused_where_programs_have_none(tmp_path):
+    names, kinds = CELLS["rail"]
+    with pytest.raises(UsageError, match=r"--external-group: programs for KUKA .* have no groups of axes"):
+        written(tmp_path, "krl", names, kinds, external_group=2)
+
+
 @pytest.mark.parametrize("name", WITH_SCARA)
 def test_a_scara_reads_back_as_written(tmp_path, name):
     """Its axis 3 slides and is in mm; it is not coupled to axis 2."""
