@@ -6,8 +6,8 @@
 ``board.toml``      the board (`calib board` writes it)
 ``camera.yaml``     the lens as ROS ``camera_info``; files of OpenCV, kalibr and RealSense are read too, under any name
                     (``.yaml .yml .xml .json``); without one, the lens is found from the images
-``corners.csv``     the corners found; written at the first reading, read instead of the images afterwards; remove it
-                    to have the images looked at again
+``corners.csv``     the corners found; written at the first reading, read instead of the images afterwards, also where
+                    the images are gone; remove it to have the images looked at again
 ==================  ===================================================================================================
 
 One folder is one camera that sees one board. Whether the arm carries the camera or the board is found from the
@@ -135,14 +135,21 @@ def joint_table(path: Path) -> Table:
 def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progress | None = None) -> Detections:
     """Return the corners of a folder's images: from ``corners.csv`` if newer than the images, else by detection.
 
+    A folder without images is read from its ``corners.csv``, however old.
+
     Args:
         path: the folder.
         board: the board to look for.
         names: file names of the images.
         progress: called with (done, total, image).
+
+    Raises:
+        MeasurementError: if there are neither images nor corners of them.
     """
     stored = path / CORNERS
     images = [path / name for name in names if (path / name).is_file()]
+    if stored.is_file() and not images:
+        return _stored_corners(stored, board, names)
     if stored.is_file():
         times = [file.stat().st_mtime for file in (*images, path / BOARD)]
         newest = max(times)
@@ -167,6 +174,28 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
     with suppress(CalibError):
         write_corners(stored, detection)
     return detection
+
+
+def _stored_corners(file: Path, board: Board, names: Sequence[str]) -> Detections:
+    """Return the corners in the ``corners.csv`` of a folder without images.
+
+    Args:
+        file: the ``corners.csv``.
+        board: the board.
+        names: file names of the images in ``joints.csv``.
+
+    Raises:
+        MeasurementError: if the file has corners of none of these images.
+    """
+    detection = read_corners(file, board)
+    if detection.images.keys() & set(names):
+        return detection
+    others = listing(detection.images, 3) or "no images"
+    raise MeasurementError(
+        f"{JOINTS} and {CORNERS} disagree: {JOINTS} names {listing(names, 3)}, {CORNERS} has {others}, and there are "
+        "no images: give the images the same names in both",
+        file.parent,
+    )
 
 
 def _usable(names: Sequence[str], detection: Detections, path: Path) -> tuple[np.ndarray, list[str]]:

@@ -16,7 +16,7 @@ from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
-from calib.errors import CalibError, Finding, MeasurementError, UsageError, require
+from calib.errors import CalibError, Finding, MeasurementError, UsageError, listing, require
 from calib.extensions import Point
 from calib.geometry.checks.pose_direction import as_seen_by_instrument
 from calib.geometry.checks.readings import without_unseen
@@ -31,7 +31,7 @@ from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain, Deflection
 from calib.robot.chain import Chain
 from calib.robot.description import remarks
-from calib.robot.formats import urdf
+from calib.robot.formats import arm_ends, urdf
 from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.kinematics import gravity_torques
@@ -271,20 +271,61 @@ def load_robot(
         if base is None and tip is None and not options.beta:
             return description.read(source, propose_beta=False), source
         return load(robot, base, tip), source
-    names: list[str] = []
-    if measured is not None and tip is None:
-        joints = read_tree(text(source)[0], str(source)).joints
-        table = measured / JOINTS if measured.is_dir() else measured
-        header = joint_columns(table)
-        columns = dict.fromkeys([*header, *options.for_file(measured).columns])
-        names = [column for column in columns if column in joints and joints[column].actuated]
-        with_words = joints_in(header, [name for name, joint in joints.items() if joint.actuated])
-        if len(with_words) > len(names):
-            names = with_words
-        # numbered columns hold more joints than are named
-        if f"q{len(names) + 1}" in header:
-            names = []
-    return load(robot, base, tip, names or None), source
+    if measured is None:
+        return load(robot, base, tip), source
+    names = _measured_joints(source, measured, options)
+    if tip is None:
+        return load(robot, base, None, names or None), source
+    chain = load(robot, base, tip)
+    if names and not set(chain.joint_names) <= set(names) and not options.for_file(measured).columns:
+        _check_measured_arm(chain, source, measured, names)
+    return chain, source
+
+
+def _measured_joints(source: Path, measured: Path, options: FitOptions) -> list[str]:
+    """Return the joints of a URDF that are named in the header of a table; [] where its joints are numbered.
+
+    Args:
+        source: file of the robot.
+        measured: the table, or a folder of images.
+        options: options for reading the table.
+    """
+    joints = read_tree(text(source)[0], str(source)).joints
+    actuated = [name for name, joint in joints.items() if joint.actuated]
+    table = measured / JOINTS if measured.is_dir() else measured
+    header = joint_columns(table)
+    columns = dict.fromkeys([*header, *options.for_file(measured).columns])
+    names = list(filter(actuated.__contains__, columns))
+    with_words = joints_in(header, actuated)
+    if len(with_words) > len(names):
+        names = with_words
+    # numbered columns hold more joints than are named
+    if f"q{len(names) + 1}" in header:
+        return []
+    return names
+
+
+def _check_measured_arm(chain: Chain, source: Path, measured: Path, names: Sequence[str]) -> None:
+    """Check that the table of a stated arm does not have another arm's joints in place of its own.
+
+    Args:
+        chain: the stated arm.
+        source: its URDF.
+        measured: the table.
+        names: the URDF's joints in the table.
+
+    Raises:
+        UsageError: if the table lacks the arm's last joint, and has joints of another arm.
+    """
+    others = [name for name in names if name not in chain.joint_names]
+    if not others or chain.joint_names[-1] in names:
+        return
+    message = f"{measured}: has joints of another arm ({listing(others, 8)}), not of that to {chain.tip}"
+    try:
+        tip = arm_ends.choose(read_tree(text(source)[0], str(source)), chain.base, others).tip
+    except CalibError:  # several arms
+        raise UsageError(f"{message}: state the last link of the measured arm by --tip") from None
+    raise UsageError(f"{message}: give --tip {tip}")
 
 
 def load_rigid(

@@ -1,5 +1,6 @@
 """Claims: a folder of images is read like a measurement file; what is of no use in it is said, image by image."""
 
+import os
 from functools import cache
 
 import cv2
@@ -64,6 +65,19 @@ def test_corners_are_looked_for_once(folder):
     assert np.array_equal(again.seen, block.seen) and again.size == LENS.size
     assert np.nanmax(np.abs(again.pixel - block.pixel)) < 1e-8
     assert (folder / "corners.csv").read_text() == before
+
+
+def test_corners_without_images_are_read_however_old(folder):
+    """A folder without images is read from its corners, however old; those of other images are refused."""
+    block = read(folder)
+    for image in folder.glob("*.png"):
+        image.unlink()
+    os.utime(folder / "corners.csv", (0, 0))
+    assert np.array_equal(read(folder).seen, block.seen)
+    table = folder / "joints.csv"
+    table.write_text(table.read_text().replace(".png", ".jpg"))
+    with pytest.raises(MeasurementError, match=r"joints.csv and corners.csv disagree: .*\.jpg.*\.png"):
+        read(folder)
 
 
 def test_useless_images_are_left_out(folder):

@@ -4,15 +4,16 @@ from itertools import chain as joined
 
 import numpy as np
 import pytest
+from robot_oracle import axis, joint, robot
 from scipy.spatial.transform import Rotation
 
 from calib.data.poses.fit_options import FileOptions, FitOptions
 from calib.data.poses.measurements import Positions
 from calib.data.poses.pose_files import read_measurements
 from calib.data.schema import Joints
-from calib.errors import MeasurementError
+from calib.errors import MeasurementError, UsageError
 from calib.geometry.checks.readings import without_unseen
-from calib.procedure.kinematic_stage.inputs import read_file
+from calib.procedure.kinematic_stage.inputs import load_robot, read_file
 from calib.robot.kinematics import forward
 from calib.robot.library import load
 
@@ -228,3 +229,21 @@ def test_repeated_readings_are_left_out(arm, stale, value):
     assert [entry.code for entry in findings] == ["reading-repeated"]
     assert findings[0].values["rows"] == tuple(str(row + 1) for row in stale)
     assert set(seen.rows.tolist()) == set(range(1, COUNT + 1)) - {row + 1 for row in stale}
+
+
+def test_stated_arm_without_columns_is_refused(tmp_path):
+    """A table of the left arm is not read as that of the right arm, and its arm is named."""
+    joints = []
+    for side in ("left", "right"):
+        joints += [
+            joint(f"{side}_joint_1", "revolute", "torso", f"{side}_a", axis("0 0 1"), "0 0 0.1"),
+            joint(f"{side}_joint_2", "revolute", f"{side}_a", f"{side}_b", axis("0 1 0"), "0.1 0 0.3"),
+            joint(f"{side}_hand", "fixed", f"{side}_b", f"{side}_tool0", "", "0 0 0.2"),
+        ]
+    source = tmp_path / "two.urdf"
+    source.write_text(robot(*joints))
+    header = ["left_joint_1 [deg]", "left_joint_2 [deg]", "x", "y", "z"]
+    table = written(tmp_path / "left.csv", header, np.ones((5, 3)))
+    with pytest.raises(UsageError, match=r"another arm .*give --tip left_tool0"):
+        load_robot(source, table, FitOptions(), tip="right_tool0")
+    assert load_robot(source, table, FitOptions(), tip="left_tool0")[0].tip == "left_tool0"
