@@ -44,6 +44,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.csv_table import Table, read_header, read_table, split_units
+from calib.data.joint_columns import words_of
 from calib.data.poses import plausible
 from calib.data.poses.base_frame import rows_with_base, seen_from_base
 from calib.data.poses.columns import (
@@ -74,6 +75,7 @@ from calib.data.poses.measurements import (
     Positions,
     Sockets,
 )
+from calib.data.poses.name_shapes import REJECTED_WORDS, positions_by_shape
 from calib.data.poses.placeholders import without_placeholders
 from calib.data.poses.robodk import FORMS
 from calib.data.poses.silent_units import with_silent_units
@@ -301,6 +303,9 @@ def _unread_angles(table: Table, ignored: Sequence[str]) -> tuple[str, ...]:
         if not set(names) <= set(ignored) or any(values.dtype != float for values in cells):
             continue
         if not set(map(str.lower, table.units[first : first + 3])) <= {"", *ANGLES}:
+            continue
+        # x_target y_target z_target: a commanded position, or another quantity
+        if positions_by_shape(names) or any(not REJECTED_WORDS.isdisjoint(words_of(name)) for name in names):
             continue
         values = np.stack(cells, axis=1)
         largest = np.abs(values).max(initial=0.0)

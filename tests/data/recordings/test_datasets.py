@@ -93,7 +93,8 @@ def test_unnamed_numbers_are_proposed_in_their_order(tmp_path, series):
 def test_two_data_sets_of_a_motion_are_joined(tmp_path, series):
     """`calib join` reads a data set as a log."""
     folder = dataset(tmp_path / "set", series, NAMES)
-    t = dataset_table(folder).cells[-1]
+    table = dataset_table(folder)
+    t = table.cells[table.header.index("timestamp")]
     header = ",".join(["t", *(f"{name} torque [Nm]" for name in ROBOT.names)])
     np.savetxt(tmp_path / "torque.csv", np.column_stack([t, series["tau"]]), delimiter=",", header=header, comments="")
     assert run(["join", str(folder), str(tmp_path / "torque.csv"), "--out", str(tmp_path / "log.csv")]) == 0
