@@ -37,7 +37,8 @@ FINDING = (
         "calib/procedure/findings.toml",
         "[joint-sign]\n",
         '[joint-hardly-moved]\nsays = "{joint} moved by {range:.3g}° only"\n'
-        'advice = "measure again with that joint over a larger range"\n\n[joint-sign]\n',
+        'advice = "measure again with that joint over a larger range"\n'
+        "example = { range = 0.5 }\n\n[joint-sign]\n",
     ),
     Edit(
         f"{STAGE}/plausibility.py",
@@ -87,8 +88,8 @@ FORMAT = (
     ),
     Edit(
         "calib/data/poses/robodk.py",
-        '    "robodk": (recognises, read_robodk),\n',
-        '    "robodk": (recognises, read_robodk),\n    "acme": (recognises_acme, read_acme),\n',
+        '    "robodk": (_is_robodk, read_robodk),\n',
+        '    "robodk": (_is_robodk, read_robodk),\n    "acme": (recognises_acme, read_acme),\n',
     ),
     Edit("calib/data/poses/fit_options.py", '"robodk", "three_smr")', '"robodk", "three_smr", "acme")'),
 )
@@ -188,7 +189,7 @@ def test_a_finding(scratch: Copy, measured: Path) -> None:
     console = scratch.calib("fit", "tx40", str(measured), "--model", "geometry", "--out", str(out), "--no-plots")
     assert "moved by 0.5° only; measure again with that joint over a larger range" in console
     assert "joint-hardly-moved" in (out / "metrics.json").read_text(encoding="utf-8")
-    assert "JOINT moved by RANGE° only" in scratch.calib("explain", "joint-hardly-moved")
+    assert "moved by 0.5° only" in scratch.calib("explain", "joint-hardly-moved")
     scratch.holds("tests/procedure/test_findings.py")
 
 
