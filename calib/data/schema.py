@@ -186,7 +186,7 @@ class Column:
         unit = {"angle": " rad", "length": " m"}.get(self.dimension, "")
 
         def other_unit(row: int, k: int) -> str:
-            too_large = (np.abs(values) > self.most).any(axis=1)
+            too_large = np.asarray((np.abs(values) > self.most).any(axis=1))
             split = two_conventions(source, too_large, self.likely, unit.strip())
             if split:
                 return f"found {values[row, k]:g}{unit}; {split}"

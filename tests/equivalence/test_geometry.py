@@ -15,7 +15,7 @@ from sessions import edit
 from calib.data.poses.pose_lists import read_poses
 from calib.errors import finding
 from calib.procedure.findings import sentence
-from calib.procedure.session.folder import open_session
+from calib.procedure.session.folder import Session, open_session
 from calib.robot.library import load
 from calib.simulation.cell import measure, write_measured
 from calib.simulation.virtual_cells import perturbed_cell
@@ -163,10 +163,18 @@ def test_odd_file_names_are_allowed(files: Path, tmp_path: Path) -> None:
     assert load(out).n == 3
 
 
+def planned(session: Session) -> None:
+    """Let a session without plans choose its poses, which have to be measured then."""
+    edit(session.path("session.toml"), "plan = false", "plan = true")
+    for name in ("measured", "validation"):
+        session.path(f"3-measured/{name}.csv").unlink()
+    go_on(session)
+
+
 def test_promise_of_poses_is_checked(fitted: Path, tmp_path: Path) -> None:
     """What the poses promised is held against the same figures."""
     session = open_session(shutil.copytree(fitted, tmp_path / "cell"))
-    edit(session.path("session.toml"), "plan = false", "plan = true")
+    planned(session)
     cell, names = perturbed_cell(planted.arm(), seed=1, hidden=0.0), planted.arm().joint_names
     for plan, name in (("poses", "measured"), ("validation_poses", "validation")):
         q = read_poses(session.path(f"2-poses/{plan}.csv"), names)
@@ -191,7 +199,8 @@ def test_promise_of_poses_is_checked(fitted: Path, tmp_path: Path) -> None:
 
 
 def test_the_same_poses_are_chosen(fitted: Path, files: Path, tmp_path: Path) -> None:
-    out, session = tmp_path / "poses.csv", open_session(fitted)
+    out, session = tmp_path / "poses.csv", open_session(shutil.copytree(fitted, tmp_path / "cell"))
+    planned(session)
     device, place = session.settings.instrument, ",".join(map(str, session.settings.instrument.tool))
     sigmas = f"{device.sigma_position},{device.sigma_orientation}"
     assert not command("select", files / "robot.toml", "-m", 4, "--tool", place, "--sigma", sigmas, "--out", out)

@@ -73,7 +73,7 @@ def test_simulation_of_a_function_is_that_of_its_shape():
     """tanh(v / 0.05) as a function runs like the smoothed sign with this width."""
     chain = planted.arm()
     own = calib.FrictionTerm(
-        "Ft", lambda v: np.tanh(v / 0.05), lambda v: 20.0 / np.cosh(np.minimum(np.abs(v) / 0.05, 300.0)) ** 2
+        "Fq", lambda v: np.tanh(v / 0.05), lambda v: 20.0 / np.cosh(np.minimum(np.abs(v) / 0.05, 300.0)) ** 2
     )
     limit = np.full(3, 1.0)
     asked = known_robots.random_fourier(-limit, limit, np.full(3, 2.0), 2.0, 500.0, 4, acceleration=10.0, seed=1)

@@ -54,7 +54,7 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
     plain = np.array([unit in ("", "rad", "m") for unit in units])
     # degrees from 0 to 360 exceed limits in degrees, too: all joints together show the unit, not one alone
     too_large = np.abs(q[:, ~sliding & plain]) > BOUNDS.max_turn
-    rows_in_degrees = too_large.any(axis=1)
+    rows_in_degrees = np.asarray(too_large.any(axis=1))
     in_degrees = bool(np.mean(rows_in_degrees) > MOST_ROWS)
     split = two_conventions(table, rows_in_degrees, "deg", "rad")
 
