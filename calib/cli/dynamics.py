@@ -173,15 +173,15 @@ def _gravity(
         unused: method, friction and excitation, which standing poses do not use; None where they are not stated.
     """
     from calib.identification.identify_options import read_options
-    from calib.procedure.dynamic_stage import standing_poses
     from calib.procedure.dynamic_stage.inputs import with_choices
+    from calib.procedure.dynamic_stage.standing import gravity_result, recorded_poses
     from calib.procedure.robot_kinds import stage_of
 
     named = [*recordings, *validate]
     if stage_of(robot, "identify") is not None:
         return False
-    if not standing_poses.stand(robot, named, options, base, tip):
-        still = standing_poses.standing_files(robot, named, options, base, tip)
+    if not recorded_poses.stand(robot, named, options, base, tip):
+        still = recorded_poses.standing_files(robot, named, options, base, tip)
         if still:
             names = ", ".join(still)
             say(f"standing poses: {names}; the other files are motions. Identify each kind by its own command")
@@ -192,8 +192,8 @@ def _gravity(
     stated = [f"--{name}" for name, value in zip(names, (method, friction, excitation)) if value is not None]
     if stated:
         say(f"not used for standing poses: {', '.join(stated)}")
-    standing_poses.check_target(out, [options, *named])
-    result = standing_poses.identify_gravity(robot, recordings, validate, options, base, tip, seed)
+    gravity_result.check_target(out, [options, *named])
+    result = gravity_result.identify_gravity(robot, recordings, validate, options, base, tip, seed)
     result.write(out)
     say_written(result.lines(), out, result.verdict.level)
     return True

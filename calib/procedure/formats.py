@@ -47,7 +47,7 @@ TOPICS: Mapping[str, tuple[str, str]] = {
     "recordings": (
         "recordings of motion, for calib identify",
         "calib.data.recordings.recording_options calib.data.recordings.recording_files calib.data.recordings.archives "
-        "calib.procedure.dynamic_stage.standing_poses",
+        "calib.procedure.dynamic_stage.standing",
     ),
     "images": (
         "a folder of images of a board, its board.toml, camera.yaml, corners.csv",

@@ -9,7 +9,7 @@ import pytest
 from calib.column_changes import exchange, reversal
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics
-from calib.identification.checks.joint_columns import corrected, wrong_joints
+from calib.identification.checks.mistaken_columns import corrected, wrong_joints
 from calib.identification.checks.recorded_motion import MotionSamples
 from calib.procedure.dynamic_stage import plausibility
 from calib.robot.library import load

@@ -14,8 +14,8 @@ from typing import Any, cast
 import numpy as np
 
 from calib.apps.controller_programs.frames import stated_frame
-from calib.apps.registration.frames import Placed, description_of, in_controller, urdf_with
 from calib.apps.registration.pairs import measured_pairs
+from calib.apps.registration.printed_frames import Placed, description_of, in_controller, urdf_with
 from calib.apps.registration.settings import DEFAULT_PLACEMENT, PlacementSettings
 from calib.errors import UsageError
 from calib.records import as_subclass

@@ -14,7 +14,16 @@ from calib.apps.registration.agreement import Reading, agreed
 from calib.errors import refuse_data
 from calib.toolkit.chains import POSE_JOINTS, CalibratedChain, Chain, Element, Joint
 from calib.toolkit.installations import chordal_turns, direction
-from calib.toolkit.pose_pairs import FIXED_WORDS, IN_HAND, LENS_WORDS, ROBOT_WORDS, TO_HAND, PosePairs, Poses
+from calib.toolkit.pose_pairs import (
+    BOARD_WORDS,
+    FIXED_WORDS,
+    IN_HAND,
+    LENS_WORDS,
+    ROBOT_WORDS,
+    TO_HAND,
+    PosePairs,
+    Poses,
+)
 from calib.transforms import invert, pose, to_quaternion
 
 # Fewest pairs that determine both placements.
@@ -23,25 +32,6 @@ MIN_PAIRS = 3
 JOINT_AXES = ("tx", "ty", "tz", "rz", "ry", "rx")
 # Names under which easy_handeye stores poses of the board in the camera.
 EASY_HANDEYE = ("optical", "opt")
-# Words for the boards that detectors find.
-BOARD_WORDS = frozenset(
-    [
-        "optical",
-        "marker",
-        "board",
-        "target",
-        "object",
-        "obj",
-        "tag",
-        "aruco",
-        "apriltag",
-        "charuco",
-        "pattern",
-        "chessboard",
-        "checkerboard",
-        "grid",
-    ]
-)
 
 
 def measured_pairs(pairs: PosePairs, mounting: str, robot: Chain | None) -> tuple[CalibratedChain, Poses]:

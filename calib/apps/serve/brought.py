@@ -7,7 +7,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, Response
 
 from calib.apps.serve import received, uploads
-from calib.apps.serve.answers import MEASURED_KINDS, back, kind_of, kinds_of, name_of, session_of
+from calib.apps.serve.page_responses import MEASURED_KINDS, back, kind_of, kinds_of, name_of, session_of
 from calib.apps.serve.received import JOINTS, POINTS, Pairing
 from calib.apps.serve.work import CHECK, JOIN, Work
 from calib.errors import UsageError, require

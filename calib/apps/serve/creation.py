@@ -8,7 +8,7 @@ from starlette.datastructures import UploadFile
 from starlette.requests import Request
 from starlette.responses import Response
 
-from calib.apps.serve.answers import back, page_of
+from calib.apps.serve.page_responses import back, page_of
 from calib.errors import CalibError, UsageError, complaint, require
 from calib.toolkit.chains import controllers, robot_names
 from calib.toolkit.sessions import (

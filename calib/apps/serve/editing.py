@@ -7,8 +7,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from calib import files
-from calib.apps.serve.answers import back, page_of, session_of
 from calib.apps.serve.brought import form_of
+from calib.apps.serve.page_responses import back, page_of, session_of
 from calib.errors import CalibError, UsageError, require
 from calib.toolkit.chains import toml_table
 from calib.toolkit.pose_data import read_fit_options

@@ -16,9 +16,18 @@ from starlette.routing import Route
 
 from calib.apps.joining.joining import METHODS
 from calib.apps.serve import brought, creation, editing, received
-from calib.apps.serve.answers import MEASURED_KINDS, back, kind_of, kinds_of, name_of, page_of, refused, session_of
 from calib.apps.serve.columns_wanted import Example, example_of
 from calib.apps.serve.guard import Guard
+from calib.apps.serve.page_responses import (
+    MEASURED_KINDS,
+    back,
+    kind_of,
+    kinds_of,
+    name_of,
+    page_of,
+    refused,
+    session_of,
+)
 from calib.apps.serve.web_viewer import LOCAL, WebViewer
 from calib.apps.serve.work import NEXT, REDO, Work
 from calib.apps.viewer.viewer import FILE as RECORDING

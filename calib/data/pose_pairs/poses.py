@@ -49,34 +49,14 @@ ROBOT_WORDS = frozenset(
         "link6",
     ]
 )
-CAMERA_WORDS = frozenset(
-    [
-        "cam",
-        "camera",
-        "optical",
-        "opt",
-        "marker",
-        "board",
-        "target",
-        "object",
-        "obj",
-        "sensor",
-        "tag",
-        "aruco",
-        "apriltag",
-        "charuco",
-        "pattern",
-        "chessboard",
-        "checkerboard",
-        "grid",
-        "tracking",
-        "tracker",
-        "eye",
-        "vision",
-    ]
+# of boards that detectors find
+BOARD_WORDS = frozenset(
+    ["marker", "board", "target", "object", "obj", "tag", "aruco", "apriltag", "charuco", "pattern", "chessboard"]
 )
-FIXED_WORDS = frozenset(["base", "world", "robot"])
+BOARD_WORDS |= {"checkerboard", "grid", "optical"}
 LENS_WORDS = frozenset(["cam", "camera", "optical", "sensor", "eye", "tracker", "vision"])
+CAMERA_WORDS = BOARD_WORDS | LENS_WORDS | {"opt", "tracking"}
+FIXED_WORDS = frozenset(["base", "world", "robot"])
 _DIRECTION = re.compile(r"(?P<of>.+?)(?:2|_to_|_in_|_wrt_|_rel_to_|_from_)(?P<frame>.+)")
 
 

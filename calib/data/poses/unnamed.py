@@ -3,7 +3,7 @@
 Behind up to three texts and a counter stand the joints before or behind the target: x y z alone, with three angles, a
 quaternion (w last or first), nine elements of a rotation, or a whole matrix 3x4 or 4x4 by rows (DELMIA's Auto ID: tag,
 x y z, roll pitch yaw, joints). Which arrangement it is, the nominal arm tells
-(`calib.procedure.kinematic_stage.readings`).
+(`calib.procedure.kinematic_stage.undecided_files`).
 """
 
 from collections.abc import Iterator, Sequence

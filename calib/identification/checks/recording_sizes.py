@@ -22,7 +22,7 @@ from calib.column_changes import Explanation
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.estimation.whiteness import inflation
-from calib.identification.checks.joint_columns import rearranged, wrong_joints
+from calib.identification.checks.mistaken_columns import rearranged, wrong_joints
 from calib.identification.checks.recorded_motion import (
     MotionSamples,
     basis,

@@ -8,7 +8,7 @@ import numpy as np
 from calib.column_changes import Explanation
 from calib.errors import Finding, finding
 from calib.identification.checks.gravity import GravityHypotheses, gravity_of
-from calib.identification.checks.joint_columns import corrected, without_offsets
+from calib.identification.checks.mistaken_columns import corrected, without_offsets
 from calib.identification.checks.recorded_motion import bodies_under, take_samples
 from calib.identification.checks.recording_sizes import MAX_SAMPLES
 from calib.identification.checks.unstated_load import unstated_load

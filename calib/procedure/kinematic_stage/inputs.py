@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.data.images.pixels import Pixels
 from calib.data.joint_columns import joints_in
-from calib.data.pose_pairs.reading import read_pairs
+from calib.data.pose_pairs.pair_files import read_pairs
 from calib.data.poses import JOINTS, is_image_folder
 from calib.data.poses.columns import Undecided
 from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
@@ -24,8 +24,8 @@ from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
 from calib.geometry.repeatability import repeated, repeated_rows, without_copies
-from calib.procedure.kinematic_stage.readings import decided
 from calib.procedure.kinematic_stage.settings import FitSettings
+from calib.procedure.kinematic_stage.undecided_files import decided
 from calib.procedure.robot_kinds import joints_of
 from calib.robot import calibrated, description
 from calib.robot.calibrated import CalibratedChain, Deflection

@@ -11,7 +11,8 @@ import pytest
 
 from calib import cli
 from calib.errors import MeasurementError
-from calib.procedure.dynamic_stage.standing_poses import identify_gravity, stand
+from calib.procedure.dynamic_stage.standing.gravity_result import identify_gravity
+from calib.procedure.dynamic_stage.standing.recorded_poses import stand
 from calib.robot.chain import Chain
 from calib.robot.formats.urdf_write import write_new
 from calib.robot.library import load

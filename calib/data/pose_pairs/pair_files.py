@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from calib.data.pose_pairs.pair_tables import read_table_of_pairs
+from calib.data.pose_pairs.pair_trees import SUFFIXES, read_pairs_of_tree
 from calib.data.pose_pairs.poses import PosePairs
-from calib.data.pose_pairs.tables import read_table_of_pairs
-from calib.data.pose_pairs.trees import SUFFIXES, read_pairs_of_tree
 from calib.data.poses.fit_options import FileOptions
 from calib.errors import MeasurementError
 
