@@ -36,15 +36,15 @@ FINDING = (
     Edit(
         "calib/procedure/findings.toml",
         "[joint-sign]\n",
-        '[joint-hardly-moved]\nsays = "{joint} moved by {range:.3g}° only"\n'
+        '[joint-hardly-moved]\nsays = "{joint} moved by {angle:.3g °} only"\n'
         'advice = "measure again with that joint over a larger range"\n'
-        "example = { range = 0.5 }\n\n[joint-sign]\n",
+        "\n[joint-sign]\n",
     ),
     Edit(
         f"{STAGE}/plausibility.py",
         '        finding("measured-range", joints=ranges(measured_range), **values),\n',
         '        finding("measured-range", joints=ranges(measured_range), **values),\n'
-        '        finding("joint-hardly-moved", joint=measured_range.joints[0], range=0.5),\n',
+        '        finding("joint-hardly-moved", joint=measured_range.joints[0], angle=0.0087),\n',
     ),
 )
 OPTION = (
@@ -187,9 +187,9 @@ def test_a_finding(scratch: Copy, measured: Path) -> None:
     scratch.apply(FINDING)
     out = scratch.folder / "out"
     console = scratch.calib("fit", "tx40", str(measured), "--model", "geometry", "--out", str(out), "--no-plots")
-    assert "moved by 0.5° only; measure again with that joint over a larger range" in console
+    assert "moved by 0.498° only; measure again with that joint over a larger range" in console
     assert "joint-hardly-moved" in (out / "metrics.json").read_text(encoding="utf-8")
-    assert "moved by 0.5° only" in scratch.calib("explain", "joint-hardly-moved")
+    assert "moved by 90° only" in scratch.calib("explain", "joint-hardly-moved")
     scratch.holds("tests/procedure/test_findings.py")
 
 

@@ -9,7 +9,6 @@ catalogue ``findings.toml`` states::
     level    note, marginal or fail; or
     limits   value -> level -> limit above which the value reaches the level; if several values have limits, the
              mildest of their levels counts; a finding that reaches no level is not reported
-    example  values of its own for the message that explains it
     accept   the name in the options' ``accept`` by which a user accepts the finding
     means    additional explanation for `calib explain`
 """
@@ -158,7 +157,6 @@ class CatalogueEntry:
     limits: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     accept: str = ""
     means: str = ""
-    example: Mapping[str, object] = field(default_factory=dict)
 
 
 @cache
@@ -314,10 +312,10 @@ def explain(code: str) -> str:
 def example(code: str) -> Finding:
     """Return a finding with plausible values, as an example of its message.
 
-    Values by name, and what a finding has otherwise, are in ``finding_examples.toml``, or in the entry's ``example``.
+    Values by name, and what a finding has otherwise, are in ``finding_examples.toml``.
     """
     values = _example_values()
-    return Finding(code, {**values["any"], **values.get(code, {}), **catalogue()[code].example})
+    return Finding(code, {**values["any"], **values.get(code, {})})
 
 
 @cache

@@ -125,7 +125,7 @@ def test_explanation_is_an_example(code):
     names = [name for _, name, _, _ in Formatter().parse(f"{entry.says} {entry.advice}") if name]
     required = [name for _, name, _, _ in Formatter().parse(re.sub("<[^<>]*>", "", f"{entry.says} {entry.advice}"))]
     missing = {name for name in names if name not in values}
-    assert not missing, f"[{code}] of findings.toml needs values of {missing}: example = {{ … }}"
+    assert not missing, f"calib/procedure/finding_examples.toml needs values of {missing}, under [any] or [{code}]"
     assert not [name for name in required if name and values[name] in findings.OMITTED_VALUES]
     text = "; ".join(findings.example_texts(code))
     assert findings.example_texts(code)[0] in findings.explain(code)
