@@ -13,7 +13,7 @@ CODES: set[str] = set()
 
 
 def note() -> None:
-    """Note the code of each finding that a source, not a test, makes from now on."""
+    """Note the code of each finding that a source, not a test, makes from now on; examples of messages do not count."""
     from calib.procedure.findings import catalogue, level_of
 
     make = Finding.__init__
@@ -23,7 +23,8 @@ def note() -> None:
         frame = sys._getframe(1)
         while frame.f_back and frame.f_code.co_name == "finding":
             frame = frame.f_back
-        if frame.f_code.co_filename.startswith(SOURCES) and self.code in catalogue() and level_of(self):
+        is_source = frame.f_code.co_filename.startswith(SOURCES) and frame.f_code.co_name != "example"
+        if is_source and self.code in catalogue() and level_of(self):
             CODES.add(self.code)
 
     Finding.__init__ = noted
