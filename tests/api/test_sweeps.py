@@ -19,7 +19,7 @@ def soft_l1(z: np.ndarray) -> np.ndarray:
 
 
 def model_and_error(fit: calib.GeometryFit) -> dict[str, object]:
-    return {"model": fit.selection.chosen, "rms": fit.selection.cross_validated}
+    return {"chosen": fit.selection.chosen, "rms": fit.selection.cross_validated}
 
 
 @dataclass
@@ -50,7 +50,7 @@ def test_runs_have_figures_of_ones_own_and_errors_in_a_column():
     few = ARM.measure(ARM.postures(2))
     runs = [{"measured": MEASURED}, {"measured": few}]
     table = calib.sweep(calib.fit_geometry, robot=ARM.nominal, settings=OFFSETS, over=runs, figures=model_and_error)
-    assert table.columns[1:] == ("model", "rms", "error") and table["model"][0] == "offsets"
+    assert table.columns[1:] == ("chosen", "rms", "error") and table["chosen"][0] == "offsets"
     assert np.isfinite(table["rms"][0]) and np.isnan(table["rms"][1])
     assert table["error"][0] == "" and "2 usable rows" in table["error"][1]
 
