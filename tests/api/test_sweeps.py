@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from worker_tasks import chosen_and_error
 
 import calib
 from calib.errors import UsageError
@@ -16,10 +17,6 @@ OFFSETS = calib.FitSettings(model="offsets")
 def soft_l1(z: np.ndarray) -> np.ndarray:
     root = np.sqrt(1.0 + z)
     return np.array([2.0 * (root - 1.0), 1.0 / root])
-
-
-def model_and_error(fit: calib.GeometryFit) -> dict[str, object]:
-    return {"chosen": fit.selection.chosen, "rms": fit.selection.cross_validated}
 
 
 @dataclass
@@ -49,7 +46,7 @@ def test_runs_have_figures_of_ones_own_and_errors_in_a_column():
     """A run that fails does not end the sweep."""
     few = ARM.measure(ARM.postures(2))
     runs = [{"measured": MEASURED}, {"measured": few}]
-    table = calib.sweep(calib.fit_geometry, robot=ARM.nominal, settings=OFFSETS, over=runs, figures=model_and_error)
+    table = calib.sweep(calib.fit_geometry, robot=ARM.nominal, settings=OFFSETS, over=runs, figures=chosen_and_error)
     assert table.columns[1:] == ("chosen", "rms", "error") and table["chosen"][0] == "offsets"
     assert np.isfinite(table["rms"][0]) and np.isnan(table["rms"][1])
     assert table["error"][0] == "" and "2 usable rows" in table["error"][1]
@@ -66,7 +63,7 @@ def slip(z: np.ndarray) -> np.ndarray:
 def test_whatever_a_run_raises_the_others_go_on():
     """Errors of the user's own functions have their class in the table; Ctrl-C still ends a sweep."""
     over = {"loss": [slip, soft_l1]}
-    table = calib.sweep(calib.fit_geometry, ARM.nominal, MEASURED, over=over, figures=model_and_error)
+    table = calib.sweep(calib.fit_geometry, ARM.nominal, MEASURED, over=over, figures=chosen_and_error)
     assert table["error"][0] == "ZeroDivisionError: no such loss" and table["error"][1] == ""
     table = calib.sweep(FewFigures, over={"rms": [1.0, 2.0]}, figures=boom)
     assert list(table["error"]) == ["figures: ValueError: boom"] * 2
@@ -101,7 +98,7 @@ def test_figures_that_are_no_columns_are_refused_at_the_first_run(figures, messa
 def test_processes_give_the_same_table():
     over = {"model": ["frames", "offsets"]}
     tables = [
-        calib.sweep(calib.fit_geometry, ARM.nominal, MEASURED, over=over, figures=model_and_error, workers=workers)
+        calib.sweep(calib.fit_geometry, ARM.nominal, MEASURED, over=over, figures=chosen_and_error, workers=workers)
         for workers in (1, 2)
     ]
     assert tables[0].to_dict() == tables[1].to_dict()

@@ -5,6 +5,7 @@ import signal
 import time
 from pathlib import Path
 
+import calib
 from calib.errors import MeasurementError
 
 SECONDS = 30.0  # that a busy machine may take
@@ -23,6 +24,10 @@ def wait_for(path: Path) -> None:
 
 def complain(row: int) -> None:
     raise MeasurementError("cannot be", "log.csv", row)
+
+
+def chosen_and_error(fit: calib.GeometryFit) -> dict[str, object]:
+    return {"chosen": fit.selection.chosen, "rms": fit.selection.cross_validated}
 
 
 class Awkward(Exception):
