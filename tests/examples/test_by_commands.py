@@ -38,7 +38,7 @@ def printed_by(script: Path, folder: Path) -> list[str]:
 
 
 def test_the_page_explains_every_command():
-    """The tutorial's commands are those of the script; `test_slow_blocks_run` runs them and compares what they print."""
+    """The tutorial's commands are those of the script; `test_slow_blocks_run` runs and compares them."""
     page = "".join(re.findall(r"^```sh\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.S | re.M))
     script = SCRIPT.read_text(encoding="utf-8")
     assert script.split("\n\n", 1)[1] == page
