@@ -17,6 +17,7 @@ with N whitened rows and ν₀ rows that the stated noise counts as.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -29,6 +30,8 @@ from calib.records import frozen, shaped
 
 RATES = (0.0, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.3)
 """Random walk rates that are compared, in sizes of the parameter per square root of a day (our choice)."""
+NEGLIGIBLE = 1e-5
+"""Probability of a filter below which its part in mean and covariance is not computed."""
 STILL = -1
 """Group of the parameters that do not drift."""
 
@@ -81,17 +84,24 @@ class DriftBank:
 
     def posterior(self) -> tuple[np.ndarray, np.ndarray]:
         """Return mean (p,) and covariance (p, p) of the parameters, over all filters."""
+        return self._posterior
+
+    @cached_property
+    def _posterior(self) -> tuple[np.ndarray, np.ndarray]:
         weights = self.weights
+        weights = np.where(weights > NEGLIGIBLE, weights, 0.0)
+        weights = weights / weights.sum()
         means = np.zeros((len(weights), self.parameters))
         covariance = np.zeros((self.parameters, self.parameters))
-        for k, factor in enumerate(self.factors):
+        for k in np.flatnonzero(weights):
+            factor = self.factors[k]
             inverse = scipy.linalg.solve_triangular(factor[:-1, :-1], np.eye(self.parameters))
             means[k] = inverse @ factor[:-1, -1]
             covariance += weights[k] * self.variance_factors[k] * (inverse @ inverse.T)
         mean = weights @ means
         deviations = means - mean
         covariance += (deviations * weights[:, None]).T @ deviations
-        return mean, covariance
+        return frozen(mean), frozen(covariance)
 
     def rate_quantiles(self, group: int, levels: tuple[float, ...] = (0.025, 0.5, 0.975)) -> tuple[float, ...]:
         """Return quantiles of the drift rate of a group [1/√day], by the filters' probabilities."""

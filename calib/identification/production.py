@@ -345,7 +345,13 @@ def judge(model: WorkingModel, state: DriftBank, rows: LogRows) -> Judgement:
     fits = _fits(model, state, rows, errors)
     best = max(fits, key=lambda fit: fit.criterion)
     change, sigma = _size(best, rows)
-    _, remaining = _compare(best.residual, expected, rows)
+    # torques in a smaller unit have larger noise, too
+    noise_factor = np.ones(len(ratios))
+    if best.hypothesis.cause is Cause.UNIT:
+        noise_factor[:] = max(1.0, abs(1.0 + change))
+    elif best.hypothesis.cause is Cause.GAIN:
+        noise_factor[best.hypothesis.row] = max(1.0, abs(1.0 + change))
+    _, remaining = _compare(best.residual, expected * noise_factor, rows)
     if not remaining and abs(change) > SURE_SIGMAS * sigma:
         cause, row = best.hypothesis.cause, best.hypothesis.row
         steps = as_predicted.steps
