@@ -14,6 +14,7 @@ from calib.data.csv_table import read_table
 from calib.dynamics.base import expressions
 from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
+from calib.identification.joint_compliance import JointCompliance, encoder_difference
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.physical_consistency import information
 from calib.identification.prediction import Dynamics, Score, predict
@@ -37,7 +38,16 @@ from calib.units import headings, per_ampere
 # of torques_1.csv [Hz]
 TORQUE_RATE = 100.0
 
-INSTRUMENTAL = "instrumental.csv"
+INSTRUMENTAL, COMPLIANCE = "instrumental.csv", "joint_compliance.csv"
+COMPLIANCE_HEADER = (
+    "joint",
+    "compliance [rad/(N m)]",
+    "sigma",
+    "identified",
+    "difference [mrad]",
+    "without delay [mrad]",
+    "residual [mrad]",
+)
 # statuses of gains in tables
 GAIN_STATUS = {"told": "identified", "not told": "not identified", "reference": "reference"}
 OURS = (
@@ -47,6 +57,7 @@ OURS = (
     folders.COVARIANCE,
     information.INFORMATION,
     INSTRUMENTAL,
+    COMPLIANCE,
     folders.METRICS,
     "drive_gains.csv",
     folders.REPORT,
@@ -245,6 +256,11 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     if identification.prior is not None or binding:
         information.write(identification, folder)
 
+    difference = encoder_difference(identification.dynamics, inputs.cases)
+    if difference is not None:
+        table = [_compliance_row(joint, inputs.chain.joint_names) for joint in difference.joints]
+        files.write_table(folder / COMPLIANCE, COMPLIANCE_HEADER, table)
+
     gains = inputs.gains and GainRecord.of(inputs.gains, inputs.unit)
     model_table = robot.model_table if isinstance(robot, Mechanism) else to_table
     table = model_table(identification.dynamics, identification.base, inputs.unit)
@@ -258,6 +274,12 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
         rows = zip(inputs.chain.joint_names, plain(gains.values), plain(gains.sigma), status)
         files.write_table(folder / "drive_gains.csv", header, rows)
     files.write_json(folder / folders.METRICS, metrics(outcome))
+
+
+def _compliance_row(joint: JointCompliance, names: Sequence[str]) -> tuple[object, ...]:
+    """Return the row of ``joint_compliance.csv`` for a joint with two encoders, in the order of `COMPLIANCE_HEADER`."""
+    milli = [1e3 * size for size in (joint.difference, joint.delayed, joint.residual)]
+    return (names[joint.joint], joint.compliance, joint.sigma, "yes" if joint.identified else "no", *milli)
 
 
 def _write_torques(

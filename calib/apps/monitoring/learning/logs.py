@@ -10,11 +10,12 @@ from datetime import datetime
 import numpy as np
 
 from calib.errors import UsageError, listing, require
-from calib.toolkit.recordings import Recording
+from calib.toolkit.recordings import Recording, parse_cut
 
 DATE = re.compile(r"(20\d\d)[-_]?(\d\d)[-_]?(\d\d)(?:[T_ -]?(\d\d)[-:_h]?(\d\d)(?:[-:_]?(\d\d))?)?")
 """Date in a file's name, with or without a time."""
 SECONDS_PER_DAY = 86_400.0
+EPOCH = datetime(1970, 1, 1)
 SKETCH = 64
 """Samples by which a log is recognised: those with the smallest hashes (Broder 1997)."""
 MIN_COMMON = 3
@@ -37,7 +38,7 @@ class DatedLog:
 
 
 def dated(paths: Sequence[str], first_number: int) -> list[DatedLog]:
-    """Return logs in the order of their dates; without dates, in the given order, as if taken a day apart.
+    """Return logs in the order of their dates; without dates, each file counts as taken a day after the one before.
 
     Args:
         paths: paths of the logs, each with a cut or without.
@@ -54,12 +55,18 @@ def dated(paths: Sequence[str], first_number: int) -> list[DatedLog]:
     )
     require(len(undated) in (0, len(paths)), message, UsageError)
     logs = []
-    for number, (path, moment) in enumerate(zip(paths, moments), first_number):
-        if moment is None:
-            logs.append(DatedLog(path, float(number), ""))
-        else:
-            day = (moment - datetime(1970, 1, 1)).total_seconds() / SECONDS_PER_DAY
-            logs.append(DatedLog(path, day, _text(moment)))
+    number = first_number - 1
+    previous = ""
+    for path, moment in zip(paths, moments):
+        file, start, _ = parse_cut(path)
+        if file != previous:
+            number += 1
+        previous = file
+        seconds = start or 0.0
+        day, date = float(number), ""
+        if moment is not None:
+            day, date = (moment - EPOCH).total_seconds() / SECONDS_PER_DAY, _text(moment)
+        logs.append(DatedLog(path, day + seconds / SECONDS_PER_DAY, date))
     return sorted(logs, key=lambda log: log.day)
 
 
