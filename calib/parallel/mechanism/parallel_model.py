@@ -34,14 +34,8 @@ from calib.errors import CalibError, UsageError, require
 from calib.parallel.mechanism.closure import ClosedRobot, Posture
 from calib.parallel.mechanism.parallel_robot import COORDINATES, FORCES
 from calib.parallel.mechanism.platform_columns import energy_columns, wrench_regressor
-from calib.parallel.mechanism.velocities import (
-    LoopJacobians,
-    LoopMotion,
-    distributed,
-    loop_jacobians,
-    of_platform,
-    of_readings,
-)
+from calib.parallel.mechanism.velocities import LoopMotion, distributed, loop_jacobians, of_platform, of_readings
+from calib.records import shaped
 
 # Largest speed [m/s or rad/s] and acceleration [m/s² or rad/s²] of random states (as `IdentificationModel.sample`).
 RATE = 3.0
@@ -254,7 +248,12 @@ class ParallelModel:
 
         `start`: postures near those at q, for a faster solution; None: home.
         """
-        posture = self.mechanism.locate(q, start)
+        if start is None:
+            robot = self.mechanism.robot
+            readings = shaped(q, (None, robot.n), f"readings of '{robot.name}'")
+            posture = _located(self.mechanism, readings.tobytes())
+        else:
+            posture = self.mechanism.locate(q, start)
         v = np.asarray(v, dtype=float)
         a = np.asarray(a, dtype=float)
         return of_readings(self.mechanism, posture, v, a)
@@ -555,6 +554,14 @@ def _renamed(term: DriveTerm, labels: Sequence[str]) -> str:
     """Return the name of a term with its joint's label instead of its number."""
     joint = term.acts[0][0]
     return term.name.removesuffix(str(joint + 1)) + labels[joint]
+
+
+# Instrumental variables ask for several speeds at the same readings, block after block of a record.
+@lru_cache(maxsize=32)
+def _located(mechanism: ClosedRobot, readings: bytes) -> Posture:
+    """Return the postures at readings (N, n) of the actuated joints."""
+    values = np.frombuffer(readings)
+    return mechanism.locate(values.reshape(-1, mechanism.robot.n))
 
 
 def _to_platform(mechanism: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray:
