@@ -173,6 +173,7 @@ def run(folder: Path, tmp_path: Path, *more: str) -> tuple[dict, list[dict], Pat
     return json.loads((out / "metrics.json").read_text())["geometry"], rows, out
 
 
+@pytest.mark.slow
 def test_command_carries_covariance_of_fit(tmp_path, capsys):
     """The command carries the fit's covariance."""
     found, rows, out = run(fitted_folder(tmp_path, 1e-6), tmp_path, "-v")

@@ -24,6 +24,7 @@ def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 def test_fit_without_plots_has_all_else(cell, calib, undrawn):
     """A fit without plots has its certificate and all else."""
     measured = cell.write("m.csv", cell.measure())
@@ -64,6 +65,7 @@ def test_ctrl_c_leaves_no_half_made_figures(cell, calib, monkeypatch, undrawn):
     assert calib(*arguments)[0] == 0 and "plot_position.png" in names(cell.folder / "o")
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_once_or_never(tmp_path, calib, monkeypatch, undrawn):
     """An identification draws each figure once, and none without plots."""
     import numpy as np

@@ -38,7 +38,7 @@ class PlanarLog:
 @njit(cache=True)
 def lever_products(arm):
     """Return μ (3, 3) and the weights Σ_i m_i a_ij (3,)."""
-    lengths, centres, masses, inertias = arm
+    lengths, centres, masses, _ = arm
     reach = np.zeros((3, 3))
     for i in range(3):
         reach[i, :i], reach[i, i] = lengths[:i], centres[i]

@@ -16,6 +16,7 @@ def run(*arguments: object) -> int:
     return without_figures.run("identify", *arguments)
 
 
+@pytest.mark.slow
 def test_the_folder_keeps_its_contract(robot, tmp_path, capsys):
     train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
     out = tmp_path / "out"

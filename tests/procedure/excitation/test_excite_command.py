@@ -55,6 +55,7 @@ QUICK = ("--starts", 1, "--evaluations", 60, "--period", 16, "--harmonics", 4, "
 SHORT = ExcitationSettings(starts=1, evaluations=45, period=16.0, harmonics=4, rate=100.0, samples=120)
 
 
+@pytest.mark.slow
 def test_motion_is_written_within_its_limits(cell, calib):
     """The motion keeps its limits, and is written for a controller."""
     Path("limits.toml").write_text(LIMITS)

@@ -46,6 +46,7 @@ def plan(*more: str) -> int:
     return run("plan", "lwr4plus", *given, *(() if "--out" in more else ("--out", "out")))
 
 
+@pytest.mark.slow
 def test_an_identified_model_is_planned_with(room, capsys):
     assert plan("--model", "model", "--start", "0,0,0,0,0,0,0", "--slower", "2", "--plots") == 0
     table = json.loads((room / "out" / "metrics.json").read_text())
