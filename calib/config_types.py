@@ -118,8 +118,8 @@ def _expression(text: str, quantity: str) -> float:
     factor = 1.0
     factors = QUANTITIES.get(quantity, {})
     for unit in sorted(factors, key=len, reverse=True):
-        if text.endswith(unit):
-            text = text.removesuffix(unit).strip()
+        if text.endswith(unit):  # ty: ignore[invalid-argument-type]
+            text = text.removesuffix(unit).strip()  # ty: ignore[no-matching-overload]
             factor = factors[unit]
             break
     return evaluated(ast.parse(text, mode="eval").body) * factor

@@ -98,7 +98,7 @@ def as_text(renderables: Iterable[object]) -> str:
     console = Console(file=io.StringIO(), width=WIDTH, highlight=False, color_system=None, force_jupyter=False)
     for renderable in renderables:
         console.print(renderable, soft_wrap=True)
-    return console.file.getvalue().rstrip()  # type: ignore[attr-defined]
+    return console.file.getvalue().rstrip()  # ty: ignore[missing-attribute]
 
 
 class Shown:

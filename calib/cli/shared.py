@@ -338,7 +338,7 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
                 error.args = (_as_typed(str(error), options),)
                 raise
 
-        call.__signature__ = signature(function).replace(parameters=options)  # type: ignore[attr-defined]
+        call.__signature__ = signature(function).replace(parameters=options)  # ty: ignore[missing-attribute]
         call.__annotations__ = {}
         help_text = cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")[0]
         app.command(name, cls=Command, help=help_text, rich_help_panel=group)(call)
@@ -368,7 +368,7 @@ def _with_help(parameter: Parameter, hint: object, description: str, names: Sequ
     if not option.metavar:
         is_argument = isinstance(option, ArgumentInfo)
         option.metavar = parameter.name.upper() if is_argument else type_word(_plain(kind)[0])
-    return Annotated[kind, option]
+    return Annotated[kind, option]  # ty: ignore[invalid-type-form]
 
 
 def _options(kind: type) -> Iterator[Parameter]:
@@ -379,7 +379,7 @@ def _options(kind: type) -> Iterator[Parameter]:
     """
     hints = get_type_hints(kind, include_extras=True)
     descriptions = described(kind)
-    for field in fields(kind):
+    for field in fields(kind):  # ty: ignore[invalid-argument-type]
         if is_dataclass(hints[field.name]):
             yield from _options(hints[field.name])
             continue
@@ -406,7 +406,7 @@ def _options(kind: type) -> Iterator[Parameter]:
         option = typer.Option(*names, help=help_text, metavar=metavar, autocompletion=complete)
         default = field.default if isinstance(field.default, int | float | str) else None
         value_type = plain | None if default is None else plain
-        yield Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[value_type, option])
+        yield Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[value_type, option])  # ty: ignore[invalid-type-form]
 
 
 def _typed(metadata: Sequence[object]) -> Typed:
@@ -487,7 +487,7 @@ def _built(kind: type[S], values: dict[str, object]) -> S:
 def _chosen(kind: type, values: dict[str, object]) -> dict[str, object]:
     result = {}
     hints = get_type_hints(kind, include_extras=True)
-    for field in fields(kind):
+    for field in fields(kind):  # ty: ignore[invalid-argument-type]
         if is_dataclass(hints[field.name]):
             value = _chosen(hints[field.name], values)
         else:

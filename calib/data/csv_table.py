@@ -161,7 +161,7 @@ class Table:
         if dimension is None:
             return cells
         units = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}
-        units |= {"speed": QUANTITIES["speed"], "time": TIMES}
+        units |= {"speed": QUANTITIES["speed"], "time": TIMES}  # ty: ignore[unsupported-operator]
         return cells * self.factor(column, units[dimension], unit)
 
     def check(self, names: Sequence[str], gaps: Collection[str] = ()) -> list[np.ndarray]:

@@ -76,10 +76,10 @@ class _ActuatorLimit(TwoSided):
     plan: PlatformRegressor
     of: Callable[[LoopMotion], np.ndarray]
     limits: np.ndarray
-    rows: tuple[str, ...] = ()
+    rows: tuple[str, ...] = ()  # ty: ignore[incompatible-attribute-override]
     name: str = "torque"
     unit: str = "N m"
-    joints: np.ndarray = field(init=False)
+    joints: np.ndarray = field(init=False)  # ty: ignore[incompatible-attribute-override]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "joints", np.arange(len(self.limits)))
@@ -413,7 +413,7 @@ def write_motion(
         names.append(f"{name} [{unit}]")
     for part in parts:
         names += headings(part, robot.chain.joints)
-    table = np.hstack([track.times[:, None], coordinates, *parts.values()])
+    table = np.hstack([track.times[:, None], coordinates, *parts.values()])  # ty: ignore[no-matching-overload]
 
     def write(folder: Path) -> None:
         robot.write(folder)

@@ -245,7 +245,7 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     if identification.prior is not None or binding:
         information.write(identification, folder)
 
-    gains = inputs.gains and GainRecord.of(inputs.gains, inputs.unit)
+    gains = None if inputs.gains is None else GainRecord.of(inputs.gains, inputs.unit)
     model_table = robot.model_table if isinstance(robot, Mechanism) else to_table
     table = model_table(identification.dynamics, identification.base, inputs.unit)
     files.write_json(folder / MODEL, table | {"drive_gains": gains})

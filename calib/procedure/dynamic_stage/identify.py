@@ -339,7 +339,7 @@ def judged(
         rests=judging.resting_parameters(found),
         noticed=judging.model_findings(inputs.cases, found),
         controller=found.loop.controller,
-        errors=errors and errors.discrepancy,
+        errors=None if errors is None else errors.discrepancy,
         contradiction=contradiction(found, inputs.chain) if inputs.unit == TORQUE else None,
         unlike=found.loop.disagreement,
         plain=tuple(plain.plain_values(found).tolist()),

@@ -252,11 +252,11 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         elimination=steps,
         unit=inputs.unit,
         switched_off=identification.friction.off,
-        drive_gains=inputs.gains and GainRecord.of(inputs.gains, inputs.unit),
+        drive_gains=inputs.gains and GainRecord.of(inputs.gains, inputs.unit),  # ty: ignore[invalid-argument-type]
         loop=identification.loop.metrics,
-        constraints=constrained and ConstraintMetrics(constrained.names, constrained.binding, constrained.postures),
+        constraints=constrained and ConstraintMetrics(constrained.names, constrained.binding, constrained.postures),  # ty: ignore[invalid-argument-type]
         filters=filters,
-        geometry=outcome.carried and geometry_tables.metrics(outcome.carried, outcome.geometries),
+        geometry=outcome.carried and geometry_tables.metrics(outcome.carried, outcome.geometries),  # ty: ignore[invalid-argument-type]
         repeated=outcome.repeated,
         findings=outcome.findings,
         error_density=_error_density(identification, inputs.cases),

@@ -252,7 +252,7 @@ def _feasible_candidates(
         )
     source = candidates(settings.candidates) if callable(candidates) else candidates
     with refused_as(UsageError, CalibError, "candidates: {}"):
-        q = read_poses(source, joints_of(chain))
+        q = read_poses(source, joints_of(chain))  # ty: ignore[invalid-argument-type]
     numbers = np.flatnonzero(is_feasible(space, q))
     if len(numbers) < m:
         exceeding = int(((q < space.lower) | (q > space.upper)).any(axis=1).sum())

@@ -49,7 +49,7 @@ def layer(draw: Callable[Concatenate[Axes, P], None]) -> Callable[P, Layer]:
             return partial(make, *arguments, **options)
         return draw(on, *arguments, **options)
 
-    return make
+    return make  # ty: ignore[invalid-explicit-return]
 
 
 @layer
@@ -362,7 +362,7 @@ class Panel:
         for draw_layer in self.layers:
             draw_layer(on=axes)
         if self.grid:
-            axes.grid(axis=self.grid)  # type: ignore[arg-type]
+            axes.grid(axis=self.grid)  # ty: ignore[invalid-argument-type]
 
     def _set_axis(
         self, axes: Axes, axis: XAxis | YAxis, names: Sequence[str] | None, limits: tuple[float, float] | None
@@ -387,7 +387,7 @@ class Panel:
         elif letter in self.log and limits:
             log_axis(axis, *limits)
         elif self.ticks:
-            axes.locator_params(letter, nbins=self.ticks)  # type: ignore[arg-type]
+            axes.locator_params(letter, nbins=self.ticks)  # ty: ignore[invalid-argument-type]
 
 
 @dataclass(frozen=True, eq=False)

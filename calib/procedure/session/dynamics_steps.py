@@ -508,7 +508,7 @@ def predict(session: Session, say: Say) -> list[str | Note]:
     cuts = {}
     for path in unseen:
         cuts[path.name], recording_notes = check_recording(session, path, "validation")
-        notes += recording_notes
+        notes += recording_notes  # ty: ignore[unsupported-operator]
     say("predicting unseen motion")
     gathered = _gathered(session, training, [*held_out, *_cut_paths(unseen, cuts)], say)
     folder = session.identification

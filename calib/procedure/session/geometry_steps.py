@@ -142,7 +142,7 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
         notes.append(f"{validation} random poses for validation")
     notes += choice.kept()
     notes += [f"{quantity}: {value}" for quantity, value in selection.predicted_rows(choice)]
-    notes += record["notes"]
+    notes += record["notes"]  # ty: ignore[unsupported-operator]
     return notes
 
 

@@ -204,6 +204,6 @@ def _torque_parts(before: Place, after: Place, settings: DiffSettings) -> list[C
         motions[name] = states  # type: ignore[assignment]
     message = f"neither {earlier.name} nor {later.name} contains a motion without payload; give one with --motion"
     require(motions, message, UsageError)
-    change = torque_change.compare(earlier, later, motions)
+    change = torque_change.compare(earlier, later, motions)  # ty: ignore[invalid-argument-type]
     tolerance = settings.torque_tolerance or later.tolerance or earlier.tolerance or None
     return [TorquePart(earlier, later, change, tolerance)]
