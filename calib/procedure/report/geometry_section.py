@@ -92,7 +92,7 @@ def outcome_section(metrics: FitMetrics) -> page.Section:
     return page.Section("Geometry", blocks, metrics.verdict, metrics.reason)
 
 
-def report_section(report: Report, figures: Mapping[str, page.Picture]) -> page.Section:
+def report_section(report: Report, figures: Mapping[str, page.ChartPicture]) -> page.Section:
     """Return the report section on the geometry: errors, tried models, parameters, identifiability, figures, outliers.
 
     Args:

@@ -207,7 +207,9 @@ def _design(
         raise KeyboardInterrupt
     draw = None
     if session.plots and name == "training":
-        from calib.procedure.report.motion_figures import write_design as draw
+        from calib.procedure.report.outputs import write_design
+
+        draw = partial(write_design, plots=session.plots)
     motion_folder.write_design(designed, session.path("6-excitation") / name, draw)
 
     condition, columns = designed.condition, len(designed.inputs.model.exact.names)
