@@ -50,13 +50,13 @@ class InFolder:
 
 
 def figure_files(*names: str) -> tuple[str, ...]:
-    """Return the names of all files that hold figures: their data, and each as PNG and SVG.
+    """Return the names of all files that hold figures: their data, each as PNG and SVG, and its samples.
 
     Args:
         names: names of the figures, or patterns of names.
     """
     drawn = [f"plot_{name}{suffix}" for name in names for suffix in (".png", ".svg")]
-    return (FIGURES, *drawn)
+    return (FIGURES, *drawn, *(f"figure_{name}.js" for name in names))
 
 
 def check_target(

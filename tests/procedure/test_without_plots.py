@@ -8,7 +8,6 @@ import pytest
 from calib.procedure.report.figures import figure_data, figure_files
 from calib.robot import description
 
-
 SVG = b'<svg xmlns="http://www.w3.org/2000/svg" width="9pt" height="9pt"/>'
 
 

@@ -49,6 +49,7 @@ FIGURES = (
     "singular_values",
     "joints",
     "map",
+    "rows",
     "parameters",
     "correlations",
 )

@@ -1,6 +1,7 @@
 """Figures on the dynamics, made from an identification's outcome or from the files in its folder."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +10,17 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import TermMotion
 from calib.dynamics.torque_rows import MOTOR
 from calib.estimation.whiteness import Whiteness
+from calib.identification.rows import Case
 from calib.procedure.dynamic_stage.geometry_tables import GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
-from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import TorqueCurves, UnseenReport
 from calib.procedure.report.dynamics_section import SIGNIFICANT, DynamicReport, IdentifiedParameter, percent, proof_of
 from calib.procedure.report.figures.charts import Bars, Captioned, Chart, Label, Level, Line, Panel
-from calib.procedure.report.figures.style import AFTER, BEFORE, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET, thinned
+from calib.procedure.report.figures.style import AFTER, BEFORE, CURVES, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import read_rows
+from calib.robot.chain import Joint
 from calib.units import small
 
 # torque rows whose figures fit half a page
@@ -25,6 +29,8 @@ MAX_HALF_PAGE_ROWS = 8
 MAX_ELEMENTS = 15
 # parameters along an axis: more cannot be read on A4
 MAX_LABELS = 40
+# samples per period of the highest frequency of low-passed torques: their curve looks as if it had all
+SAMPLES_PER_CYCLE = 8.0
 # points of a cloud of friction, and of its curve
 MAX_CLOUD_POINTS = 1400
 CURVE_POINTS = 400
@@ -60,11 +66,78 @@ def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:
     result = {}
     cases = (*outcome.inputs.unseen, *outcome.inputs.cases)
     for number, case in enumerate(cases, 1):
-        curves = TorqueCurves.of(case, outcome.predictions[case.name])
+        curves = _sampled(case, outcome.predictions[case.name])
         result[f"torque_{number}"], _ = recorded(curves, report)
     for name, (chart, _) in (_error_charts(report) | friction(outcome)).items():
         result[name] = chart
     return result
+
+
+def recordings(
+    inputs: IdentificationInputs, assessment: DynamicsAssessment, report: UnseenReport
+) -> dict[str, Captioned]:
+    """Return charts of torques and velocities of the recordings that decide the verdict, by name, with all samples.
+
+    Args:
+        inputs: robot and recordings.
+        assessment: the model's predictions.
+        report: report on the model's errors.
+    """
+    result: dict[str, Captioned] = {}
+    for number, case in enumerate(inputs.unseen or inputs.cases, 1):
+        curves = _sampled(case, assessment.predictions[case.name])
+        chart, caption = recorded(curves, report)
+        linked = f"recording {number}"
+        result[f"torque_{number}"] = replace(chart, linked=linked), caption
+        if not isinstance(inputs.robot, Mechanism):
+            chart = _velocities(case, curves.t, inputs.chain.joints, report.rows)
+            caption = f"Velocities of the joints on {case.name}, with the cursor of the torques."
+            result[f"velocity_{number}"] = replace(chart, linked=linked), caption
+    return result
+
+
+def _sampled(case: Case, predicted: np.ndarray) -> TorqueCurves:
+    """Return the low-passed torques of a recording with as many samples as their band needs.
+
+    Args:
+        case: the recording with N samples.
+        predicted: (N, rows) torques that the model predicts for it.
+    """
+    motion = case.motion
+    step = _step(case)
+    measured, predicted = motion.in_band(np.asarray(case.target)), motion.in_band(predicted)
+    return TorqueCurves(case.name, motion.t[::step], measured[::step].T, predicted[::step].T, motion.band)
+
+
+def _step(case: Case) -> int:
+    motion = case.motion
+    if not np.isfinite(motion.band):
+        return 1
+    return max(1, int(motion.rate / (SAMPLES_PER_CYCLE * motion.band)))
+
+
+def _velocities(case: Case, t: np.ndarray, joints: Sequence[Joint], rows: Sequence[str]) -> Chart:
+    """Return a chart of the joints' velocities on a recording.
+
+    Args:
+        case: the recording.
+        t: (K,) times of the samples of its torques [s].
+        joints: the robot's joints.
+        rows: names of the torque rows; where they are one per joint, they are the joints' switches, too.
+    """
+    v = np.asarray(case.motion.v)[:: _step(case)]
+    units = set()
+    lines = []
+    for j, joint in enumerate(joints):
+        switch = joint.name
+        if len(rows) == len(joints):
+            switch = rows[j]
+        colour = CURVES[j % len(CURVES)]
+        lines.append(Line(t, v[:, j], "-", colour, 0.8, label=joint.name, switch=switch))
+        units.add("m/s" if joint.kind == "prismatic" else "rad/s")
+    label = f"velocity [{', '.join(sorted(units))}]"
+    panel = Panel(lines, x="time [s]", y=label, xlim=(t[0], t[-1]))
+    return Chart([panel], 2.0, title=f"velocities on {case.name}")
 
 
 def recorded(curves: TorqueCurves, report: UnseenReport) -> Captioned:
@@ -179,13 +252,12 @@ def torques(
         if j < len(errors) and np.isfinite(errors[j]):
             row_title += f": {errors[j]:.3g} % unexplained"
         residual = measured[:, j] - predicted[:, j]
-        # thinned here already: a chart of an hour would be held, and pickled, in full
         lines = [
-            Line(*thinned(t, measured[:, j]), "-", BEFORE, 2.4, label="measured"),
-            Line(*thinned(t, predicted[:, j]), "-", AFTER, 0.7, label="predicted"),
-            Line(*thinned(t, residual), "-", QUIET, 0.5, label="measured - predicted"),
+            Line(t, measured[:, j], "-", BEFORE, 2.4, label="measured"),
+            Line(t, predicted[:, j], "-", AFTER, 0.7, label="predicted"),
+            Line(t, residual, "-", QUIET, 0.5, label="measured - predicted"),
         ]
-        panels.append(Panel(lines, row_title, time_label, xlim=(t[0], t[-1])))
+        panels.append(Panel(lines, row_title, time_label, xlim=(t[0], t[-1]), switch=row))
     columns = 2 if len(rows) > MAX_HALF_PAGE_ROWS else 1
     height = 0.7 + 0.95 * -(-len(rows) // columns)
     return Chart(panels, height, columns, title=title, shared="x")

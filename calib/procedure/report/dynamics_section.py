@@ -226,7 +226,9 @@ def report_section(
     if tests:
         blocks.insert(0, _test_table(unseen, tests))
 
-    torque_figures = [name for name in figures if name.startswith("torque_")]
+    torque_figures = [name for name in figures if name.startswith(("torque_", "velocity_"))]
+    # each recording's velocities below its torques
+    torque_figures.sort(key=lambda name: int(name.partition("_")[2]))
     blocks.append(page.pictures("", figures, ("errors", "residuals")))
     blocks.append(page.pictures("Torques", figures, torque_figures))
     blocks.append(page.pictures("Friction", figures, ("friction",)))

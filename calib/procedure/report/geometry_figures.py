@@ -4,6 +4,7 @@ Errors of the nominal arm are light and those of the calibrated arm dark, so tha
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from calib.procedure.report.figures.charts import (
     Bars,
     Captioned,
     Chart,
+    Cloud,
     Dots,
     Heat,
     Histogram,
@@ -22,7 +24,7 @@ from calib.procedure.report.figures.charts import (
     Panel,
 )
 from calib.procedure.report.figures.style import AFTER, BEFORE, BROWN, HALF_WIDTH, INK, MARK, PAGE_WIDTH, number
-from calib.procedure.report.fit_report import FittedParameter, Report
+from calib.procedure.report.fit_report import FittedParameter, Report, RowErrors
 from calib.units import ERRORS
 
 # (effort, sigma) pairs
@@ -117,7 +119,8 @@ def residuals_by_joint(
             Line(x, factor * after, ".", AFTER, size=4.5, label=arm),
         ]
         label = f"{name} [{joint_unit}]"
-        panels.append(Panel(clouds, x=label, y=f"error [{unit}]", ylim=limits, log="y", grid="y", ticks=5))
+        y_label = f"error [{unit}]"
+        panels.append(Panel(clouds, x=label, y=y_label, ylim=limits, log="y", grid="y", ticks=5, switch=name))
 
     n = q.shape[1]
     columns = 4
@@ -163,7 +166,8 @@ def error_map(
         sizes_mm = 1e3 * np.asarray(values)
         panels.append(_map_panel(points, sizes_mm, colour_limits_mm, 1, from_above))
         panels.append(_map_panel(points, sizes_mm, colour_limits_mm, 2, from_side))
-    return Chart(panels, 3.0 * len(maps), 2)
+    cloud = Cloud(points, 1e3 * np.asarray(sizes), *colour_limits_mm, "mm")
+    return Chart(panels, 3.0 * len(maps), 2, cloud=cloud)
 
 
 def _map_panel(
@@ -357,6 +361,48 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
     return Chart([panel], 2.4, width=HALF_WIDTH)
 
 
+def _point_values(report: Report, errors: RowErrors) -> dict[str, np.ndarray]:
+    """Return what a page shows of each row under the pointer: row number, expected error [mm], and joint values.
+
+    Args:
+        report: results of the fit.
+        errors: errors of the rows.
+    """
+    values = {"row": np.array(errors.rows, dtype=float)}
+    if errors.expected:
+        values["95 % expected within [mm]"] = 1e3 * np.array(errors.expected)
+    joint_values = np.array(errors.q)
+    for j, name in enumerate(report.joints):
+        if report.prismatic[j]:
+            values[f"{name} [m]"] = joint_values[:, j]
+        else:
+            values[f"{name} [deg]"] = np.rad2deg(joint_values[:, j])
+    return values
+
+
+def errors_by_row(report: Report, nature: str) -> Chart:
+    """Return a chart of the delivered arm's errors over the rows of the files, a panel per set of rows.
+
+    Args:
+        report: results of the fit.
+        nature: ``position``, ``orientation`` or ``distance``.
+    """
+    factor, unit = ERRORS[nature]
+    deliverable = report.metrics.deliverable
+    panels = []
+    for errors in report.sets:
+        delivered = errors.judged(deliverable)
+        if nature not in delivered or len(errors.rows) != len(delivered[nature]):
+            continue
+        sizes = factor * np.array(delivered[nature])
+        title = "fitted rows"
+        if errors.unseen:
+            title = f"unseen rows of {errors.name}"
+        points = Line(np.array(errors.rows), sizes, ".", AFTER, size=4.5)
+        panels.append(Panel([points], title, "row", f"error [{unit}]", grid="y"))
+    return Chart(panels or [Panel([])], 0.5 + 1.2 * max(1, len(panels)))
+
+
 def captioned(report: Report) -> dict[str, Captioned]:
     """Return the charts of a report with captions, by name; charts without data are omitted."""
     proof = report.sets[0]
@@ -390,6 +436,8 @@ def captioned(report: Report) -> dict[str, Captioned]:
         nature = "position" if "position" in delivered else "distance"
         before, after = np.array(proof.nominal[nature]), np.array(delivered[nature])
         chart = residuals_by_joint(np.array(proof.q), before, after, report.joints, report.prismatic, nature, arm)
+        points = _point_values(report, proof)
+        chart = replace(chart, points=points)
         result["joints"] = chart, f"Errors against each joint, {label}: a trend shows an unmodelled effect."
 
         # intervals hold the joint corrections' errors: they say nothing of the robot without them
@@ -398,7 +446,12 @@ def captioned(report: Report) -> dict[str, Captioned]:
         quantity = report.metrics.fit.words(nature)
         caption = f"Remaining {quantity} error over the workspace, {label}"
         caption += "; below: radius expected to contain 95 % of the errors." if expected else "."
-        result["map"] = chart, caption
+        result["map"] = replace(chart, points=points), caption
+        chart = errors_by_row(report, nature)
+        result["rows"] = (
+            chart,
+            f"{quantity.capitalize()} errors by row of the file: a step shows a change of the set-up.",
+        )
 
     for k, images in enumerate(report.images, 1):
         name = "coverage" if k == 1 else f"coverage_{k}"

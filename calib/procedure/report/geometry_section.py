@@ -102,7 +102,7 @@ def report_section(report: Report, figures: Mapping[str, page.ChartPicture]) -> 
     metrics = report.metrics
     blocks: list[page.Block] = [error_table(_sets(metrics), metrics.deliverable), *iso9283_tables(metrics)]
     blocks.append(page.pictures("Before and after", figures, ("position", "orientation", "distance")))
-    blocks.append(page.pictures("What remains", figures, ("joints", "map")))
+    blocks.append(page.pictures("What remains", figures, ("joints", "map", "rows")))
     coverage = [name for name in figures if name.startswith("coverage")]
     blocks.append(page.pictures("Image coverage", figures, coverage))
     if any(step.cross_validated_mm is not None for step in metrics.ladder):

@@ -52,7 +52,8 @@ def motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[
             layers += map(Level, bounds)
             panel_title = f"{quantity} [{unit}]" if j == 0 else ""
             label = name if k == 0 else ""
-            panels.append(Panel(layers, panel_title, "time [s]", label, xlim=(times[0], times[-1]), ticks=4))
+            limits = times[0], times[-1]
+            panels.append(Panel(layers, panel_title, "time [s]", label, limits, ticks=4, switch=joint.name))
             if len(bounds) == 2 and upper[j] > lower[j]:
                 gap = min(upper[j] - values[:, j].max(), values[:, j].min() - lower[j]) / (upper[j] - lower[j])
                 if gap < smallest_gap:

@@ -13,7 +13,9 @@ from calib.procedure.report.figures import figure_files
 from calib.procedure.report.page import Pictures, Section, Text, chart_pictures
 
 if TYPE_CHECKING:
-    from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+    from calib.procedure.dynamic_stage.folder import UnseenFolder
+    from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome
+    from calib.procedure.dynamic_stage.inputs import IdentificationInputs
     from calib.procedure.excitation.design import Designed
     from calib.procedure.excitation.planning import Planned
     from calib.procedure.kinematic_stage.fit import Outcome
@@ -63,10 +65,24 @@ def write_model(outcome: IdentificationOutcome, folder: Path, plots: Plots = Tru
     write_json(UnseenFolder(folder).report, report.unseen)
     if plots:
         charts |= dynamics_figures.captioned(report, folder)
+        charts |= dynamics_figures.recordings(outcome.inputs, outcome, report.unseen)
     figure_files.write(folder, charts, plots, pages)
     from calib.procedure.report.certificate import results
 
     results.write_model(report, chart_pictures(charts), folder)
+
+
+def write_recordings(inputs: IdentificationInputs, assessment: DynamicsAssessment, folder: UnseenFolder) -> None:
+    """Write torques and velocities of held-out recordings as figures into the folder of their validation.
+
+    Args:
+        inputs: robot and recordings.
+        assessment: the model's predictions and errors.
+        folder: the folder, with its report.
+    """
+    from calib.procedure.report.dynamics_figures import recordings
+
+    figure_files.write(folder.path, recordings(inputs, assessment, folder.read()), True, paged=False)
 
 
 def write_design(designed: Designed, folder: Path, plots: Plots = True) -> None:

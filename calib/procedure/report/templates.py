@@ -81,7 +81,7 @@ def interactive(sections: Sequence[Section]) -> tuple[list[Section], Mapping[str
     if not charts:
         return numbered, {}
     browser = {key: read(BROWSER, name) for key, name in BROWSER_FILES.items()}
-    return numbered, browser | {"data": figure_data.text(charts)}
+    return numbered, browser | {"data": figure_data.page_text(charts)}
 
 
 def _numbered(block: Pictures, charts: dict[str, Captioned]) -> Pictures:

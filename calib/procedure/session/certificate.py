@@ -115,8 +115,10 @@ def _dynamics(session: Session) -> StageRecord:
     if session.plots:
         from calib.procedure.report.dynamics_figures import captioned
 
-        charts = figure_data.of_folder(session.identification.path)
-        charts |= captioned(report, session.identification.path)
+        charts = captioned(report, session.identification.path)
+        # friction, and the torques with all samples
+        for path in (session.identification.path, session.identification.unseen.path):
+            charts |= figure_data.of_folder(path)
         training = session.path("6-excitation") / "training"
         if session.settings.dynamics.plan and (training / coefficients.NAME).exists():
             charts["excitation"] = dynamics_pages.trained_on(training, chain_of(session).joints)

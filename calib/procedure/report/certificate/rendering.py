@@ -17,6 +17,8 @@ from typing import Any
 from calib import files
 from calib.folders import PAGES
 from calib.procedure.report.certificate.record import MAX_PAGES, Certificate, Page
+from calib.procedure.report.figures import figure_data
+from calib.procedure.report.figures.charts import Captioned
 from calib.procedure.report.page import ChartPicture, Pictures
 from calib.procedure.report.templates import filled, interactive, read
 from calib.records import plain
@@ -36,7 +38,21 @@ def write(folder: Path, certificate: Certificate, report: Page) -> list[str]:
             files.write(folder / name, content)
         else:
             (folder / name).unlink(missing_ok=True)
+    for name, content in figure_data.whole_figures(_charts(report)):
+        files.write(folder / name, content)
     return notes
+
+
+def _charts(page: Page) -> dict[str, Captioned]:
+    """Return the charts of a page with their captions, by name."""
+    charts = {}
+    for section in page.sections:
+        for block in section.blocks:
+            if isinstance(block, Pictures):
+                for picture in block.pictures:
+                    if isinstance(picture, ChartPicture):
+                        charts[picture.name] = picture.chart, picture.caption
+    return charts
 
 
 def write_figures(folder: Path, page: Page) -> int:
@@ -48,7 +64,7 @@ def write_figures(folder: Path, page: Page) -> int:
     """
     count = 0
     for section in page.sections:
-        pictures = []
+        pictures: list[ChartPicture] = []
         for block in section.blocks:
             if isinstance(block, Pictures):
                 pictures += [picture for picture in block.pictures if isinstance(picture, ChartPicture)]

@@ -146,8 +146,8 @@ def read_model(folder: Path, plots: Plots, details: CertificateSection) -> tuple
     if plots:
         from calib.procedure.report.dynamics_figures import captioned
 
-        earlier = figure_data.of_folder(folder)
-        drawn = chart_pictures(earlier | captioned(model_report, folder))
+        # with all samples, which the report's data have not
+        drawn = chart_pictures(captioned(model_report, folder) | figure_data.of_folder(folder))
     return of_model(model_report, drawn, details)
 
 

@@ -6,6 +6,8 @@ The colours are distinguishable in greyscale.
 import numpy as np
 
 BEFORE, AFTER, MARK, QUIET, INK = "#e2a26b", "#17486e", "#b3261e", "#8a8f98", "#22262b"
+# of curves that stand together, such as those of joints
+CURVES = (AFTER, BEFORE, "#2f7f5f", MARK, "#7a5ea8", "#3a9bb8", "#a8622a", QUIET)
 # BEFORE, dark enough for letters
 BROWN = "#a8622a"
 # a page's line and half of it [in]

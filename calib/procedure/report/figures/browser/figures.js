@@ -14,6 +14,8 @@
   const HELP = "Drag to zoom, shift and drag to move, ctrl and wheel to zoom, double click to go back. "
     + "Keys: ← → read, shift ← → move, + − zoom, 0 back.";
   const PRINT_WIDTH = 655; // CSS pixels between the margins of A4
+  const LINKED_SIZE = 46; // CSS pixels of the y axes of figures whose cursors are linked
+  const WIDTH = 210, SMALL_WIDTH = 125; // least width of a panel, and of one that shares the labels of both axes
   const NEAR = 24; // CSS pixels within which the pointer reads a point
   const hidden = new Set(); // switches that are off
   const marked = new Set(); // rows that a finding names
@@ -24,10 +26,22 @@
 
   // numbers
 
-  function unpacked(value) {
-    if (!value || value.f4 === undefined) return value;
-    const bytes = Uint8Array.from(atob(value.f4), letter => letter.charCodeAt(0));
-    return new Float32Array(bytes.buffer);
+  // a packed array (figure_data.py) as numbers
+  function unpacked(packed) {
+    const bytes = Uint8Array.from(atob(packed.f4 || packed.u2 || ""), letter => letter.charCodeAt(0));
+    if (packed.u2 === undefined) return Object.assign(new Float32Array(bytes.buffer), { shape: packed.shape });
+    return Float32Array.from(new Uint16Array(bytes.buffer), step => packed.low + packed.step * step);
+  }
+  // a figure whose arrays stand where they are used
+  function resolved(chart) {
+    const arrays = chart.arrays.map(unpacked);
+    const filled = value => {
+      if (!value || typeof value !== "object") return value;
+      if (value.array !== undefined) return arrays[value.array];
+      if (Array.isArray(value)) return value.map(filled);
+      return Object.fromEntries(Object.entries(value).map(([key, item]) => [key, key === "arrays" ? null : filled(item)]));
+    };
+    return filled(chart);
   }
   function rounded(value) {
     if (value === null || value === undefined || Number.isNaN(value)) return "–";
@@ -64,10 +78,10 @@
   function prepared(layer) {
     for (const key of ["x", "y", "values", "spread", "counts", "edges"]) {
       if (!(key in layer)) continue;
-      const shape = layer[key] && layer[key].shape;
-      const numbers = unpacked(layer[key]);
+      const shape = layer[key].shape;
       if (key === "values" && layer.layer === "Heat") layer.shape = shape || [layer[key].length, layer[key][0].length];
-      layer[key] = typeof numbers === "number" ? [numbers] : layer.layer === "Heat" && !shape ? numbers.flat() : numbers;
+      if (typeof layer[key] === "number") layer[key] = [layer[key]];
+      if (layer.layer === "Heat" && !shape) layer[key] = layer[key].flatMap(row => [...row]);
     }
     if (layer.layer === "Line") {
       layer.sorted = layer.form === "-" || layer.form === "--";
@@ -315,7 +329,7 @@
       const names = this.names(letter), panel = this.panel;
       const upright = letter === "x" && names && !names.some(name => name.includes("\n"));
       const axis = {
-        font: FONT, labelFont: FONT, stroke: () => ink(INK), label: panel[letter] || undefined, labelSize: 16, labelGap: 2,
+        font: FONT, labelFont: FONT, stroke: () => ink(INK), label: this.bare(letter) ? undefined : panel[letter] || undefined, labelSize: 16, labelGap: 2,
         grid: { show: panel.grid === letter || panel.grid === "both", stroke: () => (dark() ? "#3a3f46" : "#e3e5e8"), width: 1 },
         ticks: { stroke: () => ink(QUIET), width: 1, size: 4 }, border: { show: true, stroke: () => ink(QUIET), width: 1 },
         gap: 3, space: letter === "x" ? 55 : 26,
@@ -330,8 +344,10 @@
         if (letter === "x") axis.space = 1; else axis.space = 1;
       } else {
         axis.values = (u, splits) => splits.map(value => (value === null ? null : tick(value)));
-        if (letter === "y") axis.size = (u, values) => 12 + 6.2 * Math.max(1, ...(values || []).map(v => (v || "").length));
-        else axis.size = 22;
+        if (this.bare(letter)) axis.values = (u, splits) => splits.map(() => "");
+        if (letter === "y" && this.figure.link) axis.size = LINKED_SIZE;
+        else if (letter === "y") axis.size = (u, values) => 12 + 6.2 * Math.max(1, ...(values || []).map(v => (v || "").length));
+        else axis.size = this.bare(letter) ? 8 : 22;
         if (panel.log.includes(letter)) { axis.splits = (u, k, low, high) => logTicks(low, high, letter === "x" ? 7 : 6); axis.filter = (u, splits) => splits; }
         else if (panel.symlog && letter === "y") { axis.splits = (u, k, low, high) => symlogTicks(low, high, panel.symlog); axis.filter = (u, splits) => splits; }
       }
@@ -359,6 +375,12 @@
       this.back();
       this.quiet = false;
     }
+    // whether another panel of the grid has the labels of the axis
+    bare(letter) {
+      const { chart, columns, shownPanels } = this.figure, k = shownPanels.indexOf(this);
+      if (!chart.shared.includes(letter)) return false;
+      return letter === "x" ? k + columns < shownPanels.length : k % columns > 0;
+    }
     barred() { return this.layers.some(layer => layer.layer === "Heat" || (layer.layer === "Dots" && layer.unit)); }
     // the same scale of both axes
     fit() {
@@ -379,6 +401,7 @@
     }
     range_of(key) { const scale = this.plot.scales[key]; return [scale.min, scale.max]; }
     scaled(key) {
+      if (key === "x" && this.plot) this.figure.wholeFor(this);
       if (this.quiet || key !== "x" || !this.figure.link) return;
       const range = this.range_of("x");
       for (const other of linked(this.figure.link)) if (other !== this) {
@@ -479,8 +502,9 @@
     }
     // around the points of the rows that a finding names
     rings(c, at) {
-      const rows = this.figure.points.row;
-      if (!rows || !marked.size) return;
+      if (!marked.size) return;
+      const byRow = this.panel.x === "row" && this.layers[0] ? this.layers[0].x : [];
+      const rows = this.figure.points.row || byRow;
       c.strokeStyle = ink(MARK); c.lineWidth = 1.8;
       for (const layer of this.layers) if (layer.x && layer.x.length === rows.length && shown(layer)) {
         for (let i = 0; i < rows.length; i++) if (marked.has(rows[i])) {
@@ -616,7 +640,7 @@
   class Space {
     constructor(figure, cloud, box) {
       Object.assign(this, { figure, cloud, box, turn: -0.9, rise: 0.45, near: 1 });
-      this.points = unpacked(cloud.points); this.values = unpacked(cloud.values);
+      this.points = cloud.points.shape ? cloud.points : Float32Array.from(cloud.points.flatMap(p => [...p])); this.values = cloud.values;
       this.canvas = document.createElement("canvas");
       this.canvas.tabIndex = 0;
       this.canvas.className = "space";
@@ -750,10 +774,11 @@
   class Figure {
     constructor(element) {
       this.element = element;
-      this.chart = figures[element.dataset.figure];
+      this.name = element.dataset.figure;
+      this.chart = resolved(figures[this.name]);
       this.box = element.querySelector(".plot");
       this.link = this.chart.linked || (this.chart.shared.includes("x") && !this.chart.shared.includes("y") ? element.dataset.figure : "");
-      this.points = Object.fromEntries(Object.entries(this.chart.points || {}).map(([name, values]) => [name, unpacked(values)]));
+      this.points = this.chart.points || {};
       for (const panel of this.chart.panels) panel.layers.forEach(prepared);
       this.box.setAttribute("role", "group");
       this.box.replaceChildren();
@@ -764,8 +789,12 @@
       this.live.className = "spoken";
       this.live.setAttribute("aria-live", "polite");
       this.box.append(this.grid, this.live);
-      if (this.chart.cloud) this.space = new Space(this, this.chart.cloud, this.grid);
-      this.panels = this.chart.cloud ? [] : this.chart.panels.map((panel, k) => {
+      if (this.chart.cloud) {
+        const box = document.createElement("div");
+        this.box.insertBefore(box, this.grid);
+        this.space = new Space(this, this.chart.cloud, box);
+      }
+      this.panels = this.chart.panels.map((panel, k) => {
         const box = document.createElement("div");
         box.className = "panel";
         this.grid.append(box);
@@ -785,7 +814,7 @@
         if (layer.label) labels.set(layer.label, [...(labels.get(layer.label) || []), layer]);
       }
       for (const [label, layers] of labels) head.append(this.entry(label, layers));
-      if (!this.chart.cloud) head.append(this.buttons());
+      head.append(this.buttons());
       this.box.append(head);
     }
     // of the legend: shows and hides layers
@@ -813,6 +842,29 @@
       }
       return made;
     }
+    // all samples of thinned curves, from the file beside the page, once a part of them is looked at
+    wholeFor(panel) {
+      if (!this.chart.whole || this.asked) return;
+      const [low, high] = panel.range_of("x");
+      if (high - low > 0.7 * (panel.home[0][1] - panel.home[0][0])) return;
+      this.asked = true;
+      const script = document.createElement("script");
+      script.src = this.chart.whole;
+      script.addEventListener("error", () => this.note(`Peaks are kept, other samples are not: all of them are in ${this.chart.whole}, which is not beside this page or may not be read.`));
+      document.head.append(script);
+    }
+    note(words) {
+      this.said = this.said || this.element.appendChild(Object.assign(document.createElement("p"), { className: "note" }));
+      this.said.textContent = words;
+    }
+    take(chart) {
+      chart.panels.forEach((panel, k) => panel.layers.forEach((layer, i) => {
+        if (layer.layer === "Line") Object.assign(this.chart.panels[k].layers[i], { x: layer.x, y: layer.y });
+      }));
+      this.note("All samples are loaded.");
+      this.element.dataset.whole = "yes";
+      this.redraw();
+    }
     visible() { return this.panels.filter(panel => panel.plot && !panel.box.hidden); }
     back(panel) { for (const one of this.link ? linked(this.link) : [panel]) { one.quiet = true; one.back(); one.quiet = false; } }
     details(count, i) {
@@ -821,10 +873,12 @@
     layout() {
       const width = printing ? PRINT_WIDTH * (this.element.classList.contains("wide") ? 1 : 0.48) : this.box.clientWidth;
       if (!width) return;
-      if (this.space) { this.space.size(Math.floor(width)); return; }
+      if (this.space) this.space.size(Math.floor(width));
       const off = panel => panel.panel.switch && hidden.has(panel.panel.switch);
       const panels = this.panels.filter(panel => { panel.box.hidden = !!off(panel); return !off(panel); });
-      const columns = Math.max(1, Math.min(this.chart.columns, panels.length || 1, Math.floor(width / (printing ? 140 : 210))));
+      const least = this.chart.shared.includes("y") && this.chart.shared.includes("x") ? SMALL_WIDTH : WIDTH;
+      const columns = Math.max(1, Math.min(this.chart.columns, panels.length || 1, Math.floor(width / (printing ? 0.65 * least : least))));
+      Object.assign(this, { columns, shownPanels: panels });
       const each = Math.floor((width - 10 * (columns - 1)) / columns), rows = Math.ceil(this.chart.panels.length / this.chart.columns);
       const natural = (72 * this.chart.height * PT - 28) / rows * (printing ? 0.95 : 1.25);
       this.grid.style.gridTemplateColumns = `repeat(${columns}, ${each}px)`;
@@ -909,10 +963,10 @@
 
   // links from the rows that a finding names to their points
 
-  const ROWS = /\brows? (\d+(?:(?:, | and )\d+)*)/g;
+  const ROWS = /\brows? \d+(?:(?:, | and |–)\d+)*/g;
   function rowLinks(item) {
-    const target = Object.entries(figures).find(([, chart]) => chart.points && chart.points.row);
-    if (!target) return;
+    const target = Object.entries(figures).find(([, chart]) => chart.panels.some(panel => panel.x === "row"));
+    if (!target || item.closest("nav")) return;
     const walker = document.createTreeWalker(item, NodeFilter.SHOW_TEXT), texts = [];
     while (walker.nextNode()) texts.push(walker.currentNode);
     for (const node of texts) {
@@ -921,16 +975,30 @@
       for (const match of node.data.matchAll(ROWS)) {
         const link = document.createElement("a");
         link.href = "#figure-" + target[0]; link.className = "rows"; link.textContent = match[0];
-        link.dataset.rows = match[1].match(/\d+/g).join(",");
+        link.dataset.rows = [...rowsOf(match[0])].join(",");
         link.addEventListener("click", () => {
           marked.clear();
           for (const row of link.dataset.rows.split(",")) marked.add(+row);
+          draw(document.getElementById("figure-" + target[0]));
           for (const figure of drawn) figure.redraw();
         });
         parts.push(node.data.slice(last, match.index), link);
         last = match.index + match[0].length;
       }
       if (parts.length) node.replaceWith(...parts, node.data.slice(last));
+    }
+  }
+
+  // called by a file of samples
+  window.calibFigure = (name, chart) => {
+    const figure = drawn.find(one => one.name === name);
+    if (figure) figure.take(resolved(chart));
+  };
+
+  function* rowsOf(words) {
+    for (const part of words.match(/\d+(?:–\d+)?/g)) {
+      const [first, last] = part.split("–").map(Number);
+      for (let row = first; row <= (last || first) && row < first + 1e6; row++) yield row;
     }
   }
 
