@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from calib.api.rendering import ChartedResult, Progress, ReportedResult, listed, optional
 from calib.api.result_table import ResultTable, data_frame
 from calib.arguments import checked
+from calib.config_types import Plots
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
 from calib.estimation.estimate import Estimate
@@ -31,7 +32,7 @@ from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from calib.api.result_table import DataFrame
-    from calib.procedure.report.charts import Chart
+    from calib.procedure.report.figures.charts import Chart
     from calib.procedure.report.page import Section
 
 Recorded = str | Path | Recording
@@ -125,12 +126,12 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
         return positions, velocities, accelerations
 
     @checked
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the result folder, with the same files as `calib identify --out`, and return its path.
 
         Args:
             out: folder to write; an earlier result of the same kind in it is replaced.
-            plots: whether to write the figures.
+            plots: False: no figures, True: in the page, ``png`` or ``svg``: as files, too.
         """
         from calib.procedure.report import outputs
 

@@ -7,6 +7,7 @@ import typer
 
 from calib.cli.completion import Robot
 from calib.cli.shared import Out, Seed, check_destination, command, progress, say, say_written
+from calib.config_types import Plots
 from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ def excite(
     workers: str = "1",
     base: str | None = None,
     tip: str | None = None,
-    plots: bool = True,
+    plots: Plots = True,
 ) -> None:
     """Design a motion that excites ROBOT's dynamics, within limits.
 
@@ -100,7 +101,7 @@ def identify_dynamics(
     base: str | None = None,
     tip: str | None = None,
     seed: Seed = 0,
-    plots: bool = True,
+    plots: Plots = True,
 ) -> None:
     """Identify ROBOT's dynamics from recordings, and judge them. What counts is how well other motion is predicted.
 
@@ -210,7 +211,7 @@ def plan(
     drives: Path | None = None,
     base: str | None = None,
     tip: str | None = None,
-    plots: bool = True,
+    plots: Plots = True,
 ) -> None:
     """Plan the fastest motion of ROBOT through waypoints. Speeds and torques stay within its limits.
 

@@ -10,6 +10,7 @@ from calib.procedure.report.fit_report import FittedParameter
 from calib.procedure.report.fit_report import read as read_fit_report
 from calib.procedure.report.page import (
     Block,
+    ChartPicture,
     KeyFigure,
     Picture,
     Pictures,
@@ -22,12 +23,13 @@ from calib.procedure.report.page import (
     table,
 )
 from calib.procedure.report.page import section as printed_section
-from calib.procedure.report.templates import filled, issued
+from calib.procedure.report.templates import filled, interactive, issued
 from calib.procedure.report.templates import read as read_template
 
 __all__ = [
     "Block",
     "CertificateSection",
+    "ChartPicture",
     "Entry",
     "FittedParameter",
     "KeyFigure",
@@ -39,6 +41,7 @@ __all__ = [
     "Text",
     "as_html",
     "filled",
+    "interactive",
     "issued",
     "met",
     "printed_section",

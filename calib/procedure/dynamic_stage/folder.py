@@ -57,9 +57,8 @@ OURS = (
     geometry_tables.SENSITIVITY,
     geometry_tables.GEOMETRIES,
     geometry_tables.TORQUE_COVARIANCE,
-    "plot_torque_[0-9]*.png",
-    *(f"plot_{name}.png" for name in ("errors", "residuals", "friction", "significance")),
-    *(f"plot_{name}.png" for name in ("geometries", "geometry_effects")),
+    *folders.figure_files("torque_[0-9]*", "velocity_[0-9]*", "errors", "residuals", "friction", "significance"),
+    *folders.figure_files("geometries", "geometry_effects"),
 )
 """Files of an earlier identification that a new one replaces."""
 INSTRUMENTAL_HEADER = ("name", "unit", "instrumental", "sigma", "least_squares", "shift_sigma", "explained_percent")

@@ -205,7 +205,7 @@ def outcome_section(outcome: IdentificationOutcome) -> page.Section:
 
 def report_section(
     report: DynamicReport,
-    figures: Mapping[str, page.Picture],
+    figures: Mapping[str, page.ChartPicture],
     exported: Sequence[str] = (),
     tolerance: float = 0.0,
     delivered: float | None = None,
@@ -226,9 +226,12 @@ def report_section(
     if tests:
         blocks.insert(0, _test_table(unseen, tests))
 
-    torque_figures = [name for name in figures if name.startswith("torque_")]
+    torque_figures = [name for name in figures if name.startswith(("torque_", "velocity_"))]
+    # each recording's velocities below its torques
+    torque_figures.sort(key=lambda name: int(name.partition("_")[2]))
     blocks.append(page.pictures("", figures, ("errors", "residuals")))
     blocks.append(page.pictures("Torques", figures, torque_figures))
+    blocks.append(page.pictures("Friction", figures, ("friction",)))
     blocks.append(page.pictures("Excitation", figures, ("excitation",)))
 
     if len(metrics.ladder) > 1:

@@ -17,6 +17,7 @@ from urllib.parse import quote
 
 import numpy as np
 import pytest
+from browsers import chromium
 from sessions import begin, go_on
 from starlette.testclient import TestClient
 
@@ -257,19 +258,9 @@ def test_only_the_sessions_files_are_served(session: Session, client: TestClient
 
 @pytest.fixture
 def browser() -> Iterator[Any]:
-    from selenium import webdriver
-
-    programs = [shutil.which(name) for name in ("chromium", "chromedriver")]
-    if None in programs:
-        pytest.skip("chromium or chromedriver is not installed (Debian: apt-get install chromium chromium-driver)")
-    options = webdriver.ChromeOptions()
-    options.binary_location = str(programs[0])
-    for word in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
-        options.add_argument(word)
-    driver = webdriver.Chrome(options, webdriver.ChromeService(programs[1]))
-    driver.implicitly_wait(10)
-    yield driver
-    driver.quit()
+    with chromium() as driver:
+        driver.implicitly_wait(10)
+        yield driver
 
 
 def split(path: Path, joints: int) -> list[Path]:
