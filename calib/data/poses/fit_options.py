@@ -75,7 +75,19 @@ RadiansOrZero = Annotated[float, Real(above=0, least=MIN_SIGMA, most=1.0, unit="
 Each = Spread(3, "a number or three")
 
 
-OF_COLUMNS = ("sign", "coupling", "still", "order", "zero", "rows", "targets", "reflection", "convention", "copies")
+OF_COLUMNS = (
+    "sign",
+    "coupling",
+    "still",
+    "order",
+    "zero",
+    "rows",
+    "targets",
+    "reflection",
+    "convention",
+    "copies",
+    "units",
+)
 FINDINGS = ("unexplained", *OF_COLUMNS, "moved", "scale", "commanded", "range")
 """Names in ``accept``: those of chapter 1 of the catalogue of findings."""
 
