@@ -34,7 +34,7 @@ def with_silent_units(sheet: Sheet, layout: Layout, robot: Joints) -> tuple[Shee
         Undecided: angles of an orientation that may be rad or deg beside joints in deg.
     """
     sheet = _with_units_of_names(sheet, layout)
-    if sheet.has_our_names(layout.joints, robot.names) and not _is_mapped(sheet, layout):
+    if sheet.has_our_names(layout.joints, robot.names, mapped=False) and not _is_mapped(sheet, layout):
         return sheet, ()
     turning: list[str] = []
     sliding: list[str] = []
