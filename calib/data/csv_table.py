@@ -30,6 +30,7 @@ from calib.files import check_regular
 from calib.records import frozen, plain_text, read_only
 from calib.units import (
     ANGLES,
+    COUNT_WORDS,
     CURRENTS,
     EFFORTS,
     LENGTHS,
@@ -37,6 +38,7 @@ from calib.units import (
     TIMES,
     UNIT_WORDS,
     VELOCITIES,
+    encoder_counts,
     is_number,
     unit_of,
 )
@@ -162,7 +164,7 @@ class Table:
             return cells
         units = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}
         units |= {"speed": QUANTITIES["speed"], "time": TIMES}
-        return cells * self.factor(column, units[dimension], unit)
+        return (cells - self.zero(column, unit)) * self.factor(column, units[dimension], unit)
 
     def check(self, names: Sequence[str], gaps: Collection[str] = ()) -> list[np.ndarray]:
         """Return columns (m,) as floats, not converted to SI, after checking that every cell is a finite number.
@@ -194,15 +196,33 @@ class Table:
             unit: unit stated by the options; "" if none. If both the header and the options state one, they must agree.
         """
         name, header_unit = self.header[column], self.units[column]
+        if encoder_counts(unit) and header_unit.lower() in COUNT_WORDS:
+            header_unit = ""
         if header_unit and unit and header_unit != unit:
             self.fail(f"the header states [{header_unit}], the options state {unit}: remove one of them", name)
         unit = header_unit or unit
         if not unit:
             return 1.0
+        counts = encoder_counts(unit)
+        if counts is not None and "rad" in factors:
+            return math.tau / counts[0]
         if unit.lower() not in factors:
             expected = ", ".join(name for name in factors if name.isascii())
-            self.fail(f"unit [{unit}] is not one of {expected}", name)
+            counts = ""
+            if unit.lower() in COUNT_WORDS and "rad" in factors:
+                counts = "; of an encoder, state counts per turn and the count at zero, as in [counts/4096@2048]"
+            self.fail(f"unit [{unit}] is not one of {expected}{counts}", name)
         return factors[unit.lower()]
+
+    def zero(self, column: int, unit: str) -> float:
+        """Return the count of an encoder at the joint's zero, by its unit; 0 for other units.
+
+        Args:
+            column: index of the column.
+            unit: unit stated by the options; "" if none.
+        """
+        counts = encoder_counts(unit) or encoder_counts(self.units[column])
+        return counts[1] if counts else 0.0
 
     def where(self, keep: np.ndarray) -> Table:
         """Return the table with only those rows that the mask `keep` (m,) selects."""

@@ -31,6 +31,7 @@ from calib.data.poses.name_shapes import (
 from calib.data.schema import BOUNDS, Column, Joints
 from calib.errors import MeasurementError, listing, one_of, suggestion
 from calib.units import ANGLES as ANGLE_UNITS
+from calib.units import COUNT_WORDS, encoder_counts
 
 SUFFIXES = ("", "_meas", "_measured")
 POSITION = Column(("x", "y", "z"), "length", "position", BOUNDS.max_length, "mm")
@@ -115,7 +116,11 @@ class Sheet:
             column: the file's name of the column.
             family: family of columns under which the options may have the unit.
         """
-        return self.table.units[self.table.index(column)] or self._unit_of_options(column, family)
+        header_unit = self.table.units[self.table.index(column)]
+        unit = self._unit_of_options(column, family)
+        if encoder_counts(unit) and header_unit.lower() in COUNT_WORDS:
+            return unit
+        return header_unit or unit
 
     def _unit_of_options(self, column: str, family: str) -> str:
         units = self.options.units

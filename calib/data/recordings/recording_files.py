@@ -484,8 +484,9 @@ def _values(table: Table, column: int, series: str, options: RecordingOptions) -
         series: the toolkit's name of the series, which determines the accepted units.
         options: options for reading the file, which may state a unit.
     """
-    factor = table.factor(column, SCALES[series], options.units.get(series, ""))
-    return table.numbers(table.header[column], None, gaps=True) * factor
+    unit = options.units.get(series, "")
+    factor = table.factor(column, SCALES[series], unit)
+    return (table.numbers(table.header[column], None, gaps=True) - table.zero(column, unit)) * factor
 
 
 def _stamps(table: Table, columns_of: dict[str, list[int]], options: RecordingOptions) -> tuple[np.ndarray, list[str]]:

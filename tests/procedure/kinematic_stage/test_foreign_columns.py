@@ -292,3 +292,21 @@ def test_numbered_columns_of_a_torso_with_two_arms(tmp_path):
     path = written(tmp_path / "m.csv", header, [np.random.default_rng(1).uniform(0.0, 0.3, (9, 10))])
     with pytest.raises(RobotError, match="two arms: choose one by its last link"):
         load_robot(tmp_path / "two.urdf", path, FitOptions())
+
+
+@pytest.mark.parametrize(("per_turn", "zero"), [(4096, 2048), (10_000, 0), (2**20, 0)])
+def test_encoder_counts_are_told_by_the_arm(arm, tmp_path, per_turn, zero):
+    """Whole numbers too large for deg are read by the usual encoder that agrees with the arm, or asked for."""
+    chain, q, position, _ = arm
+    counts = np.round(q * per_turn / (2.0 * np.pi)) + zero
+    path = written(tmp_path / "m.csv", [*numbered("q{}"), "x", "y", "z"], [counts, position])
+    (block,) = read_file(path, chain, FitOptions())
+    np.testing.assert_allclose(block.q, q, atol=np.pi / per_turn + 1e-6)
+    assert f"counts/{per_turn}@{zero}" in block.notes[0]
+    with pytest.raises(MeasurementError, match="encoder counts.*one line|encoder counts.*One line"):
+        read_measurements(path, chain.joint_names)
+    odd = written(tmp_path / "odd.csv", [*numbered("q{} [ticks]"), "x", "y", "z"], [counts + per_turn // 10, position])
+    with pytest.raises(MeasurementError, match="joint by joint: units = "):
+        read_file(odd, chain, FitOptions())
+    options = FitOptions(units={"joints": f"counts/{per_turn}@{zero + per_turn // 10}"})
+    np.testing.assert_allclose(read_file(odd, chain, options)[0].q, block.q, atol=1e-9)
