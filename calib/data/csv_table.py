@@ -58,8 +58,12 @@ _DETACHED_UNIT = re.compile(r"[ ]+([\[(])")
 # A cell of a spreadsheet, not a comment.
 _ERROR = re.compile(r"#(REF!|N/A|NUM!|DIV/0!|VALUE!|NAME\?|NULL!)", re.I)
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
-# 1.045,8959 and 1,045.8959
-_GROUPED = re.compile(r"^[+-]?(\d{1,3}(\.\d{3})+,\d*|\d{1,3}(,\d{3})+\.\d*)$")
+# 1.045,8959 and 1,045.8959, 1'045.8959 (Swiss) and 1 045,8959 (French, SI)
+_GROUPED = re.compile(
+    r"^[+-]?(\d{1,3}(\.\d{3})+,\d*|\d{1,3}(,\d{3})+\.\d*|\d{1,3}(['\u2019 \u00a0\u2009\u202f]\d{3})+([.,]\d*)?)$"
+)
+# 470,801: a decimal comma, or thousands
+_AMBIGUOUS = re.compile(r"^[+-]?\d{1,3}(,\d{3})+$")
 # Rows read at a time.
 _CHUNK = 20_000
 # Bytes of a file by which its encoding is told (our choice).
@@ -620,6 +624,11 @@ def _as_floats(texts: np.ndarray) -> np.ndarray:
 
 def _not_a_number(cell: str | float) -> str:
     text = str(cell)
+    if _AMBIGUOUS.match(text):
+        return (
+            f"found '{text}', with a decimal comma or separators between thousands: save the table with decimal "
+            "points, and without such separators"
+        )
     if _DECIMAL_COMMA.match(text):
         return f"found '{text}', with a decimal comma: save the table with decimal points (1.5, not 1,5)"
     if _GROUPED.match(text):
