@@ -10,6 +10,7 @@ import ast
 import datetime
 import math
 import operator
+import re
 import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
@@ -277,10 +278,12 @@ class OneOf(_Read):
     Attributes:
         allowed: the texts; or ``module:Name`` of a `Literal` with them, if the module is to be imported only when
             needed.
+        pattern: regular expression of further texts, which the hint names; "" for none.
     """
 
     allowed: tuple[str, ...] | str
     hint: str = ""
+    pattern: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -298,14 +301,15 @@ class OneOf(_Read):
         return f"{', '.join(self.allowed[:-1])} or {self.allowed[-1]}"
 
     def read(self, value: object) -> str:
-        if isinstance(value, str) and value in self.names:
+        if isinstance(value, str) and (value in self.names or (self.pattern and re.fullmatch(self.pattern, value))):
             return value
         near = suggestion(value, self.names) if isinstance(value, str) else ""
         raise _Refused(f"one of {', '.join(self.names)}{near}", value, self.hint)
 
     @property
     def json(self) -> Mapping[str, object]:
-        return {"enum": [*self.names], "type": "string"}
+        names: Mapping[str, object] = {"enum": [*self.names], "type": "string"}
+        return {"anyOf": [names, {"type": "string", "pattern": self.pattern}]} if self.pattern else names
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,22 @@ or a shift of rows does not hide the direction.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements, Poses
+from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.errors import Finding, finding
-from calib.geometry.first_guess import LEVER, checked_rows, chordal_turns, misfit, place_pose
+from calib.geometry.first_guess import (
+    LEVER,
+    Placements,
+    checked_rows,
+    chordal_turns,
+    misfit,
+    place_pose,
+    place_position,
+)
 from calib.records import evenly
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -31,6 +39,11 @@ MAX_SHARE = 0.1
 # Fewest rows of which both directions are tried, and of a part of the rows.
 MIN_ROWS = 4
 MIN_PART = 5
+# The same of positions: the two placements take nine of their numbers.
+MIN_PART_OF_POSITIONS = 8
+# Smallest misfit of positions, as a share of the arm's motion, at which a change is searched for: smaller ones are for
+# `calib.geometry.checks.row_changes`.
+MIN_SHARE_OF_POSITIONS = 0.01
 # Largest number of rows in which a change is searched for.
 MAX_ROWS = 150
 # Largest misfit of two parts, as a share of the misfit of all rows.
@@ -38,6 +51,8 @@ MAX_LEFT = 0.2
 # Smallest changes that are named: angle [rad] and distance [m].
 MIN_TURN = 0.5 * DEG
 MIN_SHIFT = 1e-3
+
+Placing = Callable[[np.ndarray, np.ndarray], Placements]
 
 
 @dataclass(frozen=True)
@@ -151,26 +166,33 @@ def parted_set_up(chain: Chain, block: PoseMeasurements) -> list[Finding]:
 
     Args:
         chain: the nominal arm.
-        block: measurements of any kind; only full poses are tested.
+        block: measurements of any kind; only positions and full poses are tested.
     """
-    if not isinstance(block, Poses) or not 2 * MIN_PART <= len(block) <= MAX_ROWS or np.ptp(block.tool) > 0:
+    min_part = MIN_PART if isinstance(block, Poses) else MIN_PART_OF_POSITIONS
+    if not isinstance(block, Positions) or not 2 * min_part <= len(block) <= MAX_ROWS or np.ptp(block.tool) > 0:
         return []
     arm = forward(chain, block.q)
-    measured = from_quaternion(block.position, block.quaternion)
-    together = _rms_misfit(arm, measured)
-    cuts = range(MIN_PART, len(arm) - MIN_PART + 1)
-    squares = []
-    for cut in cuts:
-        before = _rms_misfit(arm[:cut], measured[:cut])
-        after = _rms_misfit(arm[cut:], measured[cut:])
-        squares.append(cut * before**2 + (len(arm) - cut) * after**2)
-    best = int(np.argmin(squares))
-    parted = float(np.sqrt(squares[best] / len(arm)))
+    if isinstance(block, Poses):
+        solve: Placing = place_pose
+        measured = from_quaternion(block.position, block.quaternion)
+    else:
+        solve = _place_positions
+        measured = from_quaternion(block.position, np.tile([0.0, 0.0, 0.0, 1.0], (len(block), 1)))
+    together = _rms_misfit(arm, measured, solve)
+    if solve is not place_pose and together < MIN_SHARE_OF_POSITIONS * _motion(arm):
+        return []
+
+    def squares(cut: int) -> float:
+        before = _rms_misfit(arm[:cut], measured[:cut], solve)
+        after = _rms_misfit(arm[cut:], measured[cut:], solve)
+        return cut * before**2 + (len(arm) - cut) * after**2
+
+    cut = min(range(min_part, len(arm) - min_part + 1), key=squares)
+    parted = float(np.sqrt(squares(cut) / len(arm)))
     if parted > MAX_LEFT * together or parted > MAX_SHARE * _motion(arm):
         return []
-    cut = cuts[best]
-    station, tool = place_pose(arm[:cut], measured[:cut])
-    later_station, later_tool = place_pose(arm[cut:], measured[cut:])
+    station, tool = solve(arm[:cut], measured[:cut])
+    later_station, later_tool = solve(arm[cut:], measured[cut:])
     carried = invert(tool) @ later_tool
     standing = station @ invert(later_station)
     changed, change = ("what the arm carries", carried)
@@ -198,10 +220,16 @@ def parted_set_up(chain: Chain, block: PoseMeasurements) -> list[Finding]:
     ]
 
 
-def _rms_misfit(arm: np.ndarray, measured: np.ndarray) -> float:
-    """Return the rms misfit [m] of poses with the best placements, angles included."""
+def _place_positions(arm: np.ndarray, measured: np.ndarray) -> Placements:
+    """Return the placements S and X for measured positions; the rotations of `measured` (m, 4, 4) are not used."""
+    return place_position(arm, measured[:, :3, 3], None, None)
+
+
+def _rms_misfit(arm: np.ndarray, measured: np.ndarray, solve: Placing) -> float:
+    """Return the rms misfit [m] of poses with the best placements; angles are included where they were measured."""
     rows = evenly(len(arm), MAX_ROWS)
-    values = misfit(arm[rows], measured[rows], *place_pose(arm[rows], measured[rows]), LEVER)
+    lever = LEVER if solve is place_pose else 0.0
+    values = misfit(arm[rows], measured[rows], *solve(arm[rows], measured[rows]), lever)
     return float(np.sqrt(np.mean(values**2)))
 
 
