@@ -16,6 +16,7 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, Poses
 from calib.errors import Finding, finding
+from calib.geometry.checks import pose_steps
 from calib.geometry.first_guess import LEVER, checked_rows, chordal_turns, misfit, place_pose
 from calib.records import evenly
 from calib.robot.chain import Chain
@@ -31,6 +32,12 @@ MAX_SHARE = 0.1
 # Fewest rows of which both directions are tried, and of a part of the rows.
 MIN_ROWS = 4
 MIN_PART = 5
+# What changed, by the part of the set-up.
+CHANGED = {"tool": "what the arm carries", "station": "what stands beside the arm"}
+# Numbers of parts into which rows are divided: after two changes, one of five parts is of one set-up.
+PARTS = (2, 3, 5)
+# Shares of the rows, from the first on, in which a change is searched for where several may be.
+BEGINNINGS = (0.8, 0.65, 0.5)
 # Largest number of rows in which a change is searched for.
 MAX_ROWS = 150
 # Largest misfit of two parts, as a share of the misfit of all rows.
@@ -96,13 +103,17 @@ def median_misfit(arm: np.ndarray, measured: np.ndarray) -> float:
 
 
 def _misfits_of_parts(arm: np.ndarray, measured: np.ndarray) -> Iterator[float]:
-    """Yield the median misfits of both halves of the rows, and of rows paired with the next and the previous pose."""
+    """Yield the median misfits of parts of the rows, and of rows paired with the next and the previous pose."""
     m = len(arm)
     if m < 2 * MIN_PART:
         return
-    half = m // 2
-    yield median_misfit(arm[:half], measured[:half])
-    yield median_misfit(arm[half:], measured[half:])
+    for count in PARTS:
+        size = m // count
+        if size < MIN_PART:
+            continue
+        for start in range(0, size * count, size):
+            stop = start + size
+            yield median_misfit(arm[start:stop], measured[start:stop])
     yield median_misfit(arm[1:], measured[:-1])
     yield median_misfit(arm[:-1], measured[1:])
 
@@ -134,8 +145,11 @@ def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurem
     agreement = direction(arm, from_quaternion(block.position[rows], block.quaternion[rows]))
     if not agreement.is_inverse:
         return block
+    subject = "the poses agree"
+    if agreement.inverse > MAX_SHARE * _motion(arm):
+        subject = "the poses do not agree with the arm; some of their rows, or shifted rows, do"
     note = (
-        f"the poses agree as their inverse ({1e3 * agreement.inverse:.3g} mm, as they are "
+        f"{subject} as their inverse ({1e3 * agreement.inverse:.3g} mm, as they are "
         f"{1e3 * agreement.direct:.3g} mm, median misfit): read as what stands (board) seen from what the arm carries "
         "(camera)"
     )
@@ -147,7 +161,7 @@ def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurem
 def parted_set_up(chain: Chain, block: PoseMeasurements) -> list[Finding]:
     """Return a finding if the rows before and after some row agree with the arm each by themselves, not together.
 
-    This finds large changes, in small sets too; `calib.geometry.checks.row_changes` finds small ones.
+    Large changes are found by placing both parts, small ones by `calib.geometry.checks.pose_steps`.
 
     Args:
         chain: the nominal arm.
@@ -157,6 +171,46 @@ def parted_set_up(chain: Chain, block: PoseMeasurements) -> list[Finding]:
         return []
     arm = forward(chain, block.q)
     measured = from_quaternion(block.position, block.quaternion)
+    end = len(arm)
+    step = pose_steps.small_step(arm, measured, place_pose(arm, measured)) or _large_step(arm, measured)
+    if step is None and _rms_misfit(arm, measured) > MAX_SHARE * _motion(arm):
+        # the first of several changes
+        for share in BEGINNINGS:
+            end = round(share * len(arm))
+            step = _large_step(arm[:end], measured[:end])
+            if step is not None:
+                break
+    if step is None:
+        return []
+    rows = block.rows[:end]
+    return [
+        finding(
+            "set-up-parted",
+            file=block.file.rsplit("/", 1)[-1] or "measurements",
+            first=rows[0],
+            last=rows[step.cut - 1],
+            next=rows[step.cut],
+            end=rows[-1],
+            apart=step.apart,
+            together=_rms_misfit(arm[:end], measured[:end]),
+            changed=CHANGED[step.part],
+            angle=step.angle,
+            angle_sigma=step.angle_sigma,
+            shift=step.shift,
+            shift_sigma=step.shift_sigma,
+        )
+    ]
+
+
+def _large_step(arm: np.ndarray, measured: np.ndarray) -> pose_steps.Step | None:
+    """Return the row after which the set-up was another, by placing the rows before and after it by themselves.
+
+    Args:
+        arm: (m, 4, 4) poses of the tip in the base.
+        measured: (m, 4, 4) poses of the target in the instrument's frame.
+    """
+    if len(arm) < 2 * MIN_PART:
+        return None
     together = _rms_misfit(arm, measured)
     cuts = range(MIN_PART, len(arm) - MIN_PART + 1)
     squares = []
@@ -167,35 +221,13 @@ def parted_set_up(chain: Chain, block: PoseMeasurements) -> list[Finding]:
     best = int(np.argmin(squares))
     parted = float(np.sqrt(squares[best] / len(arm)))
     if parted > MAX_LEFT * together or parted > MAX_SHARE * _motion(arm):
-        return []
+        return None
     cut = cuts[best]
-    station, tool = place_pose(arm[:cut], measured[:cut])
-    later_station, later_tool = place_pose(arm[cut:], measured[cut:])
-    carried = invert(tool) @ later_tool
-    standing = station @ invert(later_station)
-    changed, change = ("what the arm carries", carried)
-    if _size(standing) > _size(carried):
-        changed, change = ("what stands beside the arm", standing)
-    angle = _angle(change)
-    shift = float(np.linalg.norm(change[:3, 3]))
-    if angle < MIN_TURN and shift < MIN_SHIFT:
-        return []
-    rows = block.rows
-    return [
-        finding(
-            "set-up-parted",
-            file=block.file.rsplit("/", 1)[-1] or "measurements",
-            first=rows[0],
-            last=rows[cut - 1],
-            next=rows[cut],
-            end=rows[-1],
-            apart=parted,
-            together=together,
-            changed=changed,
-            angle=angle,
-            shift=shift,
-        )
-    ]
+    first = place_pose(arm[:cut], measured[:cut])
+    step = pose_steps.step_at(arm, measured, cut, first)
+    if step.angle < MIN_TURN and step.shift < MIN_SHIFT:
+        return None
+    return step
 
 
 def _rms_misfit(arm: np.ndarray, measured: np.ndarray) -> float:
@@ -203,14 +235,3 @@ def _rms_misfit(arm: np.ndarray, measured: np.ndarray) -> float:
     rows = evenly(len(arm), MAX_ROWS)
     values = misfit(arm[rows], measured[rows], *place_pose(arm[rows], measured[rows]), LEVER)
     return float(np.sqrt(np.mean(values**2)))
-
-
-def _angle(change: np.ndarray) -> float:
-    """Return the angle [rad] of a motion (4, 4)."""
-    cosine = 0.5 * (np.trace(change[:3, :3]) - 1.0)
-    return float(np.arccos(np.clip(cosine, -1.0, 1.0)))
-
-
-def _size(change: np.ndarray) -> float:
-    """Return the size of a motion (4, 4) [m], its angle included."""
-    return float(np.linalg.norm(change[:3, 3])) + LEVER * _angle(change)

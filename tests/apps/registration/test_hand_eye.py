@@ -14,6 +14,8 @@ from calib.apps.registration.settings import PlacementSettings
 from calib.cli import run
 from calib.data.poses.fit_options import CameraOptions, FitOptions
 from calib.errors import CalibError, UsageError
+from calib.geometry.checks import pose_steps
+from calib.geometry.first_guess import place_pose
 
 CASE = DATA / "cases/13_hand_eye_pose_pairs"
 
@@ -216,6 +218,34 @@ def test_camera_turned_halfway_is_named_with_its_row(tmp_path):
     text = str(fit)
     assert "rows 1–8 and 9–14 agree apart" in text
     assert "what the arm carries was turned by 180°" in text
+
+
+def small_step(robot: np.ndarray, measured: np.ndarray) -> pose_steps.Step | None:
+    return pose_steps.small_step(robot, measured, place_pose(robot, measured))
+
+
+def turned_later(seed: int, count: int, angle: float, first: int, end: int | None = None) -> tuple:
+    """Return poses whose camera was turned by an angle [rad] from the row `first` on, and back at the row `end`."""
+    robot, seen = sampled(seed, count)
+    turn = motion(Rotation.from_rotvec([0, 0, -angle]), np.zeros(3))
+    seen[first:end] = turn @ seen[first:end]
+    return robot, inv(seen)
+
+
+def test_small_turns_are_steps_and_sound_sets_have_none():
+    """A turn of 0.6° is a step with its σ; sets without a turn have no step."""
+    step = small_step(*turned_later(2, 24, 0.01, 12))
+    assert (step.cut, step.part) == (12, "tool")
+    assert abs(step.angle - 0.01) < 4 * step.angle_sigma < 2e-3 and step.shift < 4 * step.shift_sigma
+    for seed in range(10):
+        assert small_step(*turned_later(seed, 15, 0.0, 8)) is None
+
+
+def test_first_of_two_turns_is_named(tmp_path):
+    """Of two turns, the first is named with its rows."""
+    robot, camera = turned_later(3, 24, np.pi / 2, 8, 16)
+    text = str(calib.hand_eye(None, table(tmp_path / "pairs.csv", robot, inv(camera))))
+    assert "rows 1–8 and 9–" in text
 
 
 def test_mounting_that_nothing_says_is_asked_for(tmp_path):

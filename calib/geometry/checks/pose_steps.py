@@ -1,0 +1,275 @@
+"""A step of the set-up halfway through a set of poses: the likelihood ratio over all rows after which it may be.
+
+Poses of the target in the instrument's frame are B_i = S A_i X E_i with the arm's poses A_i and small errors E_i. The
+twist e_i of S⁻¹ B_i against A_i X is linear in small changes of both placements,
+
+    e_i = ξ + Ad((A_i X)⁻¹) η,
+
+with X exp(ξ) and S exp(η). A step of the tool adds a second ξ from some row on, a step of the station a second η.
+Fisher's test compares the squares with and without the step, corrected for the number of steps tried (Bonferroni).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from scipy.spatial.transform import Rotation
+
+from calib.geometry.first_guess import LEVER, Placements, average_pose
+from calib.transforms import invert, pose
+
+# Fewest rows before and after a step.
+MIN_PART = 5
+# Numbers of a twist, and of both placements.
+TWIST = 6
+PLACED = 12
+# Largest probability of such a gain by noise, all steps considered; small, since an arm's errors are not white (our
+# choice, judged on simulated sets without a step).
+MAX_CHANCE = 1e-4
+# Largest variance with the step, as a share of that without it; and smallest ratio of the squares that a step over rows
+# in another order leaves: an error of the arm is explained as well by such an order (our choice).
+MAX_LEFT = 0.6
+MIN_RIVAL = 1.3
+# Largest number of Gauss-Newton steps.
+ITERATIONS = 6
+# Largest rms rotation per axis [rad] of poses whose errors are linear in the placements.
+MAX_TURN = 0.1
+# Smallest standard deviation of poses [m, rad].
+MIN_NOISE = 1e-7
+SUBJECTS = ("tool", "station")
+
+
+@dataclass(frozen=True)
+class Step:
+    """A step of a placement.
+
+    Attributes:
+        cut: index of the first row after it.
+        part: "tool" or "station".
+        apart: rms misfit of the rows with the step [m], angles included.
+        angle, angle_sigma: size of its rotation and the standard deviation [rad].
+        shift, shift_sigma: size of its displacement and the standard deviation [m].
+    """
+
+    cut: int
+    part: str
+    apart: float
+    angle: float
+    angle_sigma: float
+    shift: float
+    shift_sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Twists:
+    """Whitened errors of poses, and their derivatives.
+
+    Attributes:
+        error: (m, 6) twists, displacement before rotation.
+        tool, station: (m, 6, 6) derivatives by the placements' twists.
+    """
+
+    error: np.ndarray
+    tool: np.ndarray
+    station: np.ndarray
+
+    def columns(self, part: str, after: np.ndarray) -> np.ndarray:
+        """Return the columns (6 m, 6) of a part's step at the rows of a mask (m,)."""
+        derivative = {"tool": self.tool, "station": self.station}[part]
+        return (derivative * after[:, None, None]).reshape(-1, TWIST)
+
+    def both(self) -> np.ndarray:
+        """Return the columns (6 m, 12) of both placements."""
+        everywhere = np.ones(len(self.error))
+        return np.hstack([self.columns("tool", everywhere), self.columns("station", everywhere)])
+
+
+def small_step(arm: np.ndarray, measured: np.ndarray, start: Placements) -> Step | None:
+    """Return the most likely step of a placement; None if noise or an error of the arm explains the rows as well.
+
+    Args:
+        arm: (m, 4, 4) A_i.
+        measured: (m, 4, 4) B_i.
+        start: placements S and X of all rows.
+    """
+    # slow to load
+    from scipy.stats import f
+
+    m = len(arm)
+    placements = start
+    scale = np.ones(TWIST)
+    for _ in range(ITERATIONS):
+        raw = _twists(arm, measured, *placements, scale)
+        change = np.linalg.lstsq(raw.both(), raw.error.ravel())[0]
+        placements = (placements[0] @ _motion(change[TWIST:]), placements[1] @ _motion(change[:TWIST]))
+        scale = _scale(_twists(arm, measured, *placements, np.ones(TWIST)).error)
+    if scale[-1] > MAX_TURN:
+        return None
+    twists = _twists(arm, measured, *placements, scale)
+    cost = float(np.sum(twists.error**2))
+    gain, part, cut = _best_gain(twists, np.arange(m))
+    dof = TWIST * (m - 1) - PLACED
+    remaining = max(cost - gain, 1e-12)
+    chance = float(f.sf(gain / TWIST / (remaining / dof), TWIST, dof))
+    hypotheses = len(SUBJECTS) * (m - 2 * MIN_PART + 1)
+    if chance * hypotheses > MAX_CHANCE or remaining > MAX_LEFT * cost:
+        return None
+    for order in _other_orders(arm):
+        if cost - _best_gain(twists, order)[0] < MIN_RIVAL * remaining:
+            return None
+    return _estimated(arm, measured, cut, part, placements)
+
+
+def step_at(arm: np.ndarray, measured: np.ndarray, cut: int, first: Placements) -> Step:
+    """Return the step before a row, of the placement that explains the rows better.
+
+    Args:
+        arm: (m, 4, 4) A_i.
+        measured: (m, 4, 4) B_i.
+        cut: index of the first row after the step.
+        first: placements S and X of the rows before it.
+    """
+    steps = [_estimated(arm, measured, cut, part, first) for part in SUBJECTS]
+    return min(steps, key=lambda step: step.apart)
+
+
+def _estimated(arm: np.ndarray, measured: np.ndarray, cut: int, part: str, first: Placements) -> Step:
+    """Return the step of a placement before a row, by Gauss-Newton.
+
+    Args:
+        arm: (m, 4, 4) A_i.
+        measured: (m, 4, 4) B_i.
+        cut: index of the first row after the step.
+        part: the placement.
+        first: placements S and X near those of the rows before it.
+    """
+    station, tool = first
+    later_station, later_tool = first
+    if part == "tool":
+        later_tool = average_pose(invert(station @ arm[cut:]) @ measured[cut:])
+    else:
+        later_station = average_pose(measured[cut:] @ invert(arm[cut:] @ tool))
+    after = np.arange(len(arm)) >= cut
+    scale = used = np.ones(TWIST)
+    for _ in range(ITERATIONS):
+        stations = np.where(after[:, None, None], later_station, station)
+        tools = np.where(after[:, None, None], later_tool, tool)
+        twists = _twists(arm, measured, stations, tools, scale)
+        before = 1.0 - after
+        other = SUBJECTS[part == "tool"]
+        columns = [twists.columns(part, before), twists.columns(part, after), twists.columns(other, np.ones(len(arm)))]
+        matrix = np.hstack(columns)
+        change = np.linalg.lstsq(matrix, twists.error.ravel())[0]
+        early, late, common = map(_motion, np.split(change, 3))
+        if part == "tool":
+            tool, later_tool = tool @ early, later_tool @ late
+            station = later_station = station @ common
+        else:
+            station, later_station = station @ early, later_station @ late
+            tool = later_tool = tool @ common
+        used = scale
+        scale = _scale(twists.error * scale)
+    residual = (twists.error.ravel() - matrix @ change).reshape(-1, TWIST)
+    squares = float(np.sum(residual**2))
+    dof = residual.size - matrix.shape[1]
+    covariance = scipy.linalg.pinvh(matrix.T @ matrix) * squares / dof
+    difference = np.hstack([-np.eye(TWIST), np.eye(TWIST)])
+    covariance = difference @ covariance[:PLACED, :PLACED] @ difference.T
+    moved = invert(tool) @ later_tool
+    if part == "station":
+        moved = station @ invert(later_station)
+        adjoint = np.linalg.inv(_adjoints(station[None])[0])
+        covariance = adjoint @ covariance @ adjoint.T
+    turn = Rotation.from_matrix(moved[:3, :3]).as_rotvec()
+    shift = moved[:3, 3]
+    size = residual * used
+    apart = np.sqrt(np.mean(np.sum(size[:, :3] ** 2, axis=1) + LEVER**2 * np.sum(size[:, 3:] ** 2, axis=1)))
+    return Step(
+        cut,
+        part,
+        float(apart),
+        float(np.linalg.norm(turn)),
+        _sigma_along(turn, covariance[3:, 3:]),
+        float(np.linalg.norm(shift)),
+        _sigma_along(shift, covariance[:3, :3]),
+    )
+
+
+def _sigma_along(vector: np.ndarray, covariance: np.ndarray) -> float:
+    """Return the standard deviation of the length of a vector (3,) with this covariance (3, 3)."""
+    along = vector / max(float(np.linalg.norm(vector)), 1e-15)
+    return float(np.sqrt(along @ covariance @ along))
+
+
+def _best_gain(twists: Twists, order: np.ndarray) -> tuple[float, str, int]:
+    """Return the largest reduction of the squares by a step over rows in some order, its part and its place there.
+
+    Args:
+        twists: errors at the best placements of all rows.
+        order: (m,) indices of the rows.
+    """
+    m = len(order)
+    base = np.linalg.qr(twists.both())[0]
+    error = twists.error.ravel()
+    best = (-1.0, "", 0)
+    for cut in range(MIN_PART, m - MIN_PART + 1):
+        after = np.zeros(m)
+        after[order[cut:]] = 1.0
+        for part in SUBJECTS:
+            columns = twists.columns(part, after)
+            columns = np.linalg.qr(columns - base @ (base.T @ columns))[0]
+            gain = float(np.sum((columns.T @ error) ** 2))
+            best = max(best, (gain, part, cut))
+    return best
+
+
+def _other_orders(arm: np.ndarray) -> Sequence[np.ndarray]:
+    """Return the orders (m,) of an arm's poses (m, 4, 4) by their coordinates and by their rotations."""
+    mean = average_pose(arm)[:3, :3]
+    turns = Rotation.from_matrix(arm[:, :3, :3] @ mean.T).as_rotvec()
+    coordinates = np.hstack([arm[:, :3, 3], turns])
+    return list(np.argsort(coordinates, axis=0).T)
+
+
+def _twists(arm: np.ndarray, measured: np.ndarray, station: np.ndarray, tool: np.ndarray, scale: np.ndarray) -> Twists:
+    """Return the twists from predicted to measured poses, divided by the standard deviations `scale` (6,).
+
+    Args:
+        arm, measured: (m, 4, 4) A_i and B_i.
+        station, tool: (4, 4) or (m, 4, 4) S and X.
+        scale: standard deviations of displacements [m] and rotations [rad].
+    """
+    reached = arm @ tool
+    difference = invert(station @ reached) @ measured
+    turn = Rotation.from_matrix(difference[:, :3, :3]).as_rotvec()
+    error = np.hstack([difference[:, :3, 3], turn])
+    by_tool = np.tile(np.eye(TWIST), (len(arm), 1, 1))
+    by_station = _adjoints(reached)
+    return Twists(error / scale, by_tool / scale[:, None], by_station / scale[:, None])
+
+
+def _adjoints(poses: np.ndarray) -> np.ndarray:
+    """Return the adjoints (m, 6, 6) of the inverses of poses (m, 4, 4), for twists with the displacement first."""
+    transposed = np.swapaxes(poses[:, :3, :3], 1, 2)
+    x, y, z = poses[:, :3, 3].T
+    zero = np.zeros_like(x)
+    cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
+    result = np.zeros((len(poses), TWIST, TWIST))
+    result[:, :3, :3] = transposed
+    result[:, 3:, 3:] = transposed
+    result[:, :3, 3:] = -transposed @ cross
+    return result
+
+
+def _motion(twist: np.ndarray) -> np.ndarray:
+    """Return the motion (4, 4) of a small twist (6,), displacement before rotation."""
+    return pose(Rotation.from_rotvec(twist[3:]).as_matrix(), twist[:3])
+
+
+def _scale(error: np.ndarray) -> np.ndarray:
+    """Return the rms displacements [m] and rotations [rad] per axis (6,) of twists (m, 6)."""
+    rms = np.sqrt([np.mean(error[:, :3] ** 2), np.mean(error[:, 3:] ** 2)])
+    return np.repeat(np.maximum(rms, MIN_NOISE), 3)
