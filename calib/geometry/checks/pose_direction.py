@@ -191,7 +191,7 @@ def parted_set_up(chain: Chain, block: PoseMeasurements) -> list[Finding]:
             last=rows[step.cut - 1],
             next=rows[step.cut],
             end=rows[-1],
-            apart=step.apart,
+            apart=step.misfit,
             together=_rms_misfit(arm[:end], measured[:end]),
             changed=CHANGED[step.part],
             angle=step.angle,

@@ -49,14 +49,14 @@ class Step:
     Attributes:
         cut: index of the first row after it.
         part: "tool" or "station".
-        apart: rms misfit of the rows with the step [m], angles included.
+        misfit: rms misfit of the rows with the step [m], angles included.
         angle, angle_sigma: size of its rotation and the standard deviation [rad].
         shift, shift_sigma: size of its displacement and the standard deviation [m].
     """
 
     cut: int
     part: str
-    apart: float
+    misfit: float
     angle: float
     angle_sigma: float
     shift: float
@@ -133,7 +133,7 @@ def step_at(arm: np.ndarray, measured: np.ndarray, cut: int, first: Placements) 
         first: placements S and X of the rows before it.
     """
     steps = [_estimated(arm, measured, cut, part, first) for part in SUBJECTS]
-    return min(steps, key=lambda step: step.apart)
+    return min(steps, key=lambda step: step.misfit)
 
 
 def _estimated(arm: np.ndarray, measured: np.ndarray, cut: int, part: str, first: Placements) -> Step:
@@ -153,15 +153,17 @@ def _estimated(arm: np.ndarray, measured: np.ndarray, cut: int, part: str, first
     else:
         later_station = average_pose(measured[cut:] @ invert(arm[cut:] @ tool))
     after = np.arange(len(arm)) >= cut
-    scale = used = np.ones(TWIST)
+    everywhere = np.ones(len(arm))
+    unchanged = SUBJECTS[part == "tool"]
+    scale = applied = np.ones(TWIST)
     for _ in range(ITERATIONS):
         stations = np.where(after[:, None, None], later_station, station)
         tools = np.where(after[:, None, None], later_tool, tool)
         twists = _twists(arm, measured, stations, tools, scale)
         before = 1.0 - after
-        other = SUBJECTS[part == "tool"]
-        columns = [twists.columns(part, before), twists.columns(part, after), twists.columns(other, np.ones(len(arm)))]
-        matrix = np.hstack(columns)
+        early_columns = twists.columns(part, before)
+        late_columns = twists.columns(part, after)
+        matrix = np.hstack([early_columns, late_columns, twists.columns(unchanged, everywhere)])
         change = np.linalg.lstsq(matrix, twists.error.ravel())[0]
         early, late, common = map(_motion, np.split(change, 3))
         if part == "tool":
@@ -170,7 +172,7 @@ def _estimated(arm: np.ndarray, measured: np.ndarray, cut: int, part: str, first
         else:
             station, later_station = station @ early, later_station @ late
             tool = later_tool = tool @ common
-        used = scale
+        applied = scale
         scale = _scale(twists.error * scale)
     residual = (twists.error.ravel() - matrix @ change).reshape(-1, TWIST)
     squares = float(np.sum(residual**2))
@@ -178,19 +180,19 @@ def _estimated(arm: np.ndarray, measured: np.ndarray, cut: int, part: str, first
     covariance = scipy.linalg.pinvh(matrix.T @ matrix) * squares / dof
     difference = np.hstack([-np.eye(TWIST), np.eye(TWIST)])
     covariance = difference @ covariance[:PLACED, :PLACED] @ difference.T
-    moved = invert(tool) @ later_tool
+    jump = invert(tool) @ later_tool
     if part == "station":
-        moved = station @ invert(later_station)
+        jump = station @ invert(later_station)
         adjoint = np.linalg.inv(_adjoints(station[None])[0])
         covariance = adjoint @ covariance @ adjoint.T
-    turn = Rotation.from_matrix(moved[:3, :3]).as_rotvec()
-    shift = moved[:3, 3]
-    size = residual * used
-    apart = np.sqrt(np.mean(np.sum(size[:, :3] ** 2, axis=1) + LEVER**2 * np.sum(size[:, 3:] ** 2, axis=1)))
+    turn = Rotation.from_matrix(jump[:3, :3]).as_rotvec()
+    shift = jump[:3, 3]
+    size = residual * applied
+    rms = np.sqrt(np.mean(np.sum(size[:, :3] ** 2, axis=1) + LEVER**2 * np.sum(size[:, 3:] ** 2, axis=1)))
     return Step(
         cut,
         part,
-        float(apart),
+        float(rms),
         float(np.linalg.norm(turn)),
         _sigma_along(turn, covariance[3:, 3:]),
         float(np.linalg.norm(shift)),
