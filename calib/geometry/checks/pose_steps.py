@@ -5,8 +5,11 @@ twist e_i of S⁻¹ B_i against A_i X is linear in small changes of both placeme
 
     e_i = ξ + Ad((A_i X)⁻¹) η,
 
-with X exp(ξ) and S exp(η). A step of the tool adds a second ξ from some row on, a step of the station a second η.
-Fisher's test compares the squares with and without the step, corrected for the number of steps tried (Bonferroni).
+with X exp(ξ) and S exp(η). A step of the tool adds a second ξ from some row on, a step of the station a second η. An
+error of the arm that is linear in its pose has a prior and is fitted in any case. A step is named if Fisher's test,
+corrected for the number of steps tried (Bonferroni), finds that it explains the rows, and if nothing else does so: no
+drift, no step over rows in the order of a coordinate, and no step over rows in random orders (Pitman's test of 1937),
+which needs no distribution of the errors.
 """
 
 from __future__ import annotations
@@ -29,10 +32,19 @@ PLACED = 12
 # Largest probability of such a gain by noise, all steps considered; small, since an arm's errors are not white (our
 # choice, judged on simulated sets without a step).
 MAX_CHANCE = 1e-4
-# Largest variance with the step, as a share of that without it; and smallest ratio of the squares that a step over rows
-# in another order leaves: an error of the arm is explained as well by such an order (our choice).
-MAX_LEFT = 0.6
-MIN_RIVAL = 1.3
+# Largest variance with the step, as a share of that without it (our choice).
+MAX_LEFT = 0.85
+# Smallest likelihood ratio, as -2 log, of the step to one over rows in the order of a coordinate, which an error of the
+# arm resembles (our choice: a chance of 1e-4 at 3 degrees of freedom).
+MIN_RATIO = 20.0
+# Number of random orders of the rows, in none of which a step may gain more (Pitman 1937).
+PERMUTATIONS = 300
+# Prior standard deviations of an arm's error that is linear in its pose: displacement [m] and rotation [rad] over all
+# coordinates (our choice: those of arms of ordinary accuracy).
+ARM_SHIFT = 3e-3
+ARM_TURN = 5e-3
+# Rounding of a gain, as a share of it.
+ROUNDING = 1e-9
 # Largest number of Gauss-Newton steps.
 ITERATIONS = 6
 # Largest rms rotation per axis [rad] of poses whose errors are linear in the placements.
@@ -78,8 +90,11 @@ class Twists:
 
     def columns(self, part: str, after: np.ndarray) -> np.ndarray:
         """Return the columns (6 m, 6) of a part's step at the rows of a mask (m,)."""
-        derivative = {"tool": self.tool, "station": self.station}[part]
-        return (derivative * after[:, None, None]).reshape(-1, TWIST)
+        return (self.derivative(part) * after[:, None, None]).reshape(-1, TWIST)
+
+    def derivative(self, part: str) -> np.ndarray:
+        """Return the derivatives (m, 6, 6) by a part's twist."""
+        return {"tool": self.tool, "station": self.station}[part]
 
     def both(self) -> np.ndarray:
         """Return the columns (6 m, 12) of both placements."""
@@ -87,8 +102,82 @@ class Twists:
         return np.hstack([self.columns("tool", everywhere), self.columns("station", everywhere)])
 
 
+class Search:
+    """Gains of steps: by how much they reduce the squares that placements and the arm's errors leave.
+
+    Attributes:
+        cost: squares without a step, the prior of the arm's errors included.
+        dof: degrees of freedom of the rows.
+    """
+
+    def __init__(self, twists: Twists, arm_errors: np.ndarray) -> None:
+        """Prepare the sums over rows.
+
+        Args:
+            twists: m errors at the best placements of all rows.
+            arm_errors: (m, 6, k) columns of k unknowns of the arm, each with a standard deviation of 1.
+        """
+        m, _, unknowns = arm_errors.shape
+        placed = twists.both()
+        prior = np.hstack([np.zeros((unknowns, placed.shape[1])), np.eye(unknowns)])
+        matrix = np.vstack([np.hstack([placed, arm_errors.reshape(-1, unknowns)]), prior])
+        error = np.concatenate([twists.error.ravel(), np.zeros(unknowns)])
+        base = np.linalg.qr(matrix)[0]
+        error = error - base @ (base.T @ error)
+        of_rows = base[: m * TWIST].reshape(m, TWIST, -1)
+        residual = error[: m * TWIST].reshape(m, TWIST)
+        self.cost = float(np.sum(error**2))
+        self.dof = m * TWIST - float(np.sum(of_rows**2))
+        self._sums = {}
+        for part in SUBJECTS:
+            columns = twists.derivative(part)
+            score = np.einsum("mij,mi->mj", columns, residual)
+            square = np.einsum("mij,mik->mjk", columns, columns)
+            shared = np.einsum("mij,mik->mjk", columns, of_rows)
+            self._sums[part] = score, square, shared
+
+    def best_gain(self, order: np.ndarray) -> tuple[float, str, int]:
+        """Return the largest gain of a step over rows in some order, its part and its place there.
+
+        Args:
+            order: (m,) indices of the rows.
+        """
+        cuts = np.arange(MIN_PART, len(order) - MIN_PART + 1)
+        best = (-1.0, "", 0)
+        for part, sums in self._sums.items():
+            behind = [np.cumsum(terms[order[::-1]], axis=0)[::-1][cuts] for terms in sums]
+            gains = _gains(*behind)
+            largest = int(np.argmax(gains))
+            best = max(best, (float(gains[largest]), part, int(cuts[largest])))
+        return best
+
+    def gain_of_drift(self) -> float:
+        """Return the largest gain of a placement that drifts from the first row to the last."""
+        gains = []
+        for score, square, shared in self._sums.values():
+            ramp = np.linspace(-0.5, 0.5, len(score))
+            sums = np.tensordot(ramp, score, 1), np.tensordot(ramp**2, square, 1), np.tensordot(ramp, shared, 1)
+            gains += _gains(*(terms[None] for terms in sums)).tolist()
+        return max(gains)
+
+
+def _gains(score: np.ndarray, square: np.ndarray, shared: np.ndarray) -> np.ndarray:
+    """Return the reductions gᵀ S⁻¹ g (c,) of the squares by c changes, with S = Σ HᵀH - Σ HᵀQ (Σ HᵀQ)ᵀ.
+
+    Args:
+        score: (c, 6) g.
+        square: (c, 6, 6) Σ HᵀH.
+        shared: (c, 6, k) Σ HᵀQ, with Q orthonormal columns of what is fitted in any case.
+    """
+    matrix = square - shared @ shared.transpose(0, 2, 1)
+    rounding = ROUNDING * np.trace(square, axis1=1, axis2=2)
+    matrix = matrix + rounding[:, None, None] * np.eye(TWIST)
+    solution = np.linalg.solve(matrix, score[:, :, None])
+    return np.einsum("ck,ck->c", score, solution[:, :, 0])
+
+
 def small_step(arm: np.ndarray, measured: np.ndarray, start: Placements) -> Step | None:
-    """Return the most likely step of a placement; None if noise or an error of the arm explains the rows as well.
+    """Return the most likely step of a placement; None if noise, a drift or an error of the arm explains as much.
 
     Args:
         arm: (m, 4, 4) A_i.
@@ -108,19 +197,40 @@ def small_step(arm: np.ndarray, measured: np.ndarray, start: Placements) -> Step
         scale = _scale(_twists(arm, measured, *placements, np.ones(TWIST)).error)
     if scale[-1] > MAX_TURN:
         return None
-    twists = _twists(arm, measured, *placements, scale)
-    cost = float(np.sum(twists.error**2))
-    gain, part, cut = _best_gain(twists, np.arange(m))
-    dof = TWIST * (m - 1) - PLACED
-    remaining = max(cost - gain, 1e-12)
+    search = Search(_twists(arm, measured, *placements, scale), _arm_errors(arm, scale))
+    rows = np.arange(m)
+    gain, part, cut = search.best_gain(rows)
+    remaining = max(search.cost - gain, 1e-12)
+    dof = max(search.dof - TWIST, 1.0)
     chance = float(f.sf(gain / TWIST / (remaining / dof), TWIST, dof))
     hypotheses = len(SUBJECTS) * (m - 2 * MIN_PART + 1)
-    if chance * hypotheses > MAX_CHANCE or remaining > MAX_LEFT * cost:
+    if chance * hypotheses > MAX_CHANCE or remaining > MAX_LEFT * search.cost:
+        return None
+    if search.gain_of_drift() > gain:
         return None
     for order in _other_orders(arm):
-        if cost - _best_gain(twists, order)[0] < MIN_RIVAL * remaining:
+        ratio = (search.cost - search.best_gain(order)[0]) / remaining
+        if dof * np.log(ratio) < MIN_RATIO:
+            return None
+    random = np.random.default_rng(0)
+    for _ in range(PERMUTATIONS):
+        if search.best_gain(random.permutation(m))[0] > (1.0 + ROUNDING) * gain:
             return None
     return _estimated(arm, measured, cut, part, placements)
+
+
+def _arm_errors(arm: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Return the columns (m, 6, 36) of an arm's error that is linear in its pose, each of plausible size.
+
+    Args:
+        arm: (m, 4, 4) A_i.
+        scale: (6,) standard deviations of displacements [m] and rotations [rad].
+    """
+    coordinates = _coordinates(arm)
+    coordinates = coordinates - coordinates.mean(axis=0)
+    coordinates /= np.maximum(coordinates.std(axis=0), MIN_NOISE)
+    sizes = np.repeat([ARM_SHIFT, ARM_TURN], 3) / scale / np.sqrt(TWIST)
+    return np.einsum("jk,mi->mjki", np.diag(sizes), coordinates).reshape(len(arm), TWIST, TWIST**2)
 
 
 def step_at(arm: np.ndarray, measured: np.ndarray, cut: int, first: Placements) -> Step:
@@ -206,34 +316,16 @@ def _sigma_along(vector: np.ndarray, covariance: np.ndarray) -> float:
     return float(np.sqrt(along @ covariance @ along))
 
 
-def _best_gain(twists: Twists, order: np.ndarray) -> tuple[float, str, int]:
-    """Return the largest reduction of the squares by a step over rows in some order, its part and its place there.
-
-    Args:
-        twists: errors at the best placements of all rows.
-        order: (m,) indices of the rows.
-    """
-    m = len(order)
-    base = np.linalg.qr(twists.both())[0]
-    error = twists.error.ravel()
-    best = (-1.0, "", 0)
-    for cut in range(MIN_PART, m - MIN_PART + 1):
-        after = np.zeros(m)
-        after[order[cut:]] = 1.0
-        for part in SUBJECTS:
-            columns = twists.columns(part, after)
-            columns = np.linalg.qr(columns - base @ (base.T @ columns))[0]
-            gain = float(np.sum((columns.T @ error) ** 2))
-            best = max(best, (gain, part, cut))
-    return best
-
-
 def _other_orders(arm: np.ndarray) -> Sequence[np.ndarray]:
     """Return the orders (m,) of an arm's poses (m, 4, 4) by their coordinates and by their rotations."""
+    return list(np.argsort(_coordinates(arm), axis=0).T)
+
+
+def _coordinates(arm: np.ndarray) -> np.ndarray:
+    """Return positions and rotation vectors from the mean (m, 6) of poses (m, 4, 4)."""
     mean = average_pose(arm)[:3, :3]
     turns = Rotation.from_matrix(arm[:, :3, :3] @ mean.T).as_rotvec()
-    coordinates = np.hstack([arm[:, :3, 3], turns])
-    return list(np.argsort(coordinates, axis=0).T)
+    return np.hstack([arm[:, :3, 3], turns])
 
 
 def _twists(arm: np.ndarray, measured: np.ndarray, station: np.ndarray, tool: np.ndarray, scale: np.ndarray) -> Twists:

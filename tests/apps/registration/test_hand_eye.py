@@ -241,6 +241,20 @@ def test_small_turns_are_steps_and_sound_sets_have_none():
         assert small_step(*turned_later(seed, 15, 0.0, 8)) is None
 
 
+def test_drift_and_errors_of_the_arm_are_no_steps():
+    """A camera that turns slowly, and an arm whose error depends on its pose, are not called steps."""
+    for seed in range(5):
+        robot, seen = sampled(seed, 24)
+        turns = Rotation.from_rotvec(np.linspace(0.0, 0.02, 24)[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+        drifted = seen.copy()
+        drifted[:, :3] = turns @ seen[:, :3]
+        assert small_step(robot, inv(drifted)) is None
+        order = np.argsort(robot[:, 0, 3])
+        bent = robot[order]
+        bent[:, :3, 3] += 0.02 * (bent[:, :3, 3] - bent[:, :3, 3].mean(axis=0))[:, ::-1]
+        assert small_step(bent, inv(seen[order])) is None
+
+
 def test_first_of_two_turns_is_named(tmp_path):
     """Of two turns, the first is named with its rows."""
     robot, camera = turned_later(3, 24, np.pi / 2, 8, 16)
