@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 from scipy.spatial.transform import Rotation
 
 from calib.geometry.first_guess import LEVER, Placements, average_pose
@@ -257,47 +256,40 @@ def _estimated(arm: np.ndarray, measured: np.ndarray, cut: int, part: str, first
         first: placements S and X near those of the rows before it.
     """
     station, tool = first
-    later_station, later_tool = first
+    stations = np.stack([station, station])
+    tools = np.stack([tool, tool])
     if part == "tool":
-        later_tool = average_pose(invert(station @ arm[cut:]) @ measured[cut:])
+        tools[1] = average_pose(invert(station @ arm[cut:]) @ measured[cut:])
     else:
-        later_station = average_pose(measured[cut:] @ invert(arm[cut:] @ tool))
-    after = np.arange(len(arm)) >= cut
-    everywhere = np.ones(len(arm))
-    unchanged = SUBJECTS[part == "tool"]
-    scale = applied = np.ones(TWIST)
+        stations[1] = average_pose(measured[cut:] @ invert(arm[cut:] @ tool))
+    after = (np.arange(len(arm)) >= cut).astype(int)
+    scale = np.ones(TWIST)
     for _ in range(ITERATIONS):
-        stations = np.where(after[:, None, None], later_station, station)
-        tools = np.where(after[:, None, None], later_tool, tool)
-        twists = _twists(arm, measured, stations, tools, scale)
-        before = 1.0 - after
-        early_columns = twists.columns(part, before)
-        late_columns = twists.columns(part, after)
-        matrix = np.hstack([early_columns, late_columns, twists.columns(unchanged, everywhere)])
-        change = np.linalg.lstsq(matrix, twists.error.ravel())[0]
+        twists = _twists(arm, measured, stations[after], tools[after], scale)
+        change = np.linalg.lstsq(_parted_columns(twists, part, after), twists.error.ravel())[0]
         early, late, common = map(_motion, np.split(change, 3))
         if part == "tool":
-            tool, later_tool = tool @ early, later_tool @ late
-            station = later_station = station @ common
+            tools = tools @ np.stack([early, late])
+            stations = stations @ common
         else:
-            station, later_station = station @ early, later_station @ late
-            tool = later_tool = tool @ common
-        applied = scale
+            stations = stations @ np.stack([early, late])
+            tools = tools @ common
         scale = _scale(twists.error * scale)
-    residual = (twists.error.ravel() - matrix @ change).reshape(-1, TWIST)
-    squares = float(np.sum(residual**2))
-    dof = residual.size - matrix.shape[1]
-    covariance = scipy.linalg.pinvh(matrix.T @ matrix) * squares / dof
+    twists = _twists(arm, measured, stations[after], tools[after], scale)
+    matrix = _parted_columns(twists, part, after)
+    squares = float(np.sum(twists.error**2))
+    dof = len(matrix) - matrix.shape[1]
+    covariance = np.linalg.pinv(matrix.T @ matrix, hermitian=True) * (squares / dof)
     difference = np.hstack([-np.eye(TWIST), np.eye(TWIST)])
     covariance = difference @ covariance[:PLACED, :PLACED] @ difference.T
-    jump = invert(tool) @ later_tool
+    jump = invert(tools[0]) @ tools[1]
     if part == "station":
-        jump = station @ invert(later_station)
-        adjoint = np.linalg.inv(_adjoints(station[None])[0])
+        jump = stations[0] @ invert(stations[1])
+        adjoint = np.linalg.inv(_adjoints(stations[:1])[0])
         covariance = adjoint @ covariance @ adjoint.T
     turn = Rotation.from_matrix(jump[:3, :3]).as_rotvec()
     shift = jump[:3, 3]
-    size = residual * applied
+    size = twists.error * scale
     rms = np.sqrt(np.mean(np.sum(size[:, :3] ** 2, axis=1) + LEVER**2 * np.sum(size[:, 3:] ** 2, axis=1)))
     return Step(
         cut,
@@ -308,6 +300,23 @@ def _estimated(arm: np.ndarray, measured: np.ndarray, cut: int, part: str, first
         float(np.linalg.norm(shift)),
         _sigma_along(shift, covariance[:3, :3]),
     )
+
+
+def _parted_columns(twists: Twists, part: str, after: np.ndarray) -> np.ndarray:
+    """Return the columns (6 m, 18) of a part before and after a step, and of the other part.
+
+    Args:
+        twists: errors of m rows.
+        part: the part that has the step.
+        after: (m,) 1 at the rows after the step, else 0.
+    """
+    constant = SUBJECTS[part == "tool"]
+    columns = (
+        twists.columns(part, 1 - after),
+        twists.columns(part, after),
+        twists.columns(constant, np.ones(len(after))),
+    )
+    return np.hstack(columns)
 
 
 def _sigma_along(vector: np.ndarray, covariance: np.ndarray) -> float:
