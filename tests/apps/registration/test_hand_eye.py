@@ -281,9 +281,30 @@ def test_too_few_pairs_are_refused(tmp_path):
             calib.hand_eye(None, table(tmp_path / "pairs.csv", robot[:count], seen[:count]))
 
 
-def test_turns_about_one_axis_leave_positions_open(tmp_path):
+def test_failed_frames_are_not_for_use(tmp_path, capsys):
+    """With the verdict fail no frame is written for a controller or into a URDF; the verdict states an error once."""
+    robot, seen = sampled(6, 14)
+    path = table(tmp_path / "pairs.csv", robot, seen[np.random.default_rng(0).permutation(14)])
+    urdf = tmp_path / "with_camera.urdf"
+    options = tmp_path / "options.toml"
+    options.write_text('[camera]\nmounting = "in hand"')
+    command = ["hand-eye", "ur5", str(path), "--for", "krl", "--urdf", str(urdf), "--options", str(options)]
+    assert run(command) == 1
+    text = capsys.readouterr().out
+    assert "no frames are printed or written for use: the verdict is fail" in text
+    assert "KUKA" not in text and not urdf.exists() and "nominal" not in text
+    with pytest.raises(UsageError, match="the verdict is fail"):
+        calib.hand_eye(None, path).urdf()
+    table(path, robot[:1], seen[:1])
+    assert run(["hand-eye", str(path)]) == 2 and "1 pair of poses" in capsys.readouterr().err
+
+
+def test_turns_about_one_axis_leave_positions_open(tmp_path, capsys):
     """With turns about one axis only, positions are not identifiable, and no frame is offered for use."""
     path = table(tmp_path / "pairs.csv", *sampled(8, turns=(0.0, 0.0, 1.0)))
+    assert run(["hand-eye", str(path), "--for", "krl"]) == 3
+    text = capsys.readouterr().out
+    assert "x y z not identifiable, not identifiable, not identifiable mm" in text and "KUKA" not in text
     fit = calib.hand_eye(None, path)
     assert "about one axis only" in str(fit) and "URDF:" not in str(fit)
     for frame in fit.transforms:
