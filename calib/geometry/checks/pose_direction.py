@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, Poses
 from calib.errors import Finding, finding
-from calib.geometry.checks import pose_steps
+from calib.geometry.checks import pose_steps, row_lags
 from calib.geometry.first_guess import LEVER, checked_rows, chordal_turns, misfit, place_pose
 from calib.records import evenly
 from calib.robot.chain import Chain
@@ -103,7 +103,7 @@ def median_misfit(arm: np.ndarray, measured: np.ndarray) -> float:
 
 
 def _misfits_of_parts(arm: np.ndarray, measured: np.ndarray) -> Iterator[float]:
-    """Yield the median misfits of parts of the rows, and of rows paired with the next and the previous pose."""
+    """Yield the median misfits of parts of the rows, and of rows that lag behind the arm's or lead them."""
     m = len(arm)
     if m < 2 * MIN_PART:
         return
@@ -114,8 +114,13 @@ def _misfits_of_parts(arm: np.ndarray, measured: np.ndarray) -> Iterator[float]:
         for start in range(0, size * count, size):
             stop = start + size
             yield median_misfit(arm[start:stop], measured[start:stop])
-    yield median_misfit(arm[1:], measured[:-1])
-    yield median_misfit(arm[:-1], measured[1:])
+    lag = row_lags.last_lag(arm, measured)
+    if lag:
+        first = row_lags.first_of_lag(arm, measured, lag)
+        partners = np.arange(first, m) + lag
+        present = (partners >= 0) & (partners < m)
+        if present.sum() >= MIN_PART:
+            yield median_misfit(arm[partners[present]], measured[first:][present])
 
 
 def _motion(poses: np.ndarray) -> float:

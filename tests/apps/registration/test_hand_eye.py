@@ -262,6 +262,21 @@ def test_first_of_two_turns_is_named(tmp_path):
     assert "rows 1–8 and 9–" in text
 
 
+@pytest.mark.parametrize(("lag", "first"), [(3, 0), (-1, 8)])
+def test_rows_that_lag_are_named_with_the_first_of_them(tmp_path, lag, first):
+    """Camera rows that lag behind the robot's, or lead them, are named with lag and row, whichever the mounting."""
+    robot, seen = sampled(10, 24, in_hand=lag > 0)
+    lost = range(first, first + abs(lag))
+    if lag > 0:
+        robot, seen = robot[:-lag], np.delete(seen, lost, axis=0)
+    else:
+        robot, seen = np.delete(robot, lost, axis=0), seen[:lag]
+    fit = calib.hand_eye(None, table(tmp_path / "pairs.csv", robot, seen))
+    assert fit.verdict == "fail"
+    rows = f"{abs(lag)} row{'s' * (abs(lag) > 1)} further {'down' if lag > 0 else 'up'} from row {first + 1} on"
+    assert f"with the robot's poses {rows}" in str(fit)
+
+
 def test_mounting_that_nothing_says_is_asked_for(tmp_path):
     """Poses that agree as they are may be of a board on the arm, or of a camera in the board: it is asked."""
     path = table(tmp_path / "pairs.csv", *sampled(7, in_hand=False))
