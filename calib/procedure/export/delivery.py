@@ -331,7 +331,10 @@ def deliver(export: Export, out: Path) -> list[str]:
         for file in export.files:
             try:
                 notes.extend(file.write(export, staging / file.name))
-            except (geometry.NoSuchArm, NoOffsets) as error:
+            except geometry.NoSuchArm:
+                # a file for arms of another maker
+                continue
+            except NoOffsets as error:
                 notes.append(f"{file.name}: left out: {error}")
 
     write_staged(out, [file.name for file in export.files], write)
