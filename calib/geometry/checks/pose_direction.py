@@ -17,15 +17,7 @@ import numpy as np
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.errors import Finding, finding
 from calib.geometry.checks import pose_steps, row_lags
-from calib.geometry.first_guess import (
-    LEVER,
-    Placements,
-    checked_rows,
-    chordal_turns,
-    misfit,
-    place_pose,
-    place_position,
-)
+from calib.geometry.first_guess import LEVER, checked_rows, chordal_turns, misfit, place_pose, place_position
 from calib.records import evenly
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -185,7 +177,7 @@ def parted_set_up(chain: Chain, block: PoseMeasurements) -> list[Finding]:
         chain: the nominal arm.
         block: measurements of any kind; only positions and full poses are tested.
     """
-    if not isinstance(block, Positions) or len(block) > MAX_ROWS or np.ptp(block.tool, initial=0) > 0:
+    if not isinstance(block, Positions) or not 2 * MIN_PART <= len(block) <= MAX_ROWS or np.ptp(block.tool) > 0:
         return []
     arm = forward(chain, block.q)
     if isinstance(block, Poses):
@@ -258,13 +250,7 @@ def _parted_positions(block: Positions, arm: np.ndarray) -> list[Finding]:
 
 
 def _parted(
-    block: PoseMeasurements,
-    cut: int,
-    end: int,
-    sizes: tuple[float, float],
-    changed: str,
-    turned: str,
-    moved: str,
+    block: PoseMeasurements, cut: int, end: int, sizes: tuple[float, float], changed: str, turned: str, moved: str
 ) -> Finding:
     """Return the finding of a changed set-up.
 
