@@ -377,7 +377,8 @@ class _Rows:
             self.counts.append(np.array(good, bool))
         cell = fit.cell
         if terms:
-            cell = replace(cell, deflection=Deflection(terms, np.zeros(len(terms)), selection.nominal.cell.chain))
+            reference = selection.reference or selection.nominal.cell.chain
+            cell = replace(cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
         table = layout(cell)
         terms_index = table.index("deflection")
         geometry = np.flatnonzero(~np.isin(fit.free, terms_index))
