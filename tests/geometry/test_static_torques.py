@@ -157,11 +157,13 @@ def test_rows_of_a_swinging_arm_are_named_and_replaced(chain, folder):
 
 
 def test_friction_at_rest_is_smoothed_by_the_masses(chain, tmp_path):
-    """Torques of motors: friction of either sign is in each; the masses' torques are nearer to gravity than they are."""
+    """Torques of motors: friction of either sign is in each; those of the fitted masses are nearer to gravity."""
     arm = GivingArm(seed=3, friction=0.08)
     measured = block(arm.write(tmp_path / "motors.csv", arm.table(80, 1)))
     fit, findings = gravity_fit(chain, [measured])
-    clean, _ = gravity_fit(chain, [block(GivingArm(seed=3).write(tmp_path / "clean.csv", GivingArm(seed=3).table(80, 1)))])
+    clean, _ = gravity_fit(
+        chain, [block(GivingArm(seed=3).write(tmp_path / "clean.csv", GivingArm(seed=3).table(80, 1)))]
+    )
     assert findings == []
     truth = driven(measured, clean, MODELLED).torque
     errors = [np.abs(driven(measured, fit, source).torque - truth).mean() for source in ("measured", MODELLED)]

@@ -1,7 +1,7 @@
-"""An arm with joints and links that give under gravity, simulated by Pinocchio alone: poses, and torques of its sensors.
+"""An arm whose joints and links give under gravity, simulated by Pinocchio alone: poses, and torques of its sensors.
 
-It shares no code with the toolkit: kinematics, gravity and payloads are Pinocchio's; joints turn by c τ, and bearings tilt
-by c times the moment across the joint's axis.
+It shares no code with the toolkit: kinematics, gravity and payloads are Pinocchio's; joints turn by c τ, and bearings
+tilt by c times the moment across the axis.
 """
 
 from dataclasses import dataclass

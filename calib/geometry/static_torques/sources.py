@@ -16,14 +16,13 @@ from calib.geometry.static_torques.gravity_fit import (
     GravityFit,
     carried_load,
 )
+from calib.geometry.static_torques.load_errors import SAME_LOAD, load_masses
 from calib.robot.calibrated import BY_TORQUE, Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import gravity_torques
 
 # sources of the torques that drive the compliance
 MEASURED, MODELLED = "measured", "modelled"
-# [kg] change of a load that is stated
-LEAST_CHANGE = 0.05
 
 
 def gravity_of(chain: Chain, q: np.ndarray, load: np.ndarray | None = None) -> np.ndarray | None:
@@ -106,9 +105,7 @@ def load_findings(block: PoseMeasurements, gravity: GravityFit) -> list[Finding]
     return findings
 
 
-def torques_used(
-    deflection: Deflection, gravity: GravityFit | None, source: str
-) -> list[Finding]:
+def torques_used(deflection: Deflection, gravity: GravityFit | None, source: str) -> list[Finding]:
     """Return a finding on the source of the torques that drive the compliance; none without compliance by torques.
 
     Args:
@@ -135,21 +132,14 @@ def load_changes(fitted: Sequence[PoseMeasurements], unseen: Sequence[PoseMeasur
         fitted: the fitted blocks.
         unseen: blocks that were not fitted.
     """
-    masses = sorted({_carried_mass(block) for block in fitted})
+    masses = load_masses(fitted)
     findings = []
     for block in unseen:
-        mass = _carried_mass(block)
+        (mass,) = load_masses([block])
         nearest = min(masses, key=lambda fitted_mass: abs(fitted_mass - mass), default=mass)
-        if abs(mass - nearest) > LEAST_CHANGE:
+        if abs(mass - nearest) > SAME_LOAD:
             findings.append(finding("load-changed", file=Path(block.file).name, mass=mass, fitted=nearest))
     return findings
-
-
-def _carried_mass(block: PoseMeasurements) -> float:
-    """Return the mean mass [kg] that the arm carries in a block beyond its masses; 0 if none is known."""
-    if block.load is None:
-        return 0.0
-    return round(float(block.load[:, 3].mean()), 2)
 
 
 def _differs(gravity: GravityFit, mass: float, sigma: float, reference: float) -> bool:

@@ -23,6 +23,7 @@ from calib.geometry.model_choice.folds import folds_by_name
 from calib.geometry.model_choice.ladder import MIN_GAIN, RIGID_MODELS, ModelSelection, select_model
 from calib.geometry.observability import unidentified
 from calib.geometry.observation import fixed_parameters, stated_prior
+from calib.geometry.static_torques.load_errors import DESCRIBED, WEIGHED
 from calib.geometry.static_torques.sources import MODELLED, torques_used
 from calib.geometry.weighing import GeometricFit, Settings, calibrated_chain
 from calib.procedure.findings import Verdict, level_of, sentence, settle
@@ -211,7 +212,8 @@ def run(
     findings = replace(findings, joint_range=measured_range)
 
     progress("estimating the expected errors")
-    expected = learn_errors(selection, inputs.fit, settings.seed)
+    mass_doubt = DESCRIBED if inputs.gravity is None else WEIGHED
+    expected = learn_errors(selection, inputs.fit, settings.seed, mass_doubt)
     if expected is not None:
         findings = replace(findings, discrepancy=expected.discrepancy)
     plain = plain_reference(nominal, inputs)
