@@ -23,8 +23,8 @@ from calib.errors import TaskLost, UsageError, as_ours, require
 from calib.estimation.estimate import Estimate
 from calib.estimation.robust import Loss, check_loss
 from calib.geometry.observation import pose_sigmas
+from calib.geometry.static_torques.sources import gravity_of
 from calib.procedure.kinematic_stage import fit, folder, inputs, selection
-from calib.procedure.kinematic_stage.inputs import gravity_of
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import prediction
 from calib.procedure.measuring.measuring_run import write_run
