@@ -72,6 +72,39 @@ def log(sessions: list[Path], out: Folder = None, plots: Plots = True, mixed: bo
     _shown(robot_log.log(sessions, mixed=mixed), out, plots, result=True)
 
 
+@command(app, "Dynamics")
+def update(
+    folder: Path,
+    logs: list[str],
+    out: Annotated[Path, typer.Option(help="folder for the updated model, its report and its state")],
+    options: Annotated[Path | None, typer.Option(help="TOML of the identification: gains, columns, payloads")] = None,
+    enough: Annotated[float | None, typer.Option(min=0.0, metavar="PERCENT")] = None,
+    plots: Plots = True,
+) -> None:
+    """Update identified dynamics by LOGS of production, one after another; friction and gains drift with date.
+
+    Each log is predicted before it is learnt from. One that is not as predicted (a load that was not stated, other
+    friction, another unit, another arm) is named with its cause, and not averaged in.
+
+    Example: calib update dynamics log_2026-03-14.csv log_2026-03-21.csv --out dynamics-march
+
+    Args:
+        folder: folder of calib identify, or of an earlier update
+        logs: recordings of q and torque or current, with their dates in their names
+        enough: stop when one sigma of no parameter moves more than this share of the torque
+    """
+    from calib.apps.monitoring.learning.update import update_dynamics
+    from calib.cli.shared import progress
+
+    with progress() as show:
+        updated = update_dynamics(folder, logs, options=options, enough=enough, progress=show)
+        show("writing")
+        updated.save(out, plots=plots)
+    say(*updated.renderables())
+    say(f"written to {out}")
+    exit_failed(updated.verdict.level)
+
+
 def _shown(outcome: Any, out: Path | None, plots: Plots, result: bool = False) -> None:
     """Print a result, write it to the folder `out` if one is given, and exit with code 1 if its verdict is fail.
 
