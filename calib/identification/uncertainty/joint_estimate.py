@@ -1,0 +1,573 @@
+"""Joint estimate of geometry and dynamics from torques: most probable values, and covariance.
+
+Two stages, a geometric fit and an identification on its geometry, use the torques for the dynamics alone. But torques
+depend on the geometry, too: gravity shows the offsets of joints 2 to n - 1, and a known payload shows them well. With g
+the values of the chain's elements and two tilts of gravity, χ the standard parameters of bodies and drives, and y the
+torques, this module minimises
+
+    ‖(y - (1 + ε) W(g) χ) / σ‖² + (g - ĝ)ᵀ Σ⁻¹ (g - ĝ) + D(χ) + ‖ε / σ_ε‖² + ‖(m(χ) - m₀) / σ_m‖²,
+
+with ĝ and Σ the result of the geometric fit, i.e. all that measured poses say, D the prior of physically consistent
+bodies (`calib.identification.physical_consistency.solve`) to second order, ε the gains of the torque rows, and m the
+mass and first moments of payloads whose values are stated. The method is Gauss-Newton with rows [W, W χ, ∂(W χ)/∂g];
+its start is the result of the two stages. All standard parameters are estimated, not base parameters, since their
+regrouping depends on the geometry: with bodies that cannot exist, small changes of lengths would have large effects.
+
+Residuals of recorded torques are correlated. Their weights account for the autocorrelation within a row
+(`calib.estimation.whiteness.inflation`); in addition, the scores of blocks of time are compared with the variance that
+these weights state (sandwich estimator; Liang and Zeger 1986), and a larger one widens the information.
+
+The covariance of all parameters is (A + Λ)⁻¹, A the information of the torques, Λ that of the priors. By the inverse of
+a partitioned matrix, the dynamics' part is Σ_torque + S Σ_g Sᵀ with Σ_g the covariance of the geometry after the
+torques, S as in `calib.identification.uncertainty.geometry_uncertainty`, and the part of both is S Σ_g.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+from scipy.spatial.transform import Rotation
+from scipy.special import chdtrc
+
+from calib.data.signals.filtering import Decimator, kept
+from calib.dynamics import rigid_body
+from calib.dynamics.torque_rows import BODIES
+from calib.estimation.base_columns import split_columns
+from calib.geometry.fit import PLAUSIBLE, TYPICAL
+from calib.identification.identify import Identification, common_decimator
+from calib.identification.physical_consistency.information import of as information_of
+from calib.identification.physical_consistency.solve import find_possible
+from calib.identification.rows import Case, observe
+from calib.identification.settings import IdentificationSettings, Payload, make_bodies, make_model
+from calib.identification.uncertainty.geometry_uncertainty import STEP, TILTS
+from calib.records import Frozen
+from calib.robot.calibrated import CalibratedChain
+from calib.robot.chain import Chain, random_joints
+from calib.robot.kinematics import forward, jacobian
+
+TILT = 0.01
+"""Standard deviation of gravity's direction in the base frame [rad] (our choice): a base that was levelled by eye."""
+GAIN = 0.01
+"""Standard deviation of the gain of a torque row from 1 (our choice): torque sensors, torque constants."""
+MASS_SHARE = 0.005
+"""Standard deviation of a payload's stated mass, as a share of it (our choice)."""
+CENTRE = 1e-3
+"""Standard deviation of a payload's stated centre of mass [m] (our choice)."""
+POSTURES = 100
+"""Random postures in which effects of elements are compared (our choice)."""
+DEPENDENT = 1e-6
+"""Relative size of the independent part of an effect below which it counts as dependent."""
+ROUNDS = 8
+"""Linearisations at most."""
+SETTLED = 0.02
+"""Change of every element in units of its σ that ends the rounds."""
+FOLDS = 4
+"""Folds of held-out blocks (our choice)."""
+PIECES = 2 * FOLDS
+"""Contiguous pieces of time of which the folds consist."""
+NEGLIGIBLE = 1e-9
+"""Relative variance that counts as zero."""
+BLOCKS = 40
+"""Blocks of time whose scores are compared, about (our choice)."""
+MIN_DATA_SHARE = 0.5
+"""Share of the prior variance by which the torques reduce that of an element that they show (our choice)."""
+FIRST_MOMENTS = slice(6, 10)
+"""MX, MY, MZ and M among the ten standard parameters of a body."""
+
+FIXED = 1e12
+"""Precision of a parameter that the identification fixes, relative to that of its data."""
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class JointEstimate(Frozen):
+    """Geometry after the torques, beside its prior.
+
+    Attributes:
+        elements, units: names and units of the K free elements and tilts of gravity.
+        index: (K,) index of each in the chain's elements; tilts follow the last element.
+        before, after: (K,) values before (the geometric fit's, or nominal ones) and after the torques [m or rad].
+        prior, covariance: (K, K) covariance of the values before and after.
+        widening: factor by which the variance of the torques' information was raised, as blocks of time ask for.
+        held_out: squared torque errors on held-out blocks of time, over those with the geometry before.
+        rounds: number of linearisations.
+        gains, gain_sigma: (rows,) gains of the torque rows, measured over true torques, and their standard deviations.
+    """
+
+    elements: tuple[str, ...]
+    units: tuple[str, ...]
+    index: tuple[int, ...]
+    before: np.ndarray
+    after: np.ndarray
+    prior: np.ndarray
+    covariance: np.ndarray
+    widening: float
+    held_out: float
+    rounds: int
+    gains: np.ndarray
+    gain_sigma: np.ndarray
+
+    @property
+    def change(self) -> np.ndarray:
+        """Change of the values (K,) by the torques [m or rad]."""
+        return np.asarray(self.after - self.before)
+
+    @property
+    def sigma_before(self) -> np.ndarray:
+        """Standard deviation (K,) before the torques [m or rad]."""
+        return np.sqrt(np.diag(self.prior))
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Standard deviation (K,) after the torques [m or rad]."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def identified(self) -> np.ndarray:
+        """Mask (K,) of the values whose variance the torques reduce by at least `MIN_DATA_SHARE`."""
+        return self.sigma**2 < (1.0 - MIN_DATA_SHARE) * self.sigma_before**2
+
+    @property
+    def surprise(self) -> np.ndarray:
+        """Change (K,) in units of its standard deviation if prior and torques agree; 0 where they are equal.
+
+        The variance of the change is that before minus that after the torques.
+        """
+        variance = self.sigma_before**2 - self.sigma**2
+        noticeable = variance > NEGLIGIBLE * self.sigma_before**2
+        return np.where(noticeable, self.change / np.sqrt(np.where(noticeable, variance, 1.0)), 0.0)
+
+    @cached_property
+    def combinations(self) -> tuple[np.ndarray, np.ndarray]:
+        """Share of prior variance that the torques remove (K,), largest first, and change in units of the prior's σ.
+
+        The combinations of elements are independent of each other, before and after the torques.
+        """
+        unit = self.sigma_before
+        values, vectors = np.linalg.eigh(self.prior / np.outer(unit, unit))
+        known = values > NEGLIGIBLE
+        whitening = (vectors[:, known] / np.sqrt(values[known])) / unit[:, None]
+        removed, turn = np.linalg.eigh(np.eye(int(known.sum())) - whitening.T @ self.covariance @ whitening)
+        order = np.argsort(-removed)
+        change = turn.T @ (whitening.T @ self.change)
+        return np.clip(removed, 0.0, 1.0)[order], change[order]
+
+    @property
+    def identified_combinations(self) -> int:
+        """Number of independent combinations of elements that the torques rather than the prior determine."""
+        removed, _ = self.combinations
+        return int(np.sum(removed >= MIN_DATA_SHARE))
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger distance of the torques' geometry from the prior, if both are right."""
+        removed, change = self.combinations
+        shown = removed >= MIN_DATA_SHARE
+        if not shown.any():
+            return 1.0
+        distance = float(np.sum(change[shown] ** 2 / removed[shown]))
+        return float(chdtrc(int(shown.sum()), distance))
+
+
+def prior_of(robot: CalibratedChain) -> np.ndarray:
+    """Return the prior covariance (K + 2, K + 2) of a robot's element values and of the tilts of gravity.
+
+    It is that of the geometric fit. Without a fit, joint offsets have the deviation `PLAUSIBLE` and all other elements
+    between the first and the last joint `TYPICAL`. Elements before and after these place base and tool.
+
+    Args:
+        robot: the robot.
+    """
+    chain = robot.chain
+    count = len(chain.elements)
+    covariance = np.zeros((count + len(TILTS), count + len(TILTS)))
+    tilts = np.arange(count, count + len(TILTS))
+    covariance[tilts, tilts] = TILT**2
+    if robot.covariance is not None:
+        covariance[:count, :count] = robot.covariance
+        return covariance
+    for k in independent_elements(chain):
+        unit = chain.units[k]
+        deviation = TYPICAL[unit]
+        if k in chain.moving:
+            deviation = PLAUSIBLE[unit]
+        covariance[k, k] = deviation**2
+    return covariance
+
+
+def independent_elements(chain: Chain) -> np.ndarray:
+    """Return the elements whose effects on the tip's pose are independent of each other and of base and tool frames.
+
+    Joint offsets are preferred to elements with the same effect.
+
+    Args:
+        chain: the arm.
+    """
+    q = random_joints(chain, POSTURES)
+    motion = jacobian(chain, q)
+    poses = forward(chain, q)
+    count = motion.shape[2]
+    frames = np.zeros((len(q), 6, 12))
+    frames[:, :3, :3] = frames[:, 3:, 3:6] = np.eye(3)
+    frames[:, :3, 3:6] = np.cross(np.eye(3), poses[:, None, :3, 3]).transpose(0, 2, 1)
+    frames[:, :3, 6:9] = frames[:, 3:, 9:] = poses[:, :3, :3]
+    stacked = np.concatenate([frames, motion], axis=2).reshape(-1, 12 + count)
+    others = np.setdiff1d(np.arange(count), chain.moving)
+    groups = [np.arange(12), *(12 + chain.moving[:, None]), *(12 + others[:, None])]
+    factor = np.linalg.qr(stacked, mode="r")
+    independent = split_columns(factor, groups, DEPENDENT).kept
+    return np.sort(independent[independent >= 12] - 12)
+
+
+def changed(chain: Chain, settings: IdentificationSettings, change: np.ndarray) -> tuple[Chain, IdentificationSettings]:
+    """Return the chain and the settings with changed geometry and direction of gravity.
+
+    Args:
+        chain: the arm with K elements.
+        settings: settings of the identification.
+        change: (K + 2,) change of the element values [m or rad], and tilts of gravity [rad].
+    """
+    count = len(chain.elements)
+    gravity = chain.gravity if settings.gravity is None else np.array(settings.gravity)
+    turn = Rotation.from_rotvec([change[count], change[count + 1], 0.0])
+    turned = turn.apply(np.array(gravity))
+    moved = replace(chain.with_values(chain.values + change[:count]), gravity=turned)
+    if settings.gravity is not None:
+        settings = replace(settings, gravity=tuple(turned.tolist()))
+    return moved, settings
+
+
+def updated(
+    robot: CalibratedChain, settings: IdentificationSettings, joint: JointEstimate
+) -> tuple[CalibratedChain, IdentificationSettings]:
+    """Return the robot with the geometry and covariance after the torques, and settings with the estimated gravity.
+
+    Args:
+        robot: the robot before.
+        settings: settings of the identification.
+        joint: the joint estimate.
+    """
+    count = len(robot.chain.elements)
+    change = np.zeros(count + len(TILTS))
+    change[list(joint.index)] = joint.after - joint.before
+    chain, settings = changed(robot.chain, settings, change)
+    covariance = np.zeros((count, count))
+    moved = np.array(joint.index)
+    elements = moved < count
+    index = moved[elements]
+    covariance[np.ix_(index, index)] = joint.covariance[np.ix_(elements, elements)]
+    nominal = robot.nominal or robot.chain
+    return replace(robot, chain=chain, nominal=nominal, covariance=covariance), settings
+
+
+def estimate_jointly(
+    identification: Identification,
+    robot: CalibratedChain,
+    cases: Sequence[Case],
+    start: JointEstimate | None = None,
+    doubted: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> JointEstimate:
+    """Return the geometry after the torques, estimated together with the dynamics.
+
+    Args:
+        identification: the identification on the robot's geometry, with a prior of its parameters.
+        robot: the robot, with the covariance of its geometric fit.
+        cases: training data of the identification.
+        start: an earlier joint estimate, whose geometry the identification used; None: it used that of the robot.
+        doubted: labels of payloads whose stated mass and centre are not used.
+        progress: called with a short text at each round; None: not called.
+    """
+    say = progress or (lambda text: None)
+    chain = robot.chain
+    prior = prior_of(robot)
+    free = np.flatnonzero(np.diag(prior) > 0.0)
+    settings = identification.settings
+    change = np.zeros(len(free))
+    if start is not None:
+        change = start.after - start.before
+        backwards = np.zeros(len(prior))
+        backwards[free] = -change
+        _, settings = changed(chain, settings, backwards)
+    problem = _Problem(identification, settings, chain, tuple(cases), free, prior[np.ix_(free, free)], tuple(doubted))
+    values = problem.start()
+    for rounds in range(1, ROUNDS + 1):
+        say(f"geometry and dynamics together, round {rounds}")
+        products = problem.products(change, values)
+        solution = problem.solve(products, 1.0)
+        step = solution.change - change
+        change, values = solution.change, solution.values
+        if (np.abs(step) < SETTLED * np.sqrt(np.diag(solution.covariance))).all():
+            break
+    widening = problem.widening(products, change, values)
+    solution = problem.solve(products, widening)
+    names = (*chain.names, *TILTS)
+    units = (*chain.units, *(["rad"] * len(TILTS)))
+    before = np.append(chain.values, np.zeros(len(TILTS)))[free]
+    return JointEstimate(
+        elements=tuple(names[k] for k in free),
+        units=tuple(units[k] for k in free),
+        index=tuple(free.tolist()),
+        before=before,
+        after=before + solution.change,
+        prior=problem.prior,
+        covariance=solution.covariance,
+        widening=widening,
+        held_out=problem.held_out(products, widening),
+        rounds=rounds,
+        gains=1.0 + solution.values[-len(solution.gain_sigma) :],
+        gain_sigma=solution.gain_sigma,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    change: np.ndarray
+    values: np.ndarray
+    covariance: np.ndarray
+    gain_sigma: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    identification: Identification
+    settings: IdentificationSettings
+    chain: Chain
+    cases: tuple[Case, ...]
+    free: np.ndarray
+    prior: np.ndarray
+    doubted: tuple[str, ...]
+
+    @property
+    def computed(self) -> np.ndarray:
+        """Indices of the model's columns that are computed anew: the bodies', and regrouped ones of drives."""
+        base = self.identification.base
+        inertial = self.identification.dynamics.model.inertial
+        dropped = np.setdiff1d(np.arange(len(base.standard)), base.kept)
+        return np.concatenate([np.arange(inertial), dropped[dropped >= inertial]])
+
+    @property
+    def columns(self) -> np.ndarray:
+        """Indices of the drives' columns among those of the identification's rows."""
+        base = self.identification.base
+        inertial = self.identification.dynamics.model.inertial
+        of_drives = np.flatnonzero(base.kept >= inertial)
+        friction = np.arange(base.b, len(self.identification.names))
+        return np.concatenate([of_drives, friction])
+
+    @cached_property
+    def beforehand(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Most probable parameters (p,) of the identification, and precision (p, p) and pull (p,) of their prior.
+
+        The parameters are those of bodies that can exist. Their prior is quadratic about them.
+        """
+        identification = self.identification
+        base = identification.base
+        information = information_of(identification, self.chain)
+        possible = find_possible(information)
+        friction = [identification.dynamics.model.names.index(name) for name in identification.names[base.b :]]
+        drives = base.kept[self.columns[self.columns < base.b]]
+        index = np.concatenate([self.computed, drives, friction]).astype(int)
+        values = possible.dynamics.values
+        factor = information.factor[:, :-1] @ information.transform / possible.doubt
+        target = information.factor[:, -1] / possible.doubt
+        slope = factor.T @ (factor @ values - target)
+        covariance = possible.covariance[np.ix_(index, index)]
+        free = np.diag(covariance) > 0.0
+        precision = np.zeros_like(covariance)
+        data = factor[:, index].T @ factor[:, index]
+        precision[np.ix_(free, free)] = _inverse(covariance[np.ix_(free, free)]) - data[np.ix_(free, free)]
+        precision = _nonnegative((precision + precision.T) / 2.0, np.diag(data))
+        fixed = np.flatnonzero(~free)
+        precision[fixed, fixed] += FIXED * (1.0 + np.diag(data)[fixed])
+        values = values[index]
+        pull = precision @ values + np.where(free, slope[index], 0.0)
+        richer = np.arange(len(index) - len(friction), len(index))
+        if len(richer) and identification.fitted.beforehand is not None:
+            ridges = np.sum(identification.fitted.beforehand**2, axis=0)[base.b :]
+            precision[richer, richer] += ridges
+        return values, precision, pull
+
+    def start(self) -> np.ndarray:
+        """Return the parameters (p,) to start with, then the gains' deviations (rows,) from 1."""
+        return np.concatenate([self.beforehand[0], np.zeros(len(self.identification.fitted.std))])
+
+    @cached_property
+    def parameters_prior(self) -> tuple[np.ndarray, np.ndarray]:
+        """Precision and pull of the prior of parameters and gains, with those of stated payloads."""
+        _, of_parameters, pull = self.beforehand
+        gains = np.full(len(self.identification.fitted.std), GAIN**-2.0)
+        precision = scipy.linalg.block_diag(of_parameters, np.diag(gains))
+        pull = np.concatenate([pull, np.zeros(len(gains))])
+        bodies = self.identification.dynamics.model.bodies
+        for label, payload in self.settings.payloads.items():
+            if payload.parameters is None or label in self.doubted:
+                continue
+            first = 10 * bodies.labels.index(label)
+            moments = np.arange(first, first + 10)[FIRST_MOMENTS]
+            information, stated = payload_information(payload)
+            precision[np.ix_(moments, moments)] += information
+            pull[moments] += information @ stated
+        return precision, pull
+
+    def products(self, change: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the products (blocks, P + 1, P + 1) of whitened rows [W, ∂(W χ)/∂g, y], y with the change's effect."""
+        identification = self.identification
+        whole = np.zeros(len(self.chain.elements) + len(TILTS))
+        whole[self.free] = change
+        chain, settings = changed(self.chain, self.settings, whole)
+        model = make_model(chain, settings)
+        decimator = common_decimator(self.cases, settings)
+        inertial = model.inertial
+        columns = self.columns
+        row_count = len(identification.fitted.std)
+        deviation = np.array(identification.fitted.std) * np.sqrt(identification.fitted.inflation)
+        total = sum(len(rows.target) for rows in identification.rows)
+        result = []
+        for case, rows in zip(self.cases, identification.rows):
+            observed = observe(model, self.computed, case, decimator)
+            slopes = self._slopes(chain, settings, case, decimator, values[:inertial])
+            target = rows.target + slopes @ change
+            of_parameters = np.concatenate([observed.matrix, rows.matrix[:, :, columns]], axis=2)
+            predicted = of_parameters @ values[: of_parameters.shape[2]]
+            gains = predicted[:, :, None] * np.eye(row_count)
+            matrix = np.concatenate([of_parameters, gains, slopes, target[:, :, None]], axis=2)
+            matrix *= (rows.weight / deviation)[:, :, None]
+            count = max(1, round(BLOCKS * len(matrix) / total))
+            for part in np.array_split(matrix, count):
+                flat = part.reshape(-1, part.shape[2])
+                result.append(flat.T @ flat)
+        return np.array(result)
+
+    def _slopes(
+        self, chain: Chain, settings: IdentificationSettings, case: Case, decimator: Decimator, values: np.ndarray
+    ) -> np.ndarray:
+        """Return ∂(W χ)/∂g (M, rows, K) at the decimated samples."""
+        index = kept(case.motion.segment, decimator)
+        states = [np.asarray(series[index]) for series in case.links]
+        model = make_model(chain, settings)
+        parameters = values * model.carried_columns(case.carried)
+        slopes = np.zeros((len(index), model.bodies.n, len(self.free)))
+        for column, element in enumerate(self.free):
+            for sign in (1.0, -1.0):
+                step = np.zeros(len(chain.elements) + len(TILTS))
+                step[element] = sign * STEP
+                bodies = make_bodies(*changed(chain, settings, step))
+                torque = rigid_body.inverse_dynamics(bodies, parameters, *states)
+                slopes[:, :, column] += sign / (2.0 * STEP) * torque
+        acts = (BODIES,) * len(self.free)
+        return model.torque_rows.observe(slopes, acts, states[0], states[1])
+
+    def solve(self, products: np.ndarray, widening: float, freed: bool = True) -> _Solution:
+        """Return the solution of one linearisation.
+
+        Args:
+            products: products of whitened rows.
+            widening: factor of the torques' variance.
+            freed: whether the geometry is estimated; otherwise it is that before the torques.
+        """
+        total = products.sum(axis=0) / widening
+        p = len(total) - 1 - len(self.free)
+        matrix = total[:-1, :-1].copy()
+        right = total[:-1, -1].copy()
+        precision, pull = self.parameters_prior
+        matrix[:p, :p] += precision
+        right[:p] += pull
+        matrix[p:, p:] += _inverse(self.prior)
+        if not freed:
+            matrix, right = matrix[:p, :p], right[:p]
+        unit = np.sqrt(np.diag(matrix))
+        factor = scipy.linalg.cho_factor(matrix / np.outer(unit, unit))
+        solution = np.zeros(len(total) - 1)
+        solution[: len(unit)] = scipy.linalg.cho_solve(factor, right / unit) / unit
+        covariance = scipy.linalg.cho_solve(factor, np.eye(len(unit))) / np.outer(unit, unit)
+        gain_sigma = np.sqrt(np.diag(covariance)[p - len(self.identification.fitted.std) : p])
+        return _Solution(solution[p:], solution[:p], covariance[p:, p:], gain_sigma)
+
+    def _geometric(self, products: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the map (K, P) from scores of all columns to those of the geometry alone, and its information."""
+        total = products.sum(axis=0)
+        p = len(total) - 1 - len(self.free)
+        precision, _ = self.parameters_prior
+        inner = total[:p, :p] + precision
+        unit = np.sqrt(np.diag(inner))
+        factor = scipy.linalg.cho_factor(inner / np.outer(unit, unit))
+        gain = scipy.linalg.cho_solve(factor, total[:p, p:-1] / unit[:, None]) / unit[:, None]
+        selection = np.hstack([-gain.T, np.eye(len(self.free))])
+        information = total[p:-1, p:-1] - total[p:-1, :p] @ gain
+        return selection, (information + information.T) / 2.0
+
+    def widening(self, products: np.ndarray, change: np.ndarray, values: np.ndarray) -> float:
+        """Return the ratio of the scores' variance over blocks of time to the stated one, at least 1."""
+        selection, information = self._geometric(products)
+        solution = np.concatenate([values, change, [-1.0]])
+        scores = -(products @ solution)[:, :-1] @ selection.T
+        root, shown = self._shown(information)
+        projected = scores @ root[:, shown]
+        information_shown = root[:, shown].T @ information @ root[:, shown]
+        observed = np.sum(projected**2, axis=0) / np.diag(information_shown)
+        if not shown.any():
+            return 1.0
+        return float(max(1.0, observed.mean()))
+
+    def _shown(self, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return combinations of elements of unit prior variance (K, K), and the mask of those that torques show."""
+        unit = np.sqrt(np.diag(self.prior))
+        values, vectors = np.linalg.eigh(self.prior / np.outer(unit, unit))
+        half = unit[:, None] * vectors * np.sqrt(np.clip(values, 0.0, None))
+        strengths, turns = np.linalg.eigh(half.T @ information @ half)
+        return half @ turns, strengths > 1.0
+
+    def held_out(self, products: np.ndarray, widening: float) -> float:
+        """Return squared errors on held-out time with the geometry estimated, over those with it unchanged."""
+        fold = (np.arange(len(products)) * PIECES // len(products)) % FOLDS
+        squares = np.zeros(2)
+        for number in range(FOLDS):
+            training, test = products[fold != number], products[fold == number]
+            if not len(training) or not len(test):
+                return 1.0
+            tested = test.sum(axis=0)
+            for k, freed in enumerate((True, False)):
+                solution = self.solve(training, widening, freed)
+                whole = np.concatenate([solution.values, solution.change, [-1.0]])
+                squares[k] += whole @ tested @ whole
+        return float(squares[0] / squares[1])
+
+
+def payload_information(payload: Payload) -> tuple[np.ndarray, np.ndarray]:
+    """Return the precision (4, 4) of a stated payload's MX, MY, MZ [kg m] and M [kg], and their values (4,).
+
+    Args:
+        payload: mass and centre of mass.
+    """
+    stated = np.array(payload.parameters)[FIRST_MOMENTS]
+    mass = stated[3]
+    # an uncertain centre, and an uncertain mass at that centre
+    slopes = np.diag([mass, mass, mass, 1.0])
+    slopes[:3, 3] = stated[:3] / mass
+    half = slopes * np.array([CENTRE, CENTRE, CENTRE, MASS_SHARE * mass])
+    return np.linalg.inv(half @ half.T), stated
+
+
+def _nonnegative(matrix: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Return the nearest positive semidefinite matrix, nearest with rows and columns scaled.
+
+    Args:
+        matrix: (p, p) symmetric.
+        scale: (p,) sizes that its diagonal is compared with.
+    """
+    diagonal = np.maximum(np.abs(np.diag(matrix)), 1e-9 * scale)
+    unit = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
+    half = vectors * np.sqrt(np.clip(values, 0.0, None)) * unit[:, None]
+    return half @ half.T
+
+
+def _inverse(covariance: np.ndarray) -> np.ndarray:
+    """Return the (pseudo-)inverse of a covariance, with rows scaled to unit variance."""
+    unit = np.sqrt(np.diag(covariance))
+    correlation = covariance / np.outer(unit, unit)
+    return np.linalg.pinv(correlation, rcond=1e-10, hermitian=True) / np.outer(unit, unit)
