@@ -25,6 +25,7 @@ torques, S as in `calib.identification.uncertainty.geometry_uncertainty`, and th
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -36,9 +37,10 @@ from calib.dynamics import rigid_body
 from calib.dynamics.torque_rows import BODIES
 from calib.estimation.base_columns import split_columns
 from calib.geometry.fit import PLAUSIBLE, TYPICAL
-from calib.identification.identify import Identification, common_decimator
+from calib.identification.identify import Identification, common_decimator, identify
 from calib.identification.physical_consistency.information import of as information_of
 from calib.identification.physical_consistency.solve import find_possible
+from calib.identification.prior import residual_inflation
 from calib.identification.rows import Case, observe
 from calib.identification.settings import IdentificationSettings, Payload, make_bodies, make_model
 from calib.identification.uncertainty.geometry_uncertainty import STEP, TILTS
@@ -59,6 +61,10 @@ POSTURES = 100
 """Random postures in which effects of elements are compared (our choice)."""
 DEPENDENT = 1e-6
 """Relative size of the independent part of an effect below which it counts as dependent."""
+PASSES = 6
+"""Joint estimates, each with the weights and the prior of an identification on the geometry of the last, at most."""
+PASS_SETTLED = 0.2
+"""Change of every element in units of its σ that ends the passes (our choice)."""
 ROUNDS = 8
 """Linearisations at most."""
 SETTLED = 0.02
@@ -70,7 +76,9 @@ PIECES = 2 * FOLDS
 NEGLIGIBLE = 1e-9
 """Relative variance that counts as zero."""
 BLOCKS = 40
-"""Blocks of time whose scores are compared, about (our choice)."""
+"""Blocks of time, about, whose products of rows are kept (our choice)."""
+BLOCK_COUNTS = (40, 20, 10)
+"""Numbers of blocks whose scores are compared (our choice)."""
 MIN_DATA_SHARE = 0.5
 """Share of the prior variance by which the torques reduce that of an element that they show (our choice)."""
 FIRST_MOMENTS = slice(6, 10)
@@ -263,6 +271,53 @@ def updated(
     return replace(robot, chain=chain, nominal=nominal, covariance=covariance), settings
 
 
+class JointIdentification(NamedTuple):
+    """Result of geometry and dynamics identified together.
+
+    Attributes:
+        estimate: the geometry.
+        robot: the robot with this geometry and its covariance.
+        identification: the identification on it; its settings have the estimated direction of gravity.
+    """
+
+    estimate: JointEstimate
+    robot: CalibratedChain
+    identification: Identification
+
+
+def identify_jointly(
+    identification: Identification,
+    robot: CalibratedChain,
+    cases: Sequence[Case],
+    settings: IdentificationSettings,
+    doubted: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> JointIdentification:
+    """Return geometry and dynamics identified together, by repeated joint estimates and identifications.
+
+    Errors of the geometry enter the residuals, and thereby the weights and the prior of a first pass; each further pass
+    has those of a better geometry, until the geometry changes by less than `PASS_SETTLED` σ.
+
+    Args:
+        identification: the identification on the robot's geometry.
+        robot: the robot, with the covariance of its geometric fit if it has one.
+        cases: training recordings.
+        settings: settings of the identifications.
+        doubted: labels of payloads whose stated mass and centre are not used.
+        progress: called with a short text at each step; None: not called.
+    """
+    joint = None
+    for _ in range(PASSES):
+        previous = joint
+        joint = estimate_jointly(identification, robot, cases, previous, doubted, progress)
+        moved, moved_settings = updated(robot, settings, joint)
+        identification = identify(moved, cases, moved_settings, progress)
+        if previous is not None and (np.abs(joint.after - previous.after) < PASS_SETTLED * joint.sigma).all():
+            break
+    assert joint is not None
+    return JointIdentification(joint, moved, identification)
+
+
 def estimate_jointly(
     identification: Identification,
     robot: CalibratedChain,
@@ -391,6 +446,16 @@ class _Problem:
             precision[richer, richer] += ridges
         return values, precision, pull
 
+    @cached_property
+    def deviation(self) -> np.ndarray:
+        """Standard deviation (rows,) of the torques [N m or N], raised by the residuals' autocorrelation.
+
+        The identification limits this autocorrelation, since it weighs rows by it; here it states a covariance.
+        """
+        fitted = self.identification.fitted
+        autocorrelation = residual_inflation(self.identification.rows, fitted.estimate.values)
+        return np.array(fitted.std) * np.sqrt(np.maximum(fitted.inflation, autocorrelation))
+
     def start(self) -> np.ndarray:
         """Return the parameters (p,) to start with, then the gains' deviations (rows,) from 1."""
         return np.concatenate([self.beforehand[0], np.zeros(len(self.identification.fitted.std))])
@@ -424,7 +489,7 @@ class _Problem:
         inertial = model.inertial
         columns = self.columns
         row_count = len(identification.fitted.std)
-        deviation = np.array(identification.fitted.std) * np.sqrt(identification.fitted.inflation)
+        deviation = self.deviation
         total = sum(len(rows.target) for rows in identification.rows)
         result = []
         for case, rows in zip(self.cases, identification.rows):
@@ -501,17 +566,25 @@ class _Problem:
         return selection, (information + information.T) / 2.0
 
     def widening(self, products: np.ndarray, change: np.ndarray, values: np.ndarray) -> float:
-        """Return the ratio of the scores' variance over blocks of time to the stated one, at least 1."""
+        """Return the ratio of the scores' variance over blocks of time to the stated one, at least 1.
+
+        Blocks shorter than the time in which errors change underestimate it: the largest ratio of several lengths counts.
+        """
         selection, information = self._geometric(products)
-        solution = np.concatenate([values, change, [-1.0]])
-        scores = -(products @ solution)[:, :-1] @ selection.T
         root, shown = self._shown(information)
-        projected = scores @ root[:, shown]
-        information_shown = root[:, shown].T @ information @ root[:, shown]
-        observed = np.sum(projected**2, axis=0) / np.diag(information_shown)
         if not shown.any():
             return 1.0
-        return float(max(1.0, observed.mean()))
+        directions = root[:, shown]
+        stated = np.einsum("ki,kl,li->i", directions, information, directions)
+        solution = np.concatenate([values, change, [-1.0]])
+        scores = (products @ solution)[:, :-1] @ selection.T @ directions
+        ratios = [1.0]
+        for count in BLOCK_COUNTS:
+            parts = np.array_split(scores, min(count, len(scores)))
+            sums = np.array([part.sum(axis=0) for part in parts])
+            fitted_mean = len(parts) / max(len(parts) - 1, 1)
+            ratios.append(fitted_mean * float(np.mean(np.sum(sums**2, axis=0) / stated)))
+        return max(ratios)
 
     def _shown(self, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return combinations of elements of unit prior variance (K, K), and the mask of those that torques show."""

@@ -317,7 +317,7 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
         settings = replace(settings, friction="standard")
     if settings.with_geometry:
         inputs = replace(inputs, options=replace(inputs.options, settings=settings))
-        return judged(*with_geometry.identify_jointly(inputs, progress or silent), progress=progress)
+        return judged(*with_geometry.run_jointly(inputs, progress or silent), progress=progress)
     return judged(inputs, identify(inputs.robot, inputs.cases, settings, progress), progress=progress)
 
 

@@ -29,7 +29,7 @@ from calib.identification.methods.least_squares import LeastSquares
 from calib.identification.prediction import predict
 from calib.identification.registry import method_named
 from calib.identification.uncertainty.geometry_uncertainty import GeometryUncertainty
-from calib.identification.uncertainty.joint_estimate import JointEstimate, estimate_jointly, updated
+from calib.identification.uncertainty.joint_estimate import JointEstimate, identify_jointly
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.verdict import model_findings
 from calib.robot.calibrated import CalibratedChain
@@ -41,8 +41,6 @@ MAX_HELD_OUT = 1.001
 CONTRADICTION = 1e-4
 # difference of identified and stated mass, as a share, from which on the stated payload is not used (our choice)
 MAX_MASS_ERROR = 0.1
-# passes: the weights of the first one are those of a wrong geometry
-PASSES = 2
 TABLE, COVARIANCE = "geometry_from_torques.csv", "joint_covariance.csv"
 HEADER = ("element", "unit", "before", "sigma_before", "after", "sigma_after", "change", "surprise", "identified")
 
@@ -106,7 +104,7 @@ class GeometryFromTorquesMetrics:
     gains: tuple[tuple[float, float], ...] = ()
 
 
-def identify_jointly(
+def run_jointly(
     inputs: IdentificationInputs, say: Progress
 ) -> tuple[IdentificationInputs, Identification, GeometryFromTorques]:
     """Return the inputs with the robot of the result, its identification, and the geometry from torques.
@@ -125,20 +123,14 @@ def identify_jointly(
         settings = replace(settings, friction=plain.friction.chosen)
     doubted = _doubted_payloads(inputs, plain)
 
-    found, joint = plain, None
-    robot, joint_settings = inputs.robot, settings
-    for _ in range(PASSES):
-        joint = estimate_jointly(found, inputs.robot, inputs.cases, joint, doubted, say)
-        robot, joint_settings = updated(inputs.robot, settings, joint)
-        found = identify(robot, inputs.cases, joint_settings, say)
-    assert joint is not None
+    joint, robot, found = identify_jointly(plain, inputs.robot, inputs.cases, settings, doubted, say)
 
     unseen = _unseen_ratio(inputs, plain, found)
     result = GeometryFromTorques(joint, True, (), unseen)
     noticed = tuple(_objections(result, inputs.robot))
     if noticed:
         return inputs, plain, replace(result, delivered=False, noticed=noticed)
-    options = replace(inputs.options, settings=replace(inputs.options.settings, gravity=joint_settings.gravity))
+    options = replace(inputs.options, settings=replace(inputs.options.settings, gravity=found.settings.gravity))
     return replace(inputs, robot=robot, options=options), found, result
 
 

@@ -616,10 +616,11 @@ def _joint_blocks(jointly: GeometryFromTorquesMetrics | None) -> list[page.Block
         before = f"{1e3 * change.sigma_before:.3g}"
         after = f"{1e3 * change.sigma_after:.3g}"
         shift = f"{1e3 * (change.after - change.before):+.3g}"
-        rows.append([change.element, f"m{change.unit}", shift, before, after, f"{change.surprise:.2g}"])
+        sigmas = f"{(change.after - change.before) / change.sigma_after:+.2g}"
+        rows.append([change.element, f"m{change.unit}", shift, before, after, sigmas])
     blocks: list[page.Block] = [page.Text("Geometry from torques", lines)]
     if rows:
-        header = ("element", "unit", "change", "σ before", "σ after", "change / its σ")
+        header = ("element", "unit", "change", "σ before", "σ after", "change / σ after")
         blocks.append(page.ReportTable("Elements that torques determine", header, rows, numbers=[2, 3, 4, 5]))
     return blocks
 
