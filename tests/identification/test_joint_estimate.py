@@ -77,13 +77,19 @@ def test_no_torque_widens_a_sigma(joint):
 
 
 @pytest.mark.slow
-def test_torques_of_other_joint_zeros_contradict_a_fit(identification, cases):
-    chain = planted.arm()
-    fit = CalibratedChain(chain, covariance=np.diag(np.where(np.array(chain.names) == "shoulder", 1e-5**2, 0.0)))
-    refuted = estimate_jointly(identification, fit, cases)
-    k = refuted.elements.index("shoulder")
-    assert abs(refuted.surprise[k]) > 4.0 or refuted.p_value < 1e-4
-    assert refuted.sigma[k] == pytest.approx(1e-5, rel=0.05), "where torques say little, the fit counts"
+def test_torques_of_other_joint_zeros_are_far_from_a_fit(joint):
+    robot = CalibratedChain(planted.arm(), covariance=np.diag(np.full(6, 1e-10)))
+    k = joint.elements.index("shoulder")
+    assert abs(joint.distances(robot)[k]) > 5.0
+
+
+@pytest.mark.slow
+def test_where_torques_say_little_the_fit_counts(identification, cases):
+    covariance = np.diag(np.where(np.array(planted.arm().names) == "shoulder", 1e-5**2, 0.0))
+    fit = CalibratedChain(planted.arm(), covariance=covariance)
+    after = estimate_jointly(identification, fit, cases)
+    k = after.elements.index("shoulder")
+    assert after.sigma[k] == pytest.approx(1e-5, rel=0.05) and abs(after.change[k]) < 1e-4
 
 
 @pytest.mark.slow
@@ -115,10 +121,10 @@ def test_a_fit_is_its_own_prior():
 
 
 @pytest.mark.slow
-def test_a_doubted_payload_is_no_reference(identification, cases, joint):
+def test_a_doubted_payload_counts_as_one_that_nobody_stated(identification, cases):
     robot = CalibratedChain(planted.arm())
     heavy = replace(SETTINGS, payloads={"load": replace(LOAD, mass=4.0)})
-    doubted = identify_jointly(identification, robot, cases, heavy, ("load",)).estimate
-    k = joint.elements.index("shoulder")
-    assert abs(doubted.change[k] - OFFSET) < 3.0 * doubted.sigma[k]
-    assert doubted.sigma[k] > joint.sigma[k]
+    doubted = estimate_jointly(replace(identification, settings=heavy), robot, cases, doubted=("load",))
+    unstated = replace(SETTINGS, payloads={"load": Payload()})
+    without = estimate_jointly(replace(identification, settings=unstated), robot, cases)
+    assert np.allclose(doubted.change, without.change) and np.allclose(doubted.covariance, without.covariance)

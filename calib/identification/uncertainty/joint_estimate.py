@@ -14,15 +14,18 @@ its start is the result of the two stages. All standard parameters are estimated
 regrouping depends on the geometry: with bodies that cannot exist, small changes of lengths would have large effects.
 
 Residuals of recorded torques are correlated. Their weights account for the autocorrelation within a row
-(`calib.estimation.whiteness.inflation`); in addition, the scores of blocks of time are compared with the variance that
-these weights state (sandwich estimator; Liang and Zeger 1986), and a larger one widens the information.
+(`calib.estimation.whiteness.inflation`); in addition, the scores of groups of rows (blocks of time, and equal velocity
+or position of a joint) are compared with the variance that these weights state, as in a sandwich estimator (Liang and
+Zeger 1986). For each combination of elements, a larger one lowers the weight of the torques beside the prior.
 
 The covariance of all parameters is (A + Λ)⁻¹, A the information of the torques, Λ that of the priors. By the inverse of
 a partitioned matrix, the dynamics' part is Σ_torque + S Σ_g Sᵀ with Σ_g the covariance of the geometry after the
 torques, S as in `calib.identification.uncertainty.geometry_uncertainty`, and the part of both is S Σ_g.
 """
 
-from collections.abc import Callable, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -30,7 +33,6 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg
 from scipy.spatial.transform import Rotation
-from scipy.special import chdtrc
 
 from calib.data.signals.filtering import Decimator, kept
 from calib.dynamics import rigid_body
@@ -77,6 +79,8 @@ NEGLIGIBLE = 1e-9
 """Relative variance that counts as zero."""
 BLOCKS = 40
 """Blocks of time, about, whose products of rows are kept (our choice)."""
+BINS = 10
+"""Groups of equal velocity or position, with equal numbers of rows (our choice)."""
 BLOCK_COUNTS = (40, 20, 10)
 """Numbers of blocks whose scores are compared (our choice)."""
 MIN_DATA_SHARE = 0.5
@@ -99,7 +103,8 @@ class JointEstimate(Frozen):
         index: (K,) index of each in the chain's elements; tilts follow the last element.
         before, after: (K,) values before (the geometric fit's, or nominal ones) and after the torques [m or rad].
         prior, covariance: (K, K) covariance of the values before and after.
-        widening: factor by which the variance of the torques' information was raised, as blocks of time ask for.
+        widening: factor by which the variance of the torques was raised, as groups of rows ask for; median over
+            combinations of elements.
         held_out: squared torque errors on held-out blocks of time, over those with the geometry before.
         rounds: number of linearisations.
         gains, gain_sigma: (rows,) gains of the torque rows, measured over true torques, and their standard deviations.
@@ -156,9 +161,9 @@ class JointEstimate(Frozen):
         """
         unit = self.sigma_before
         values, vectors = np.linalg.eigh(self.prior / np.outer(unit, unit))
-        known = values > NEGLIGIBLE
-        whitening = (vectors[:, known] / np.sqrt(values[known])) / unit[:, None]
-        removed, turn = np.linalg.eigh(np.eye(int(known.sum())) - whitening.T @ self.covariance @ whitening)
+        positive = values > NEGLIGIBLE
+        whitening = (vectors[:, positive] / np.sqrt(values[positive])) / unit[:, None]
+        removed, turn = np.linalg.eigh(np.eye(int(positive.sum())) - whitening.T @ self.covariance @ whitening)
         order = np.argsort(-removed)
         change = turn.T @ (whitening.T @ self.change)
         return np.clip(removed, 0.0, 1.0)[order], change[order]
@@ -169,18 +174,18 @@ class JointEstimate(Frozen):
         removed, _ = self.combinations
         return int(np.sum(removed >= MIN_DATA_SHARE))
 
-    @property
-    def p_value(self) -> float:
-        """Probability of a larger distance of the torques' geometry from the prior, if both are right."""
-        removed, change = self.combinations
-        shown = removed >= MIN_DATA_SHARE
-        if not shown.any():
-            return 1.0
-        distance = float(np.sum(change[shown] ** 2 / removed[shown]))
-        return float(chdtrc(int(shown.sum()), distance))
+    def distances(self, robot: CalibratedChain) -> np.ndarray:
+        """Return the differences (K,) from a robot's values in units of their σ; 0 for what torques do not determine.
+
+        Args:
+            robot: the robot with the covariance of its fit, which these torques did not enter.
+        """
+        variance = np.diag(self.covariance) + np.diag(prior_of(robot))[list(self.index)]
+        distance = self.change / np.sqrt(variance)
+        return np.where(self.identified, distance, 0.0)
 
 
-def prior_of(robot: CalibratedChain) -> np.ndarray:
+def prior_of(robot: CalibratedChain, fitted: bool = True) -> np.ndarray:
     """Return the prior covariance (K + 2, K + 2) of a robot's element values and of the tilts of gravity.
 
     It is that of the geometric fit. Without a fit, joint offsets have the deviation `PLAUSIBLE` and all other elements
@@ -188,16 +193,21 @@ def prior_of(robot: CalibratedChain) -> np.ndarray:
 
     Args:
         robot: the robot.
+        fitted: whether the covariance of its fit is used; otherwise the fitted elements have the deviations of a robot
+            without a fit.
     """
     chain = robot.chain
     count = len(chain.elements)
     covariance = np.zeros((count + len(TILTS), count + len(TILTS)))
     tilts = np.arange(count, count + len(TILTS))
     covariance[tilts, tilts] = TILT**2
+    elements = independent_elements(chain)
     if robot.covariance is not None:
-        covariance[:count, :count] = robot.covariance
-        return covariance
-    for k in independent_elements(chain):
+        if fitted:
+            covariance[:count, :count] = robot.covariance
+            return covariance
+        elements = np.flatnonzero(np.diag(robot.covariance) > 0.0)
+    for k in elements:
         unit = chain.units[k]
         deviation = TYPICAL[unit]
         if k in chain.moving:
@@ -223,8 +233,8 @@ def independent_elements(chain: Chain) -> np.ndarray:
     frames[:, :3, 3:6] = np.cross(np.eye(3), poses[:, None, :3, 3]).transpose(0, 2, 1)
     frames[:, :3, 6:9] = frames[:, 3:, 9:] = poses[:, :3, :3]
     stacked = np.concatenate([frames, motion], axis=2).reshape(-1, 12 + count)
-    others = np.setdiff1d(np.arange(count), chain.moving)
-    groups = [np.arange(12), *(12 + chain.moving[:, None]), *(12 + others[:, None])]
+    constant = np.setdiff1d(np.arange(count), chain.moving)
+    groups = [np.arange(12), *(12 + chain.moving[:, None]), *(12 + constant[:, None])]
     factor = np.linalg.qr(stacked, mode="r")
     independent = split_columns(factor, groups, DEPENDENT).kept
     return np.sort(independent[independent >= 12] - 12)
@@ -242,10 +252,10 @@ def changed(chain: Chain, settings: IdentificationSettings, change: np.ndarray) 
     gravity = chain.gravity if settings.gravity is None else np.array(settings.gravity)
     turn = Rotation.from_rotvec([change[count], change[count + 1], 0.0])
     turned = turn.apply(np.array(gravity))
-    moved = replace(chain.with_values(chain.values + change[:count]), gravity=turned)
+    changed_chain = replace(chain.with_values(chain.values + change[:count]), gravity=turned)
     if settings.gravity is not None:
         settings = replace(settings, gravity=tuple(turned.tolist()))
-    return moved, settings
+    return changed_chain, settings
 
 
 def updated(
@@ -263,9 +273,9 @@ def updated(
     change[list(joint.index)] = joint.after - joint.before
     chain, settings = changed(robot.chain, settings, change)
     covariance = np.zeros((count, count))
-    moved = np.array(joint.index)
-    elements = moved < count
-    index = moved[elements]
+    free = np.array(joint.index)
+    elements = free < count
+    index = free[elements]
     covariance[np.ix_(index, index)] = joint.covariance[np.ix_(elements, elements)]
     nominal = robot.nominal or robot.chain
     return replace(robot, chain=chain, nominal=nominal, covariance=covariance), settings
@@ -291,6 +301,7 @@ def identify_jointly(
     cases: Sequence[Case],
     settings: IdentificationSettings,
     doubted: Sequence[str] = (),
+    fitted: bool = True,
     progress: Progress | None = None,
 ) -> JointIdentification:
     """Return geometry and dynamics identified together, by repeated joint estimates and identifications.
@@ -304,18 +315,19 @@ def identify_jointly(
         cases: training recordings.
         settings: settings of the identifications.
         doubted: labels of payloads whose stated mass and centre are not used.
+        fitted: whether the covariance of the fit is the prior; otherwise torques alone determine the geometry.
         progress: called with a short text at each step; None: not called.
     """
     joint = None
     for _ in range(PASSES):
         previous = joint
-        joint = estimate_jointly(identification, robot, cases, previous, doubted, progress)
-        moved, moved_settings = updated(robot, settings, joint)
-        identification = identify(moved, cases, moved_settings, progress)
+        joint = estimate_jointly(identification, robot, cases, previous, doubted, fitted, progress)
+        updated_robot, updated_settings = updated(robot, settings, joint)
+        identification = identify(updated_robot, cases, updated_settings, progress)
         if previous is not None and (np.abs(joint.after - previous.after) < PASS_SETTLED * joint.sigma).all():
             break
     assert joint is not None
-    return JointIdentification(joint, moved, identification)
+    return JointIdentification(joint, updated_robot, identification)
 
 
 def estimate_jointly(
@@ -324,6 +336,7 @@ def estimate_jointly(
     cases: Sequence[Case],
     start: JointEstimate | None = None,
     doubted: Sequence[str] = (),
+    fitted: bool = True,
     progress: Progress | None = None,
 ) -> JointEstimate:
     """Return the geometry after the torques, estimated together with the dynamics.
@@ -334,11 +347,12 @@ def estimate_jointly(
         cases: training data of the identification.
         start: an earlier joint estimate, whose geometry the identification used; None: it used that of the robot.
         doubted: labels of payloads whose stated mass and centre are not used.
+        fitted: whether the covariance of the fit is the prior; otherwise torques alone determine the geometry.
         progress: called with a short text at each round; None: not called.
     """
     say = progress or (lambda text: None)
     chain = robot.chain
-    prior = prior_of(robot)
+    prior = prior_of(robot, fitted)
     free = np.flatnonzero(np.diag(prior) > 0.0)
     settings = identification.settings
     change = np.zeros(len(free))
@@ -352,13 +366,13 @@ def estimate_jointly(
     for rounds in range(1, ROUNDS + 1):
         say(f"geometry and dynamics together, round {rounds}")
         products = problem.products(change, values)
-        solution = problem.solve(products, 1.0)
+        solution = problem.solve(products)
         step = solution.change - change
         change, values = solution.change, solution.values
         if (np.abs(step) < SETTLED * np.sqrt(np.diag(solution.covariance))).all():
             break
     widening = problem.widening(products, change, values)
-    solution = problem.solve(products, widening)
+    solution = problem.widened(products, solution, widening)
     names = (*chain.names, *TILTS)
     units = (*chain.units, *(["rad"] * len(TILTS)))
     before = np.append(chain.values, np.zeros(len(TILTS)))[free]
@@ -370,8 +384,8 @@ def estimate_jointly(
         after=before + solution.change,
         prior=problem.prior,
         covariance=solution.covariance,
-        widening=widening,
-        held_out=problem.held_out(products, widening),
+        widening=float(np.median(widening)),
+        held_out=problem.held_out(products),
         rounds=rounds,
         gains=1.0 + solution.values[-len(solution.gain_sigma) :],
         gain_sigma=solution.gain_sigma,
@@ -478,20 +492,17 @@ class _Problem:
             pull[moments] += information @ stated
         return precision, pull
 
-    def products(self, change: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the products (blocks, P + 1, P + 1) of whitened rows [W, ∂(W χ)/∂g, y], y with the change's effect."""
+    def whitened_rows(self, change: np.ndarray, values: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield the whitened rows [W, W χ, ∂(W χ)/∂g, y] (M, rows, P + 1) of each case, y with the change's effect."""
         identification = self.identification
-        whole = np.zeros(len(self.chain.elements) + len(TILTS))
-        whole[self.free] = change
-        chain, settings = changed(self.chain, self.settings, whole)
+        of_elements = np.zeros(len(self.chain.elements) + len(TILTS))
+        of_elements[self.free] = change
+        chain, settings = changed(self.chain, self.settings, of_elements)
         model = make_model(chain, settings)
         decimator = common_decimator(self.cases, settings)
         inertial = model.inertial
         columns = self.columns
         row_count = len(identification.fitted.std)
-        deviation = self.deviation
-        total = sum(len(rows.target) for rows in identification.rows)
-        result = []
         for case, rows in zip(self.cases, identification.rows):
             observed = observe(model, self.computed, case, decimator)
             slopes = self._slopes(chain, settings, case, decimator, values[:inertial])
@@ -500,10 +511,16 @@ class _Problem:
             predicted = of_parameters @ values[: of_parameters.shape[2]]
             gains = predicted[:, :, None] * np.eye(row_count)
             matrix = np.concatenate([of_parameters, gains, slopes, target[:, :, None]], axis=2)
-            matrix *= (rows.weight / deviation)[:, :, None]
+            yield matrix * (rows.weight / self.deviation)[:, :, None]
+
+    def products(self, change: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the products (blocks, P + 1, P + 1) of the whitened rows of about `BLOCKS` blocks of time."""
+        total = sum(len(rows.target) for rows in self.identification.rows)
+        result = []
+        for matrix in self.whitened_rows(change, values):
             count = max(1, round(BLOCKS * len(matrix) / total))
-            for part in np.array_split(matrix, count):
-                flat = part.reshape(-1, part.shape[2])
+            for block in np.array_split(matrix, count):
+                flat = block.reshape(-1, block.shape[2])
                 result.append(flat.T @ flat)
         return np.array(result)
 
@@ -526,15 +543,14 @@ class _Problem:
         acts = (BODIES,) * len(self.free)
         return model.torque_rows.observe(slopes, acts, states[0], states[1])
 
-    def solve(self, products: np.ndarray, widening: float, freed: bool = True) -> _Solution:
+    def solve(self, products: np.ndarray, freed: bool = True) -> _Solution:
         """Return the solution of one linearisation.
 
         Args:
             products: products of whitened rows.
-            widening: factor of the torques' variance.
             freed: whether the geometry is estimated; otherwise it is that before the torques.
         """
-        total = products.sum(axis=0) / widening
+        total = products.sum(axis=0)
         p = len(total) - 1 - len(self.free)
         matrix = total[:-1, :-1].copy()
         right = total[:-1, -1].copy()
@@ -565,36 +581,69 @@ class _Problem:
         information = total[p:-1, p:-1] - total[p:-1, :p] @ gain
         return selection, (information + information.T) / 2.0
 
-    def widening(self, products: np.ndarray, change: np.ndarray, values: np.ndarray) -> float:
-        """Return the ratio of the scores' variance over blocks of time to the stated one, at least 1.
+    def widening(self, products: np.ndarray, change: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return by direction the ratio (K,) of the scores' variance over groups of rows to the stated one, at least 1.
 
-        Blocks shorter than the time in which errors change underestimate it: the largest ratio of several lengths counts.
+        Groups are blocks of time of several lengths, and rows of one joint with about the same velocity or position:
+        friction that the model lacks has the same errors in every period of a motion, and no block of time shows them.
         """
         selection, information = self._geometric(products)
-        root, shown = self._shown(information)
-        if not shown.any():
-            return 1.0
-        directions = root[:, shown]
-        stated = np.einsum("ki,kl,li->i", directions, information, directions)
+        directions = self._directions(information)
+        variance = np.einsum("ki,kl,li->i", directions, information, directions)
+        project = selection.T @ directions
         solution = np.concatenate([values, change, [-1.0]])
-        scores = (products @ solution)[:, :-1] @ selection.T @ directions
-        ratios = [1.0]
-        for count in BLOCK_COUNTS:
-            parts = np.array_split(scores, min(count, len(scores)))
-            sums = np.array([part.sum(axis=0) for part in parts])
-            fitted_mean = len(parts) / max(len(parts) - 1, 1)
-            ratios.append(fitted_mean * float(np.mean(np.sum(sums**2, axis=0) / stated)))
-        return max(ratios)
+        decimator = common_decimator(self.cases, self.settings)
+        scores = []
+        for matrix in self.whitened_rows(change, values):
+            residual = matrix @ solution
+            scores.append(matrix[:, :, :-1] @ project * residual[:, :, None])
+        all_scores = np.concatenate(scores)
+        index = [kept(case.motion.segment, decimator) for case in self.cases]
+        positions = np.concatenate([case.motion.q[k] for case, k in zip(self.cases, index)])
+        velocities = np.concatenate([case.motion.v[k] for case, k in zip(self.cases, index)])
 
-    def _shown(self, information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return combinations of elements of unit prior variance (K, K), and the mask of those that torques show."""
+        count = len(all_scores)
+        groupings = []
+        for blocks in BLOCK_COUNTS:
+            of_time = np.arange(count) * blocks // count
+            groupings.append(np.repeat(of_time[:, None], all_scores.shape[1], axis=1))
+        for states in (positions, velocities):
+            joints = np.arange(all_scores.shape[1]) % states.shape[1]
+            ranks = np.argsort(np.argsort(states, axis=0), axis=0)
+            bins = (ranks * BINS // count)[:, joints]
+            groupings.append(bins + BINS * np.arange(len(joints)))
+        ratio = np.ones(len(variance))
+        effective = variance > 0.0
+        for groups in groupings:
+            sums = np.zeros((groups.max() + 1, len(variance)))
+            np.add.at(sums, groups.ravel(), all_scores.reshape(-1, len(variance)))
+            squares = np.sum(sums**2, axis=0)
+            ratio[effective] = np.maximum(ratio[effective], squares[effective] / variance[effective])
+        return ratio
+
+    def widened(self, products: np.ndarray, solution: _Solution, widening: np.ndarray) -> _Solution:
+        """Return the solution with the torques' information of each direction divided by its widening (K,)."""
+        _, information = self._geometric(products)
+        directions = self._directions(information)
+        strength = np.clip(np.einsum("ki,kl,li->i", directions, information, directions), 0.0, None)
+        trusted = strength / widening
+        # share of the torques in the estimate, with and without the widening
+        share = np.divide(strength, 1.0 + strength)
+        widened_share = np.divide(trusted, 1.0 + trusted)
+        factor = np.divide(widened_share, share, out=np.ones(len(share)), where=share > 0.0)
+        amount = np.linalg.pinv(directions) @ solution.change
+        covariance = (directions / (1.0 + trusted)) @ directions.T
+        return replace(solution, change=directions @ (factor * amount), covariance=covariance)
+
+    def _directions(self, information: np.ndarray) -> np.ndarray:
+        """Return combinations of elements (K, K) that are independent, of unit variance before the torques."""
         unit = np.sqrt(np.diag(self.prior))
         values, vectors = np.linalg.eigh(self.prior / np.outer(unit, unit))
         half = unit[:, None] * vectors * np.sqrt(np.clip(values, 0.0, None))
-        strengths, turns = np.linalg.eigh(half.T @ information @ half)
-        return half @ turns, strengths > 1.0
+        _, turns = np.linalg.eigh(half.T @ information @ half)
+        return np.asarray(half @ turns)
 
-    def held_out(self, products: np.ndarray, widening: float) -> float:
+    def held_out(self, products: np.ndarray) -> float:
         """Return squared errors on held-out time with the geometry estimated, over those with it unchanged."""
         fold = (np.arange(len(products)) * PIECES // len(products)) % FOLDS
         squares = np.zeros(2)
@@ -602,11 +651,11 @@ class _Problem:
             training, test = products[fold != number], products[fold == number]
             if not len(training) or not len(test):
                 return 1.0
-            tested = test.sum(axis=0)
+            test_products = test.sum(axis=0)
             for k, freed in enumerate((True, False)):
-                solution = self.solve(training, widening, freed)
-                whole = np.concatenate([solution.values, solution.change, [-1.0]])
-                squares[k] += whole @ tested @ whole
+                solution = self.solve(training, freed)
+                weights = np.concatenate([solution.values, solution.change, [-1.0]])
+                squares[k] += weights @ test_products @ weights
         return float(squares[0] / squares[1])
 
 

@@ -14,11 +14,12 @@ worse, and where the torques contradict the geometry before: a log of another ar
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.special import erfc
 
 from calib import files
 from calib.errors import Finding, UsageError, finding, require
@@ -37,7 +38,7 @@ from calib.units import TORQUE
 
 # ratio of squared errors on held-out torques up to which the joint estimate is not worse
 MAX_HELD_OUT = 1.001
-# probability below which torques and geometry contradict each other (our choice)
+# probability below which torques and geometry contradict each other, by the largest of all distances (our choice)
 CONTRADICTION = 1e-4
 # difference of identified and stated mass, as a share, from which on the stated payload is not used (our choice)
 MAX_MASS_ERROR = 0.1
@@ -69,7 +70,7 @@ class GeometryFromTorques:
 
 @dataclass(frozen=True)
 class ElementChange:
-    """An element of the geometry before and after the torques [m or rad]; fields as in ``geometry_from_torques.csv``."""
+    """An element before and after the torques [m or rad]; fields as in ``geometry_from_torques.csv``."""
 
     element: str
     unit: str
@@ -89,7 +90,6 @@ class GeometryFromTorquesMetrics:
         delivered: whether the robot of the result has this geometry.
         held_out: squared errors on held-out torques, over those of the two stages.
         combinations: number of independent combinations of elements that the torques determine.
-        p_value: probability of a larger distance of the torques' geometry from that before.
         widening: factor by which blocks of time widened the variance of the torques.
         elements: free elements, and tilts of gravity.
         gains: measured over true torque of each torque row, with the standard deviation.
@@ -98,7 +98,6 @@ class GeometryFromTorquesMetrics:
     delivered: bool
     held_out: float
     combinations: int
-    p_value: float
     widening: float
     elements: tuple[ElementChange, ...]
     gains: tuple[tuple[float, float], ...] = ()
@@ -123,13 +122,19 @@ def run_jointly(
         settings = replace(settings, friction=plain.friction.chosen)
     doubted = _doubted_payloads(inputs, plain)
 
-    joint, robot, found = identify_jointly(plain, inputs.robot, inputs.cases, settings, doubted, say)
+    identify_all = partial(identify_jointly, plain, inputs.robot, inputs.cases, settings, doubted)
 
+    if inputs.robot.covariance is not None:
+        by_torques = identify_all(fitted=False, progress=say).estimate
+        contradicting = contradictions(by_torques, inputs.robot)
+        if contradicting:
+            return inputs, plain, GeometryFromTorques(by_torques, False, contradicting, None)
+    joint, robot, found = identify_all(progress=say)
     unseen = _unseen_ratio(inputs, plain, found)
     result = GeometryFromTorques(joint, True, (), unseen)
-    noticed = tuple(_objections(result, inputs.robot))
-    if noticed:
-        return inputs, plain, replace(result, delivered=False, noticed=noticed)
+    if result.held_out > MAX_HELD_OUT:
+        noticed = finding("geometry-not-better", ratio=result.held_out)
+        return inputs, plain, replace(result, delivered=False, noticed=(noticed,))
     options = replace(inputs.options, settings=replace(inputs.options.settings, gravity=found.settings.gravity))
     return replace(inputs, robot=robot, options=options), found, result
 
@@ -181,20 +186,21 @@ def _unseen_ratio(inputs: IdentificationInputs, plain: Identification, found: Id
     return float(squares[0] / squares[1])
 
 
-def _objections(result: GeometryFromTorques, robot: CalibratedChain) -> Iterator[Finding]:
-    """Yield findings that speak against the geometry from torques."""
-    joint = result.estimate
-    if robot.covariance is not None and joint.p_value < CONTRADICTION:
-        worst = int(np.argmax(np.abs(joint.surprise)))
-        yield finding(
-            "geometry-contradicted",
-            element=joint.elements[worst],
-            change=joint.change[worst],
-            unit=joint.units[worst],
-            sigmas=abs(joint.surprise[worst]),
-        )
-    if result.held_out > MAX_HELD_OUT:
-        yield finding("geometry-not-better", ratio=result.held_out)
+def contradictions(by_torques: JointEstimate, robot: CalibratedChain) -> tuple[Finding, ...]:
+    """Return a finding on the element in which torques contradict a robot's fit most, if they do.
+
+    Args:
+        by_torques: geometry by the torques by_torques.
+        robot: the robot with the covariance of its fit.
+    """
+    distances = np.abs(by_torques.distances(robot))
+    worst = int(np.argmax(distances))
+    compared = max(int(np.count_nonzero(distances)), 1)
+    p_value = compared * float(erfc(distances[worst] / np.sqrt(2.0)))
+    if p_value > CONTRADICTION:
+        return ()
+    shift = f"{1e3 * by_torques.change[worst]:.3g} m{by_torques.units[worst]}"
+    return (finding("geometry-contradicted", element=by_torques.elements[worst], moved=shift, sigmas=distances[worst]),)
 
 
 def with_covariance(carried: GeometryUncertainty, result: GeometryFromTorques) -> GeometryUncertainty:
@@ -273,7 +279,6 @@ def metrics(result: GeometryFromTorques) -> GeometryFromTorquesMetrics:
         delivered=result.delivered,
         held_out=result.held_out,
         combinations=joint.identified_combinations,
-        p_value=joint.p_value,
         widening=joint.widening,
         elements=changes(joint),
         gains=tuple(gains),

@@ -601,7 +601,7 @@ def _joint_blocks(jointly: GeometryFromTorquesMetrics | None) -> list[page.Block
     """
     if jointly is None:
         return []
-    told = [change for change in jointly.elements if change.identified]
+    determined = [change for change in jointly.elements if change.identified]
     resting = [change.element for change in jointly.elements if not change.identified]
     state = "the robot has the geometry from poses and torques" if jointly.delivered else "the geometry is unchanged"
     lines = [
@@ -612,7 +612,7 @@ def _joint_blocks(jointly: GeometryFromTorquesMetrics | None) -> list[page.Block
     if resting:
         lines.append(f"determined by poses or their prior rather than by torques: {listing(resting, 8)}")
     rows = []
-    for change in told:
+    for change in determined:
         before = f"{1e3 * change.sigma_before:.3g}"
         after = f"{1e3 * change.sigma_after:.3g}"
         shift = f"{1e3 * (change.after - change.before):+.3g}"

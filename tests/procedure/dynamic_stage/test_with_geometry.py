@@ -1,18 +1,19 @@
 """``calib identify --with-geometry``: what it writes, when it leaves the geometry alone, and what it refuses."""
 
 import csv
-from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import planted_motion as planted
 import pytest
 import without_figures
 
-from calib.errors import UsageError
 from calib.folders import read_covariance
-from calib.identification.uncertainty.joint_estimate import JointEstimate
-from calib.procedure.dynamic_stage.with_geometry import GeometryFromTorques, _objections
+from calib.identification.settings import IdentificationSettings
+from calib.identification.uncertainty.joint_estimate import JointEstimate, JointIdentification
+from calib.procedure.dynamic_stage import with_geometry
+from calib.procedure.dynamic_stage.with_geometry import contradictions
 from calib.procedure.findings import lines_of
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain
@@ -54,30 +55,38 @@ def estimate(change: float = 0.0, sigma: float = 1e-3, held_out: float = 0.9) ->
     )
 
 
-def objections(joint: JointEstimate, unseen: float | None = None, fitted: bool = True) -> list:
-    covariance = np.diag(np.full(6, 1e-6)) if fitted else None
-    robot = CalibratedChain(planted.arm(), covariance=covariance)
-    return list(_objections(GeometryFromTorques(joint, True, (), unseen), robot))
-
-
 def test_torques_far_from_the_fit_contradict_it():
-    contradicted = objections(estimate(change=0.02))
-    assert [item.code for item in contradicted] == ["geometry-contradicted"]
-    assert "shoulder would move by 20 mrad" in lines_of(contradicted)[0]
-    assert not objections(estimate(change=0.002))
-    assert not objections(estimate(change=0.02), fitted=False), "nobody measured this geometry before"
+    fit = CalibratedChain(planted.arm(), covariance=np.diag(np.full(6, 1e-6)))
+    (contradicted,) = contradictions(estimate(change=0.02), fit)
+    assert contradicted.code == "geometry-contradicted"
+    assert "shoulder off by 20 mrad, 14.1 σ" in lines_of([contradicted])[0]
+    assert not contradictions(estimate(change=0.004), fit)
 
 
-def test_a_geometry_that_predicts_worse_is_not_delivered():
-    assert [item.code for item in objections(estimate(held_out=1.01))] == ["geometry-not-better"]
-    assert [item.code for item in objections(estimate(held_out=0.9), unseen=1.02)] == ["geometry-not-better"]
-    assert not objections(estimate(held_out=1.01), unseen=0.99), "other recordings count more than held-out time"
-
-
-def test_what_torques_do_not_show_rests_on_the_prior():
-    joint = estimate(sigma=1.9e-3)
+def test_what_torques_do_not_show_rests_on_the_prior_and_contradicts_nothing():
+    fit = CalibratedChain(planted.arm(), covariance=np.diag(np.full(6, 1e-6)))
+    joint = estimate(change=0.02, sigma=1.9e-3)
     assert not joint.identified.any() and joint.identified_combinations == 0
-    assert joint.p_value == 1.0
+    assert not contradictions(joint, fit)
+
+
+def test_a_geometry_that_predicts_worse_is_not_delivered(monkeypatch):
+    worse = estimate(held_out=1.01)
+    inputs = SimpleNamespace(
+        robot=CalibratedChain(planted.arm()),
+        cases=(),
+        unseen=(),
+        unit="N m",
+        options=SimpleNamespace(settings=IdentificationSettings()),
+    )
+    plain = SimpleNamespace(friction=SimpleNamespace(chosen="standard"))
+    monkeypatch.setattr(with_geometry, "identify", lambda *arguments: plain)
+    monkeypatch.setattr(with_geometry, "_doubted_payloads", lambda *arguments: ())
+    answer = JointIdentification(worse, inputs.robot, plain)
+    monkeypatch.setattr(with_geometry, "identify_jointly", lambda *arguments, **names: answer)
+    used, found, result = with_geometry.run_jointly(inputs, print)
+    assert used is inputs and found is plain and not result.delivered
+    assert [item.code for item in result.noticed] == ["geometry-not-better"]
 
 
 @pytest.mark.slow
@@ -106,8 +115,9 @@ def test_the_command_writes_the_robot_with_its_covariance(robot, tmp_path, capsy
     assert np.linalg.eigvalsh(covariance / np.sqrt(np.outer(np.diag(covariance), np.diag(covariance)))).min() > -1e-9
 
 
+@pytest.mark.slow
 def test_methods_without_rows_are_refused(robot, tmp_path, capsys):
     log = write_log(tmp_path, "free.npz", 0)
     arguments = ("identify", robot, log, "--method", "pc-wls", "--with-geometry", "--out", tmp_path / "out")
     assert without_figures.run(*arguments) != 0
-    assert "with_geometry" in capsys.readouterr().err
+    assert "--with-geometry: method 'pc-wls'" in capsys.readouterr().err
