@@ -13,6 +13,9 @@ mass and first moments of payloads whose values are stated. The method is Gauss-
 its start is the result of the two stages. All standard parameters are estimated, not base parameters, since their
 regrouping depends on the geometry: with bodies that cannot exist, small changes of lengths would have large effects.
 
+If the fit has joint corrections (compliance, gears, encoders), the geometry is that fitted with them; their
+coefficients follow its change by the correlations of the fit.
+
 Residuals of recorded torques are correlated. Their weights account for the autocorrelation within a row
 (`calib.estimation.whiteness.inflation`); in addition, the scores of groups of rows (blocks of time, and equal velocity
 or position of a joint) are compared with the variance that these weights state, as in a sandwich estimator (Liang and
@@ -47,7 +50,7 @@ from calib.identification.rows import Case, observe
 from calib.identification.settings import IdentificationSettings, Payload, make_bodies, make_model
 from calib.identification.uncertainty.geometry_uncertainty import STEP, TILTS
 from calib.records import Frozen
-from calib.robot.calibrated import CalibratedChain
+from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import forward, jacobian
 
@@ -196,17 +199,19 @@ def prior_of(robot: CalibratedChain, fitted: bool = True) -> np.ndarray:
         fitted: whether the covariance of its fit is used; otherwise the fitted elements have the deviations of a robot
             without a fit.
     """
-    chain = robot.chain
+    chain = robot.complete
     count = len(chain.elements)
     covariance = np.zeros((count + len(TILTS), count + len(TILTS)))
     tilts = np.arange(count, count + len(TILTS))
     covariance[tilts, tilts] = TILT**2
-    elements = independent_elements(chain)
-    if robot.covariance is not None:
-        if fitted:
-            covariance[:count, :count] = robot.covariance
-            return covariance
-        elements = np.flatnonzero(np.diag(robot.covariance) > 0.0)
+    of_fit = robot.covariance if robot.corrections is None else robot.corrections.covariance
+    if of_fit is None:
+        elements = independent_elements(chain)
+    elif fitted:
+        covariance[:count, :count] = of_fit[:count, :count]
+        return covariance
+    else:
+        elements = np.flatnonzero(np.diag(of_fit)[:count] > 0.0)
     for k in elements:
         unit = chain.units[k]
         deviation = TYPICAL[unit]
@@ -270,15 +275,43 @@ def updated(
     """
     count = len(robot.chain.elements)
     change = np.zeros(count + len(TILTS))
-    change[list(joint.index)] = joint.after - joint.before
-    chain, settings = changed(robot.chain, settings, change)
-    covariance = np.zeros((count, count))
+    change[list(joint.index)] = joint.change
+    chain, changed_settings = changed(robot.chain, settings, change)
+    nominal = robot.nominal or robot.chain
     free = np.array(joint.index)
     elements = free < count
     index = free[elements]
-    covariance[np.ix_(index, index)] = joint.covariance[np.ix_(elements, elements)]
-    nominal = robot.nominal or robot.chain
-    return replace(robot, chain=chain, nominal=nominal, covariance=covariance), settings
+    covariance = joint.covariance[np.ix_(elements, elements)]
+    if robot.corrections is not None:
+        complete, _ = changed(robot.complete, settings, change)
+        corrections = _conditioned(replace(robot.corrections, chain=complete), index, change[index], covariance)
+        return replace(robot, chain=chain, nominal=nominal, corrections=corrections), changed_settings
+    of_chain = np.zeros((count, count))
+    of_chain[np.ix_(index, index)] = covariance
+    return replace(robot, chain=chain, nominal=nominal, covariance=of_chain), changed_settings
+
+
+def _conditioned(
+    corrections: CorrectedChain, index: np.ndarray, change: np.ndarray, covariance: np.ndarray
+) -> CorrectedChain:
+    """Return joint corrections whose coefficients follow the change of the geometry by their correlation.
+
+    Args:
+        corrections: the changed geometry, with the coefficients and the covariance (K + E, K + E) before.
+        index: (k,) changed elements.
+        change: (k,) their changes.
+        covariance: (k, k) their covariance after the torques.
+    """
+    before = corrections.covariance
+    if before is None:
+        return corrections
+    # regression of all values on the changed elements
+    gain = before[:, index] @ _inverse(before[np.ix_(index, index)])
+    after = before + gain @ (covariance - before[np.ix_(index, index)]) @ gain.T
+    shift = (gain @ change)[len(corrections.chain.elements) :]
+    coefficients = np.asarray(corrections.deflection.coefficients) + shift
+    deflection = replace(corrections.deflection, coefficients=coefficients)
+    return replace(corrections, deflection=deflection, covariance=after)
 
 
 class JointIdentification(NamedTuple):
@@ -351,7 +384,7 @@ def estimate_jointly(
         progress: called with a short text at each round; None: not called.
     """
     say = progress or (lambda text: None)
-    chain = robot.chain
+    chain = robot.complete
     prior = prior_of(robot, fitted)
     free = np.flatnonzero(np.diag(prior) > 0.0)
     settings = identification.settings

@@ -124,7 +124,7 @@ def run_jointly(
 
     identify_all = partial(identify_jointly, plain, inputs.robot, inputs.cases, settings, doubted)
 
-    if inputs.robot.covariance is not None:
+    if inputs.robot.covariance is not None or inputs.robot.corrections is not None:
         by_torques = identify_all(fitted=False, progress=say).estimate
         contradicting = contradictions(by_torques, inputs.robot)
         if contradicting:
