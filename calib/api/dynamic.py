@@ -197,6 +197,7 @@ def identify_dynamics(
     terms: Sequence[FrictionTerm] = (),
     options: IdentifyOptions | str | Path | None = None,
     excitation: str | Path | None = None,
+    with_geometry: bool | None = None,
     base: str | None = None,
     tip: str | None = None,
     seed: int = 0,
@@ -224,6 +225,9 @@ def identify_dynamics(
             instead of `settings`; None for no file.
         excitation: folder written by `design_excitation`, for methods that simulate the closed loop ([loop] in the
             options). Its motion is the reference motion for recordings that contain none. None for no folder.
+        with_geometry: whether the geometry is estimated again together with the dynamics: the covariance of the fit is
+            its prior, and torques of motions with and without a known payload tell joint offsets. ``robot`` of the
+            result has the geometry after the torques. None takes the settings' choice.
         seed: seed of all random numbers.
         on_read: called with the inputs before the identification begins; None for no call.
         progress: called with the name of each step; None for no report.
@@ -242,6 +246,8 @@ def identify_dynamics(
     elif not isinstance(options, IdentifyOptions):
         options = read_options(optional(options))
     options = replace(options, settings=replace(options.settings, functions=tuple(terms)))
+    if with_geometry is not None:
+        options = replace(options, settings=replace(options.settings, with_geometry=with_geometry))
     designed = [] if excitation is None else [coefficients.read(Path(excitation))]
     stage = stage_of(robot, "identify", base, tip)
     if stage is not None:

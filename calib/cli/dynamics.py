@@ -98,6 +98,7 @@ def identify_dynamics(
     friction: str | None = None,
     options: Path | None = None,
     excitation: Path | None = None,
+    with_geometry: bool = False,
     base: str | None = None,
     tip: str | None = None,
     seed: Seed = 0,
@@ -118,6 +119,7 @@ def identify_dynamics(
         options: TOML: drives, payloads, gains, filters, identification
         excitation: folder of calib excite: its prediction is compared with the result; its motion is the reference of
             recordings that have none (methods with a [loop])
+        with_geometry: estimate joint offsets, lengths and the direction of gravity again, together with the dynamics
     """
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.report.dynamics_section import read_lines
@@ -141,6 +143,7 @@ def identify_dynamics(
             options=options,
             base=base,
             excitation=excitation,
+            with_geometry=with_geometry or None,
             tip=tip,
             seed=seed,
             on_read=read,

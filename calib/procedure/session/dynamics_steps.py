@@ -68,7 +68,13 @@ def options_of(session: Session) -> IdentifyOptions:
     settings = options.settings
     if not section.options:
         rows = torque_rows(section.torques)
-        settings = replace(settings, torque_rows=rows, friction=section.friction, method=section.method)
+        settings = replace(
+            settings,
+            torque_rows=rows,
+            friction=section.friction,
+            method=section.method,
+            with_geometry=section.with_geometry,
+        )
     payloads = dict(section.payloads) | dict(settings.payloads)
     settings = replace(settings, payloads=payloads, seed=session.settings.seed)
     by_file = dict(options.files)
