@@ -213,7 +213,7 @@ class DynamicsUpdate(ChartedResult, ReportedResult):
 
     def charts(self) -> dict[str, Chart]:
         """Return the figure by name: Coulomb and viscous friction and gains against date, with one sigma."""
-        from calib.toolkit.report_charts import AFTER, QUIET, Chart, Panel, line
+        from calib.toolkit.report_charts import AFTER, QUIET, Chart, Line, Panel
 
         record = self.state.record
         days = np.array([log.day for log in record.logs])
@@ -227,11 +227,11 @@ class DynamicsUpdate(ChartedResult, ReportedResult):
         for k, index in enumerate(self.state.drifting):
             if not self._drawn(index):
                 continue
-            layers = [line(days, values[:, k], "o-", AFTER, spread=sigmas[:, k])]
+            layers = [Line(days, values[:, k], "o-", AFTER, spread=sigmas[:, k])]
             first = 1.0
             if index < self.state.model.k:
                 first = record.values[index]
-            layers.append(line(days[[0, -1]], np.full(2, first), "--", QUIET))
+            layers.append(Line(days[[0, -1]], np.full(2, first), "--", QUIET))
             title = f"{record.names[index]} [{record.units[index]}]".replace(" []", "")
             panels.append(Panel(layers, title, label))
         return {"drift": Chart(panels, 0.6 + PANEL_HEIGHT * -(-len(panels) // 4), 4)}
