@@ -177,15 +177,48 @@ class JointEstimate(Frozen):
         removed, _ = self.combinations
         return int(np.sum(removed >= MIN_DATA_SHARE))
 
+    def regrouped(self, chain: Chain) -> JointEstimate:
+        """Return the estimate of the independent elements of a chain, each with those regrouped into it, and of tilts.
+
+        Args:
+            chain: the arm before.
+        """
+        count = len(chain.elements)
+        index, matrix = independent_elements(chain)
+        free = np.array(self.index)
+        elements = free < count
+        transform = scipy.linalg.block_diag(matrix[:, free[elements]], np.eye(int(np.sum(~elements))))
+        prior = transform @ self.prior @ transform.T
+        estimated = np.diag(prior) > 0.0
+        transform = transform[estimated]
+        regrouped = np.concatenate([index, free[~elements]])[estimated]
+        names = np.array([*chain.names, *TILTS])[regrouped]
+        units = np.array([*chain.units, *(["rad"] * len(TILTS))])[regrouped]
+        before = np.append(chain.values, np.zeros(len(TILTS)))[regrouped]
+        return replace(
+            self,
+            elements=tuple(names.tolist()),
+            units=tuple(units.tolist()),
+            index=tuple(regrouped.tolist()),
+            before=before,
+            after=before + transform @ self.change,
+            prior=transform @ self.prior @ transform.T,
+            covariance=transform @ self.covariance @ transform.T,
+        )
+
     def distances(self, robot: CalibratedChain) -> np.ndarray:
         """Return the differences (K,) from a robot's values in units of their σ; 0 for what torques do not determine.
 
         Args:
             robot: the robot with the covariance of its fit, which these torques did not enter.
         """
-        variance = np.diag(self.covariance) + np.diag(prior_of(robot))[list(self.index)]
-        distance = self.change / np.sqrt(variance)
-        return np.where(self.identified, distance, 0.0)
+        count = len(robot.complete.elements)
+        index, matrix = independent_elements(robot.complete)
+        of_fit = np.zeros(count + len(TILTS))
+        of_fit[index] = np.diag(matrix @ prior_of(robot)[:count, :count] @ matrix.T)
+        compared = np.array(self.index)
+        distance = self.change / np.sqrt(self.sigma**2 + of_fit[compared])
+        return np.where(self.identified & (compared < count), distance, 0.0)
 
 
 def prior_of(robot: CalibratedChain, fitted: bool = True) -> np.ndarray:
@@ -196,8 +229,8 @@ def prior_of(robot: CalibratedChain, fitted: bool = True) -> np.ndarray:
 
     Args:
         robot: the robot.
-        fitted: whether the covariance of its fit is used; otherwise the fitted elements have the deviations of a robot
-            without a fit.
+        fitted: whether the covariance of its fit is used; otherwise the elements have the deviations of a robot without
+            a fit.
     """
     chain = robot.complete
     count = len(chain.elements)
@@ -205,14 +238,10 @@ def prior_of(robot: CalibratedChain, fitted: bool = True) -> np.ndarray:
     tilts = np.arange(count, count + len(TILTS))
     covariance[tilts, tilts] = TILT**2
     of_fit = robot.covariance if robot.corrections is None else robot.corrections.covariance
-    if of_fit is None:
-        elements = independent_elements(chain)
-    elif fitted:
+    if of_fit is not None and fitted:
         covariance[:count, :count] = of_fit[:count, :count]
         return covariance
-    else:
-        elements = np.flatnonzero(np.diag(of_fit)[:count] > 0.0)
-    for k in elements:
+    for k in independent_elements(chain).index:
         unit = chain.units[k]
         deviation = TYPICAL[unit]
         if k in chain.moving:
@@ -221,14 +250,20 @@ def prior_of(robot: CalibratedChain, fitted: bool = True) -> np.ndarray:
     return covariance
 
 
-def independent_elements(chain: Chain) -> np.ndarray:
-    """Return the elements whose effects on the tip's pose are independent of each other and of base and tool frames.
+class Regrouping(NamedTuple):
+    """Elements whose effects on the tip's pose are independent of each other and of the frames of base and tool.
 
-    Joint offsets are preferred to elements with the same effect.
-
-    Args:
-        chain: the arm.
+    Attributes:
+        index: (k,) indices of these elements; joint offsets are preferred to elements with the same effect.
+        matrix: (k, K) changes of these elements with the effect of a change of every element of the chain.
     """
+
+    index: np.ndarray
+    matrix: np.ndarray
+
+
+def independent_elements(chain: Chain) -> Regrouping:
+    """Return the independent elements of a chain, into which all others are regrouped."""
     q = random_joints(chain, POSTURES)
     motion = jacobian(chain, q)
     poses = forward(chain, q)
@@ -241,8 +276,12 @@ def independent_elements(chain: Chain) -> np.ndarray:
     constant = np.setdiff1d(np.arange(count), chain.moving)
     groups = [np.arange(12), *(12 + chain.moving[:, None]), *(12 + constant[:, None])]
     factor = np.linalg.qr(stacked, mode="r")
-    independent = split_columns(factor, groups, DEPENDENT).kept
-    return np.sort(independent[independent >= 12] - 12)
+    split = split_columns(factor, groups, DEPENDENT)
+    columns = np.sort(split.kept[split.kept >= 12])
+    effects = np.zeros((12 + count, 12 + count))
+    effects[split.kept, split.kept] = 1.0
+    effects[np.ix_(split.kept, split.dropped)] = split.coefficients
+    return Regrouping(columns - 12, effects[columns, 12:])
 
 
 def changed(chain: Chain, settings: IdentificationSettings, change: np.ndarray) -> tuple[Chain, IdentificationSettings]:

@@ -3,9 +3,10 @@
 Files in addition to those of every identification::
 
     robot.toml, chain_covariance.csv   the robot with the geometry after the torques, and its covariance
-    geometry_from_torques.csv          each free element and tilt of gravity: value and σ before and after the torques;
-                                       identified: the torques reduce its variance by half or more; surprise: change in
-                                       units of its σ if poses and torques agree
+    geometry_from_torques.csv          each independent element, with those of the same effect, and tilt of gravity:
+                                       change by the torques, σ before and after; identified: the torques reduce its
+                                       variance by half or more; surprise: change in units of its σ if poses and torques
+                                       agree
     joint_covariance.csv               of elements, tilts and dynamic parameters, with their correlations
 
 The two stages stand beside as the plain reference. They are kept where the joint estimate predicts held-out torques
@@ -43,7 +44,7 @@ CONTRADICTION = 1e-4
 # difference of identified and stated mass, as a share, from which on the stated payload is not used (our choice)
 MAX_MASS_ERROR = 0.1
 TABLE, COVARIANCE = "geometry_from_torques.csv", "joint_covariance.csv"
-HEADER = ("element", "unit", "before", "sigma_before", "after", "sigma_after", "change", "surprise", "identified")
+HEADER = ("element", "unit", "change", "sigma_before", "sigma_after", "surprise", "identified")
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +56,14 @@ class GeometryFromTorques:
         delivered: whether the robot of the result has this geometry; otherwise it has that before the torques.
         noticed: findings.
         unseen: squared errors on held-out recordings, over those of the two stages; None without such recordings.
+        regrouped: the estimate by independent elements.
     """
 
     estimate: JointEstimate
     delivered: bool
     noticed: tuple[Finding, ...]
     unseen: float | None
+    regrouped: JointEstimate
 
     @property
     def held_out(self) -> float:
@@ -70,13 +73,12 @@ class GeometryFromTorques:
 
 @dataclass(frozen=True)
 class ElementChange:
-    """An element before and after the torques [m or rad]; fields as in ``geometry_from_torques.csv``."""
+    """Change of an element by the torques [m or rad]; fields as in ``geometry_from_torques.csv``."""
 
     element: str
     unit: str
-    before: float
+    change: float
     sigma_before: float
-    after: float
     sigma_after: float
     surprise: float
     identified: bool
@@ -128,10 +130,10 @@ def run_jointly(
         by_torques = identify_all(fitted=False, progress=say).estimate
         contradicting = contradictions(by_torques, inputs.robot)
         if contradicting:
-            return inputs, plain, GeometryFromTorques(by_torques, False, contradicting, None)
+            return inputs, plain, GeometryFromTorques(by_torques, False, contradicting, None, by_torques)
     joint, robot, found = identify_all(progress=say)
     unseen = _unseen_ratio(inputs, plain, found)
-    result = GeometryFromTorques(joint, True, (), unseen)
+    result = GeometryFromTorques(joint, True, (), unseen, joint.regrouped(inputs.robot.complete))
     if result.held_out > MAX_HELD_OUT:
         noticed = finding("geometry-not-better", ratio=result.held_out)
         return inputs, plain, replace(result, delivered=False, noticed=(noticed,))
@@ -227,21 +229,9 @@ def write(result: GeometryFromTorques, carried: GeometryUncertainty, folder: Pat
         folder: folder to write into.
     """
     rows = []
-    for change in changes(result.estimate):
-        shift = change.after - change.before
-        rows.append(
-            (
-                change.element,
-                change.unit,
-                change.before,
-                change.sigma_before,
-                change.after,
-                change.sigma_after,
-                shift,
-                change.surprise,
-                "yes" if change.identified else "no",
-            )
-        )
+    for row in changes(result.regrouped):
+        identified = "yes" if row.identified else "no"
+        rows.append((row.element, row.unit, row.change, row.sigma_before, row.sigma_after, row.surprise, identified))
     files.write_table(folder / TABLE, HEADER, rows)
     if not result.delivered:
         return
@@ -260,9 +250,8 @@ def changes(joint: JointEstimate) -> tuple[ElementChange, ...]:
             ElementChange(
                 element=element,
                 unit=unit,
-                before=float(joint.before[k]),
+                change=float(joint.change[k]),
                 sigma_before=float(joint.sigma_before[k]),
-                after=float(joint.after[k]),
                 sigma_after=float(joint.sigma[k]),
                 surprise=float(joint.surprise[k]),
                 identified=bool(joint.identified[k]),
@@ -280,6 +269,6 @@ def metrics(result: GeometryFromTorques) -> GeometryFromTorquesMetrics:
         held_out=result.held_out,
         combinations=joint.identified_combinations,
         widening=joint.widening,
-        elements=changes(joint),
+        elements=changes(result.regrouped),
         gains=tuple(gains),
     )

@@ -618,8 +618,8 @@ def _joint_blocks(jointly: GeometryFromTorquesMetrics | None) -> list[page.Block
     for change in determined:
         before = f"{1e3 * change.sigma_before:.3g}"
         after = f"{1e3 * change.sigma_after:.3g}"
-        shift = f"{1e3 * (change.after - change.before):+.3g}"
-        sigmas = f"{(change.after - change.before) / change.sigma_after:+.2g}"
+        shift = f"{1e3 * change.change:+.3g}"
+        sigmas = f"{change.change / change.sigma_after:+.2g}"
         rows.append([change.element, f"m{change.unit}", shift, before, after, sigmas])
     blocks: list[page.Block] = [page.Text("Geometry from torques", lines)]
     if rows:

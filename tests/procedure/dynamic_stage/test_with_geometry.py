@@ -37,6 +37,9 @@ def write_log(folder: Path, name: str, seed: int, payload: bool = False, offset:
     return folder / name
 
 
+FIT = CalibratedChain(planted.arm(), covariance=np.diag([0.0, 0.0, 1e-6, 0.0, 0.0, 0.0]))
+
+
 def estimate(change: float = 0.0, sigma: float = 1e-3, held_out: float = 0.9) -> JointEstimate:
     """Return a joint estimate of one offset, whose prior has a standard deviation of 2 mrad."""
     return JointEstimate(
@@ -56,18 +59,16 @@ def estimate(change: float = 0.0, sigma: float = 1e-3, held_out: float = 0.9) ->
 
 
 def test_torques_far_from_the_fit_contradict_it():
-    fit = CalibratedChain(planted.arm(), covariance=np.diag(np.full(6, 1e-6)))
-    (contradicted,) = contradictions(estimate(change=0.02), fit)
+    (contradicted,) = contradictions(estimate(change=0.02), FIT)
     assert contradicted.code == "geometry-contradicted"
     assert "shoulder off by 20 mrad, 14.1 σ" in lines_of([contradicted])[0]
-    assert not contradictions(estimate(change=0.004), fit)
+    assert not contradictions(estimate(change=0.004), FIT)
 
 
 def test_what_torques_do_not_show_rests_on_the_prior_and_contradicts_nothing():
-    fit = CalibratedChain(planted.arm(), covariance=np.diag(np.full(6, 1e-6)))
     joint = estimate(change=0.02, sigma=1.9e-3)
     assert not joint.identified.any() and joint.identified_combinations == 0
-    assert not contradictions(joint, fit)
+    assert not contradictions(joint, FIT)
 
 
 def test_a_geometry_that_predicts_worse_is_not_delivered(monkeypatch):
@@ -101,10 +102,10 @@ def test_the_command_writes_the_robot_with_its_covariance(robot, tmp_path, capsy
 
     rows = {row["element"]: row for row in csv.DictReader((out / "geometry_from_torques.csv").open())}
     offset = rows["shoulder"]
-    assert abs(float(offset["after"]) - 0.01) < 3.5 * float(offset["sigma_after"]) and offset["identified"] == "yes"
+    assert abs(float(offset["change"]) - 0.01) < 3.5 * float(offset["sigma_after"]) and offset["identified"] == "yes"
     after = calibrated.read(out)
     k = after.chain.names.index("shoulder")
-    assert after.chain.values[k] == pytest.approx(float(offset["after"]))
+    assert after.chain.values[k] == pytest.approx(float(offset["change"]))
     assert after.covariance is not None
     assert np.sqrt(after.covariance[k, k]) == pytest.approx(float(offset["sigma_after"]), rel=1e-6)
 
