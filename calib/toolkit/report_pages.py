@@ -23,7 +23,7 @@ from calib.procedure.report.page import (
     table,
 )
 from calib.procedure.report.page import section as printed_section
-from calib.procedure.report.templates import filled, interactive, issued
+from calib.procedure.report.templates import filled, interactive, issued, script_sources
 from calib.procedure.report.templates import read as read_template
 
 __all__ = [
@@ -49,6 +49,7 @@ __all__ = [
     "read_template",
     "rendered",
     "report_page",
+    "script_sources",
     "table",
     "write_certificate",
     "write_figures",

@@ -35,6 +35,7 @@ from calib.errors import CalibError
 from calib.folders import PAGES
 from calib.toolkit.chains import controllers
 from calib.toolkit.pose_data import EULER
+from calib.toolkit.report_pages import script_sources
 from calib.toolkit.sessions import (
     DONE,
     KEPT,
@@ -52,8 +53,8 @@ from calib.toolkit.sessions import (
 from calib.units import ANGLES, LENGTHS
 
 PICTURES = (".png", ".svg")
-# of files, whoever wrote them
-SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
+# of files, whoever wrote them; of scripts those of reports alone run
+SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src {}; sandbox allow-scripts"
 # folders to take along as a whole: what they hold
 BUNDLES = {"2-poses": "planned poses and their programs", "6-excitation": "motions to play"}
 RESULTS = "the calibrated robot, for other programs"
@@ -230,7 +231,7 @@ def file(request: Request) -> Response:
     headers = {"X-Content-Type-Options": "nosniff", "Cache-Control": "no-cache"}
     # Viewers of PDF are scripts, which a sandbox would stop; what was received may be of anybody.
     if path.suffix != ".pdf" or received.FOLDER in path.parts:
-        headers["Content-Security-Policy"] = SANDBOX
+        headers["Content-Security-Policy"] = SANDBOX.format(script_sources())
     return FileResponse(path, headers=headers)
 
 
