@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -82,6 +83,16 @@ def interactive(sections: Sequence[Section]) -> tuple[list[Section], Mapping[str
         return numbered, {}
     browser = {key: read(BROWSER, name) for key, name in BROWSER_FILES.items()}
     return numbered, browser | {"data": figure_data.page_text(charts)}
+
+
+@cache
+def script_sources() -> str:
+    """Return the scripts of a page as sources of a Content-Security-Policy: their SHA-256, so that no others run."""
+    sources = []
+    for key in ("library", "script"):
+        digest = hashlib.sha256(read(BROWSER, BROWSER_FILES[key]).encode()).digest()
+        sources.append(f"'sha256-{base64.b64encode(digest).decode()}'")
+    return " ".join(sources)
 
 
 def _numbered(block: Pictures, charts: dict[str, Captioned]) -> Pictures:

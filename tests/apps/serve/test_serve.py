@@ -26,6 +26,8 @@ from calib.apps.serve import pages, received
 from calib.apps.serve.pages import application
 from calib.apps.serve.work import CHECK, NEXT, Work
 from calib.errors import UsageError
+from calib.procedure.report.figures import figure_data
+from calib.procedure.report.figures.charts import Chart, Line, Panel
 from calib.procedure.session import commands, steps
 from calib.procedure.session.folder import Session, open_session
 from calib.procedure.session.geometry_steps import chain_of, read_measured
@@ -246,6 +248,16 @@ def test_who_may_ask(session: Session) -> None:
     assert served.state.work.current is None
     assert other.post("/next", headers={"origin": "http://192.168.1.7:8000"}).status_code == 200
     assert served.state.work.current.task == NEXT
+
+
+def test_figures_of_a_step_are_a_page_that_runs_its_own_scripts(session: Session, client: TestClient) -> None:
+    chart = Chart([Panel([Line([0.0, 1.0], [1.0, 2.0])])], 2.0)
+    session.path("4-fit").mkdir(exist_ok=True)
+    figure_data.write(session.path("4-fit"), {"joints": (chart, "errors by joint")})
+    assert '<a href="/figures/4-fit/figures.json">' in client.get("/").text
+    answer = client.get("/figures/4-fit/figures.json")
+    assert "errors by joint" in answer.text and "script-src 'sha256-" in answer.headers["content-security-policy"]
+    assert client.get("/figures/session.toml").status_code == client.get("/figures/5-validation").status_code == 404
 
 
 def test_only_the_sessions_files_are_served(session: Session, client: TestClient, tmp_path: Path) -> None:

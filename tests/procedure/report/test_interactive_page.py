@@ -22,7 +22,7 @@ from calib.procedure.report.figures.drawing import figure
 from calib.procedure.report.figures.svg import svg
 from calib.procedure.report.geometry_figures import correlation_map, error_histogram, error_map, residuals_by_joint
 from calib.procedure.report.page import Pictures, ReportTable, Section, Text, chart_pictures
-from calib.procedure.report.templates import read
+from calib.procedure.report.templates import read, script_sources
 
 HOSTILE = "</script><script>document.title='taken'</script>"
 SAMPLES = 400_000
@@ -257,3 +257,16 @@ def test_vendored_files_are_those_published():
     for name, digest in table["sha256"].items():
         assert hashlib.sha256(read(BROWSER, name).encode()).hexdigest() == digest
     assert "MIT License" in read(BROWSER, "uPlot.LICENSE") and table["version"] in read(BROWSER, "uPlot.iife.min.js")
+
+
+@pytest.mark.slow
+def test_served_page_runs_its_own_scripts_alone(browser, tmp_path):
+    """Under the policy of `calib serve` the page is drawn, and a script that somebody added does not run."""
+    from calib.apps.serve.pages import SANDBOX
+
+    page = written(tmp_path, geometry()).read_text(encoding="utf-8")
+    added = page.replace("</body>", "<script>document.title = 'taken'</script></body>")
+    policy = SANDBOX.format(script_sources()).partition("; sandbox")[0]
+    head = f'<head><meta http-equiv="Content-Security-Policy" content="{policy}">'
+    opened(browser, files.write(tmp_path / "served.html", added.replace("<head>", head, 1)))
+    assert browser.title != "taken" and "has been blocked" in str(browser.get_log("browser"))

@@ -828,7 +828,7 @@
       made.className = "entry";
       made.setAttribute("aria-pressed", "true");
       const colour = layers[0].colour || layers[0].colours;
-      if (typeof colour === "string") made.style.setProperty("--colour", colour);
+      if (typeof colour === "string") made.dataset.colour = colour;
       return made;
     }
     buttons() {
@@ -873,6 +873,7 @@
     layout() {
       const width = printing ? PRINT_WIDTH * (this.element.classList.contains("wide") ? 1 : 0.48) : this.box.clientWidth;
       if (!width) return;
+      this.swatches();
       if (this.space) this.space.size(Math.floor(width));
       const off = panel => panel.panel.switch && hidden.has(panel.panel.switch);
       const panels = this.panels.filter(panel => { panel.box.hidden = !!off(panel); return !off(panel); });
@@ -887,7 +888,9 @@
         panel.build(each, Math.round(Math.max(equal ? 0.8 * each : natural, 110)));
       }
     }
-    redraw() { if (this.space) this.space.paint(); for (const panel of this.visible()) panel.plot.redraw(false); }
+    // colours of the legend on the paper of the moment
+    swatches() { for (const made of this.box.querySelectorAll("[data-colour]")) made.style.setProperty("--colour", ink(made.dataset.colour)); }
+    redraw() { this.swatches(); if (this.space) this.space.paint(); for (const panel of this.visible()) panel.plot.redraw(false); }
   }
 
   // one row of switches for all figures of a part, such as its joints
