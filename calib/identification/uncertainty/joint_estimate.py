@@ -275,7 +275,7 @@ def independent_elements(chain: Chain) -> Regrouping:
     stacked = np.concatenate([frames, motion], axis=2).reshape(-1, 12 + count)
     constant = np.setdiff1d(np.arange(count), chain.moving)
     groups = [np.arange(12), *(12 + chain.moving[:, None]), *(12 + constant[:, None])]
-    factor = np.linalg.qr(stacked, mode="r")
+    factor = np.asarray(np.linalg.qr(stacked, mode="r"))
     split = split_columns(factor, groups, DEPENDENT)
     columns = np.sort(split.kept[split.kept >= 12])
     effects = np.zeros((12 + count, 12 + count))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.procedure.report.figures.charts import Captioned, Chart, Label, Level, Line, Panel
+from calib.procedure.report.figures.charts import Captioned, Chart, Label, Layer, Level, Line, Panel
 from calib.procedure.report.figures.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
 from calib.procedure.report.geometry_figures import outlook_figure
 from calib.robot.chain import Chain, Joint
@@ -47,7 +47,7 @@ def motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[
         name = joint.name.replace("_", "_\n") if len(joint.name) > LONG_NAME else joint.name
         for k, (values, lower, upper) in enumerate(series):
             quantity, unit = TITLES[k], units[k]
-            layers = [Line(times, values[:, j])]
+            layers: list[Layer] = [Line(times, values[:, j])]
             bounds = [float(bound) for bound in (lower[j], upper[j]) if np.isfinite(bound)]
             layers += map(Level, bounds)
             panel_title = f"{quantity} [{unit}]" if j == 0 else ""

@@ -79,7 +79,7 @@ def _draw_panel(panel: Panel, axes: Axes) -> None:
     for layer in panel.layers:
         _draw(layer, axes)
     if panel.grid:
-        axes.grid(axis=panel.grid)  # type: ignore[arg-type]
+        axes.grid(axis=panel.grid)  # ty: ignore[invalid-argument-type]
 
 
 def _set_axis(
@@ -106,7 +106,7 @@ def _set_axis(
     elif letter in panel.log and limits:
         log_axis(axis, *limits)
     elif panel.ticks:
-        axes.locator_params(letter, nbins=panel.ticks)  # type: ignore[arg-type]
+        axes.locator_params(letter, nbins=panel.ticks)  # ty: ignore[invalid-argument-type]
 
 
 @singledispatch

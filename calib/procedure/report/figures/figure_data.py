@@ -184,7 +184,7 @@ def _fields(record: object, arrays: Arrays) -> ParsedTable:
     content: ParsedTable = {}
     if type(record).__name__ in LAYERS:
         content["layer"] = type(record).__name__
-    for field in fields(record):  # type: ignore[arg-type]
+    for field in fields(record):  # ty: ignore[invalid-argument-type]
         value = getattr(record, field.name)
         if value is not None:
             content[field.name] = _value(value, arrays, field.name)
@@ -258,13 +258,13 @@ def _panel(content: ParsedTable, arrays: Sequence[np.ndarray]) -> Panel:
     for layer in content["layers"]:
         kind = LAYERS[layer["layer"]]
         layers.append(kind(**_record(kind, layer, arrays)))
-    return Panel(**_record(Panel, content, arrays) | {"layers": layers})
+    return Panel(**_record(Panel, content, arrays) | {"layers": layers})  # ty: ignore[invalid-argument-type]
 
 
 def _record(kind: type, content: ParsedTable, arrays: Sequence[np.ndarray]) -> ParsedTable:
     """Return the values of a class's fields; fields of later versions are left out."""
     record = {}
-    for field in fields(kind):
+    for field in fields(kind):  # ty: ignore[invalid-argument-type]
         if field.name in content:
             record[field.name] = _read(content[field.name], arrays)
     return record

@@ -12,6 +12,7 @@ from operator import attrgetter, itemgetter
 from xml.sax.saxutils import escape
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calib.procedure.report.figures.charts import (
     Bars,
@@ -254,13 +255,13 @@ def _scale(panel: Panel, letter: str, content: Sequence[np.ndarray]) -> _Scale:
 
 
 @singledispatch
-def _content(layer: Layer) -> tuple[object, object]:
+def _content(layer: Layer) -> tuple[ArrayLike, ArrayLike]:
     """Return the values that a layer shows along x and along y."""
     raise TypeError(f"no layer of a chart: {layer!r}")
 
 
 @_content.register
-def _(line: Line) -> tuple[object, object]:
+def _(line: Line) -> tuple[ArrayLike, ArrayLike]:
     y = np.asarray(line.y, dtype=float)
     if line.spread is None:
         return line.x, y
@@ -269,7 +270,7 @@ def _(line: Line) -> tuple[object, object]:
 
 
 @_content.register
-def _(bars: Bars) -> tuple[object, object]:
+def _(bars: Bars) -> tuple[ArrayLike, ArrayLike]:
     values = np.asarray(bars.values, dtype=float)
     spread = np.zeros(len(values)) + (0.0 if bars.spread is None else np.asarray(bars.spread))
     ends = np.concatenate([values - spread, values + spread, [bars.base]])
@@ -278,34 +279,34 @@ def _(bars: Bars) -> tuple[object, object]:
 
 
 @_content.register
-def _(level: Level) -> tuple[object, object]:
+def _(level: Level) -> tuple[ArrayLike, ArrayLike]:
     return ([level.at], ()) if level.upright else ((), [level.at])
 
 
 @_content.register
-def _(label: Label) -> tuple[object, object]:
+def _(label: Label) -> tuple[ArrayLike, ArrayLike]:
     return (), ()
 
 
 @_content.register
-def _(dots: Dots) -> tuple[object, object]:
+def _(dots: Dots) -> tuple[ArrayLike, ArrayLike]:
     return dots.x, dots.y
 
 
 @_content.register
-def _(heat: Heat) -> tuple[object, object]:
+def _(heat: Heat) -> tuple[ArrayLike, ArrayLike]:
     rows, columns = np.shape(heat.values)
     left, right, bottom, top = heat.extent or (-0.5, columns - 0.5, rows - 0.5, -0.5)
     return [left, right], [bottom, top]
 
 
 @_content.register
-def _(histogram: Histogram) -> tuple[object, object]:
+def _(histogram: Histogram) -> tuple[ArrayLike, ArrayLike]:
     return histogram.edges, np.append(histogram.counts, 0.0)
 
 
 @_content.register
-def _(box: Box) -> tuple[object, object]:
+def _(box: Box) -> tuple[ArrayLike, ArrayLike]:
     return box.values, [box.position - 0.5, box.position + 0.5]
 
 
