@@ -42,12 +42,12 @@ read, too). No number: null.
 as in the geometric fit's corrections) with sigma, whether it is identified, and the rms difference of the encoders: as
 recorded, without their delay, and what delay and compliance leave.
 
-Figures: those of the report, as ``plot_torque_N.png`` of every unseen recording in the order given, of those to learn
-from where none is unseen (measured, predicted, residual, low-passed to the identification band), ``plot_errors.png``,
-``plot_residuals.png`` (autocorrelation; dashed: white noise), ``plot_significance.png``, and, where the geometry's
-uncertainty is known, what it adds to sigma; ``plot_friction.png`` (over velocity), in a session that
-alone: its report has the others. Recordings to learn from are drawn by ``model.plot("torque_N")``, where N counts on
-after the unseen ones.
+Figures are in report.html, and with ``--plots png`` (or svg) as files, too: ``plot_torque_N.png`` of every unseen
+recording in the order given, of those to learn from where none is unseen (measured, predicted, residual, low-passed to
+the identification band), ``plot_errors.png``, ``plot_residuals.png`` (autocorrelation; dashed: white noise),
+``plot_significance.png``, and, where the geometry's uncertainty is known, what it adds to sigma; ``plot_friction.png``
+(over velocity), in a session that alone: its report has the others. Recordings to learn from are drawn by
+``model.plot("torque_N")``, where N counts on after the unseen ones.
 """
 
 import json

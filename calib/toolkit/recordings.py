@@ -1,6 +1,7 @@
 """Recordings: joint positions and torques over time, the motions filtered from recordings, and planned motions."""
 
 from calib.data.joint_columns import words_of
+from calib.data.recordings.bags import bag_table, is_bag
 from calib.data.recordings.datasets import dataset_table, is_dataset
 from calib.data.recordings.log_columns import families, series_of, time_column
 from calib.data.recordings.recording import Recording, parse_cut
@@ -31,9 +32,11 @@ __all__ = [
     "FilterOptions",
     "Recording",
     "at_times",
+    "bag_table",
     "dataset_table",
     "design_decimator",
     "families",
+    "is_bag",
     "is_dataset",
     "likely_unit",
     "make_motion",

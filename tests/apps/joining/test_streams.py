@@ -260,6 +260,7 @@ def check_step(log: Path, stream: Path, robot: str, size: float, file: str, row:
     assert abs(int(said[4]) - row) <= 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [5e-3, -0.02, 0.2])
 def test_instrument_clock_step_is_refused(tmp_path, files, size):
     """A step of the instrument's clock is refused with its size and row."""

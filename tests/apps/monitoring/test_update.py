@@ -13,6 +13,7 @@ from calib.apps.monitoring.learning.logs import common_share, dated, sketch
 from calib.apps.monitoring.learning.update import update_dynamics
 from calib.data.csv_table import read_table
 from calib.errors import MeasurementError, UsageError
+from calib.procedure.report.figures import figure_data
 from calib.result_kinds import kind_of
 from calib.results.result_classes import open_result
 from calib.robot import description
@@ -66,7 +67,7 @@ def test_the_folder_is_an_identification_with_the_values_of_today(identified: Pa
     kind = kind_of(folder)
     assert kind is not None and kind.name == "identification"
     assert open_result(folder).verdict == "not judged"
-    assert (folder / "plot_drift.png").stat().st_size > 1000
+    assert set(figure_data.of_folder(folder)) == {"drift"}
     assert read_table(folder / DRIFT).numbers("day", None).size == 2
     assert read_table(folder / LOG_TABLE).numbers("seconds", None).size == 2
     written = json.loads((folder / "dynamics.json").read_text())

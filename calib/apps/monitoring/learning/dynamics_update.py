@@ -14,11 +14,22 @@ import numpy as np
 
 from calib import files, folders
 from calib.apps.monitoring.learning.working_state import LOGS, STATE, LogRecord, WorkingState
+from calib.config_types import Plots
 from calib.errors import Finding
 from calib.records import plain
 from calib.result_kinds import BY_NAME
 from calib.toolkit.model_identification import FRICTION, GAIN
-from calib.toolkit.report_pages import Entry, RecordColumn, Section, Text, as_html, report_page, table
+from calib.toolkit.report_pages import (
+    ChartPicture,
+    Entry,
+    Pictures,
+    RecordColumn,
+    Section,
+    Text,
+    as_html,
+    report_page,
+    table,
+)
 from calib.toolkit.result_folders import (
     INSTRUMENTAL,
     LEVELS,
@@ -37,11 +48,11 @@ from calib.toolkit.torque_models import INFORMATION, MODEL, Case, predict, score
 from calib.units import headings
 
 if TYPE_CHECKING:
-    from calib.toolkit.report_charts import Chart
+    from calib.toolkit.report_charts import Captioned, Chart
 
 PAGE = "report.html"
 DRIFT, LOG_TABLE, TORQUES = "friction_drift.csv", "logs.csv", "torques_1.csv"
-PICTURE = "plot_{}.png"
+CAPTION = "Friction and gains against date; dashed: first identification. Bars: one σ."
 LOG_HEADER = (
     "log",
     "date",
@@ -68,7 +79,7 @@ WRITTEN = (
     LOGS,
 )
 """Files that an update writes anew."""
-OUTDATED = (INSTRUMENTAL, *folders.PAGES, "torques_*.csv", "plot_*.png")
+OUTDATED = (INSTRUMENTAL, *folders.PAGES, "torques_*.csv", *folders.figure_files("*"))
 """Files of the identification that do not hold for the updated model, and are not copied."""
 DRAWN_SHAPES = ("sign", "velocity")
 PANEL_HEIGHT = 1.9  # of the figure, per row of panels [inch]
@@ -202,7 +213,7 @@ class DynamicsUpdate(ChartedResult, ReportedResult):
 
     def charts(self) -> dict[str, Chart]:
         """Return the figure by name: Coulomb and viscous friction and gains against date, with one sigma."""
-        from calib.toolkit.report_charts import AFTER, QUIET, Chart, Panel, line
+        from calib.toolkit.report_charts import AFTER, QUIET, Chart, Line, Panel
 
         record = self.state.record
         days = np.array([log.day for log in record.logs])
@@ -216,11 +227,11 @@ class DynamicsUpdate(ChartedResult, ReportedResult):
         for k, index in enumerate(self.state.drifting):
             if not self._drawn(index):
                 continue
-            layers = [line(days, values[:, k], "o-", AFTER, spread=sigmas[:, k])]
+            layers = [Line(days, values[:, k], "o-", AFTER, spread=sigmas[:, k])]
             first = 1.0
             if index < self.state.model.k:
                 first = record.values[index]
-            layers.append(line(days[[0, -1]], np.full(2, first), "--", QUIET))
+            layers.append(Line(days[[0, -1]], np.full(2, first), "--", QUIET))
             title = f"{record.names[index]} [{record.units[index]}]".replace(" []", "")
             panels.append(Panel(layers, title, label))
         return {"drift": Chart(panels, 0.6 + PANEL_HEIGHT * -(-len(panels) // 4), 4)}
@@ -232,14 +243,14 @@ class DynamicsUpdate(ChartedResult, ReportedResult):
         term = self.state.model.term(parameter)
         return term is not None and term.shape in DRAWN_SHAPES
 
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the updated model into a folder, which is one of an identification, and return its path.
 
         Added are report.html, friction_drift.csv, logs.csv, and the state from which the next update goes on.
 
         Args:
             out: the folder; not the one that was updated.
-            plots: whether the figure is drawn.
+            plots: False: no figure, True: in the page, ``png`` or ``svg``: as a file, too.
 
         Raises:
             UsageError: the folder contains files that are not of an identification.
@@ -255,7 +266,7 @@ class DynamicsUpdate(ChartedResult, ReportedResult):
         names = {path.name for path in self.state.folder.iterdir() if path.is_file()}
         return sorted(names - replaced)
 
-    def _write(self, folder: Path, plots: bool) -> None:
+    def _write(self, folder: Path, plots: Plots) -> None:
         for name in self._copied():
             shutil.copy(self.state.folder / name, folder / name)
         self.state.write(folder)
@@ -331,22 +342,22 @@ class DynamicsUpdate(ChartedResult, ReportedResult):
             columns.append(values[rows])
         files.write_numbers(path, names, np.column_stack(columns))
 
-    def _write_page(self, folder: Path, plots: bool) -> None:
-        section = self.section()
-        if plots:
-            from calib.toolkit.report_charts import picture
-            from calib.toolkit.report_pages import Pictures
+    def _write_page(self, folder: Path, plots: Plots) -> None:
+        from calib.toolkit.report_charts import write_figures
 
+        section = self.section()
+        charts: dict[str, Captioned] = {}
+        if plots:
             drawings = []
             for name, chart in self.charts().items():
-                drawing = picture(chart, "Friction and gains against date; dashed: first identification. Bars: one σ.")
-                files.write(folder / PICTURE.format(name), drawing.image)
-                drawings.append(drawing)
+                drawings.append(ChartPicture(chart, CAPTION, name))
+                charts[name] = chart, CAPTION
             section = Section(section.title, [*section.blocks, Pictures("", drawings)], section.verdict, section.reason)
         robot = self.state.robot.chain.name
         entries = [Entry("robot", robot), Entry("updated from", str(self.state.folder))]
         page = report_page(f"Dynamics of {robot}, learnt at work", robot, entries, [section])
         files.write(folder / PAGE, as_html(page))
+        write_figures(folder, charts, plots, paged=True)
 
     def _report(self) -> UnseenReport:
         """Return the data of certificate and figures: the last log, predicted before it was learnt from."""

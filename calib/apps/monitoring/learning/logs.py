@@ -75,7 +75,8 @@ def _moment(path: str) -> datetime | None:
     for part in reversed(re.split(r"[/\\]", path.partition("@")[0])):
         for match in DATE.finditer(part):
             try:
-                return datetime(*[int(text) for text in match.groups(default="0")])  # type: ignore[arg-type]
+                year, month, day, hour, minute, second = map(int, match.groups(default="0"))
+                return datetime(year, month, day, hour, minute, second)
             except ValueError:
                 continue
     return None
