@@ -155,7 +155,7 @@ def curve(robot: str) -> list[dict[str, float]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("robots", nargs="*", default=list(CURVES))
-    print("| robot | s | identify | update | LS | ridge | DREM | best / best reference |")
+    print("| robot | s | identify | update | LS | ridge | DREM | identify, update / best reference |")
     print("|---|---|---|---|---|---|---|---|")
     for robot in parser.parse_args().robots:
         for row in curve(robot):
