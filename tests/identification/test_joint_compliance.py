@@ -6,7 +6,12 @@ import pytest
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.motion import FilterOptions, make_motion
-from calib.identification.joint_compliance import EncoderDifference, JointCompliance, compared, encoder_difference
+from calib.identification.checks.joint_compliance import (
+    EncoderDifference,
+    JointCompliance,
+    compared,
+    encoder_difference,
+)
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import Case, make_case
 from calib.procedure.dynamic_stage.verdict import elastic_findings

@@ -12,9 +12,9 @@ import numpy as np
 from calib import files, folders
 from calib.data.csv_table import read_table
 from calib.dynamics.base import expressions
+from calib.identification.checks.joint_compliance import JointCompliance, encoder_difference
 from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
-from calib.identification.joint_compliance import JointCompliance, encoder_difference
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.physical_consistency import information
 from calib.identification.prediction import Dynamics, Score, predict

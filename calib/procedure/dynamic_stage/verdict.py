@@ -14,8 +14,8 @@ import numpy as np
 from calib.data.signals.persistency import ExcitationReport
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, finding
+from calib.identification.checks.joint_compliance import encoder_difference
 from calib.identification.identify import Identification
-from calib.identification.joint_compliance import encoder_difference
 from calib.identification.prediction import Dynamics, Score
 from calib.identification.rows import Case
 from calib.identification.uncertainty.torque_errors import COVERED, TorqueIntervals
