@@ -9,11 +9,12 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from copy import copy
 from dataclasses import fields, is_dataclass
+from enum import StrEnum
 from functools import partial, wraps
 from inspect import Parameter, cleandoc, signature
 from math import inf, isfinite
@@ -27,9 +28,10 @@ from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
 from calib.cli.completion import completion
 from calib.cli.help import Command, type_word
 from calib.config import described, parse
-from calib.config_types import OneOf, Typed
+from calib.config_types import OneOf, Plots, Typed
 from calib.errors import UsageError, require
 from calib.units import plain_number
+from calib.workers.extras import installed, lacking
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -278,7 +280,8 @@ class Common:
         base: URDF: the link the arm starts at.
         tip: URDF: the link the arm ends at; else its flange (tool0, flange), which is printed with the reason.
         workers: local processes, or the address of a Dask scheduler.
-        plots: draw figures, or leave them out.
+        plots: write each figure as a file, too. Default: figures are on the page.
+        no_plots: leave figures out.
         verbose: print all details, tables included.
         overwrite: replace all existing files; without it, only those of an earlier run.
     """
@@ -317,6 +320,8 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
         for key, parameter in parameters.items():
             if key in settings:
                 options += [option for option in _options(settings[key]) if option.name not in parameters]
+            elif key == "plots":
+                options += _plots_options(descriptions)
             elif listing or key != "verbose":
                 names = (f"--{key.replace('_', '-')}",) if parameter.default is False else ()
                 annotation = _with_help(parameter, hints[key], descriptions.get(key, ""), names)
@@ -333,6 +338,8 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
                 arguments = {key: _built(kind, values) for key, kind in settings.items()}
                 with printing(bool(values.get("verbose", True))):
                     arguments |= {key: value for key, value in values.items() if key in parameters}
+                    if "plots" in parameters:
+                        arguments["plots"] = _plots(values)
                     return function(**arguments)
             except UsageError as error:
                 error.args = (_as_typed(str(error), options),)
@@ -345,6 +352,44 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
         return function
 
     return add
+
+
+class PlotFormat(StrEnum):
+    """Formats of figures that are written as files."""
+
+    PNG = "png"
+    SVG = "svg"
+
+
+def _plots_options(descriptions: Mapping[str, str]) -> Iterator[Parameter]:
+    """Yield the options ``--plots`` and ``--no-plots`` of a command that has the parameter `plots`.
+
+    Args:
+        descriptions: name of a parameter -> its help.
+    """
+    file_format = typer.Option("--plots", metavar="png|svg", help=descriptions["plots"])
+    kind = Annotated[PlotFormat | None, file_format]
+    yield Parameter("plots", Parameter.KEYWORD_ONLY, default=None, annotation=kind)
+    none = typer.Option("--no-plots", metavar=type_word(bool), help=descriptions["no_plots"])
+    yield Parameter("no_plots", Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, none])
+
+
+def _plots(values: Mapping[str, object]) -> Plots:
+    """Return which figures a command writes.
+
+    Args:
+        values: the command line's values.
+
+    Raises:
+        UsageError: figures are asked for and left out.
+    """
+    asked = values["plots"]
+    require(not (asked and values["no_plots"]), "--plots and --no-plots exclude each other", UsageError)
+    if asked == PlotFormat.PNG:
+        require(installed("matplotlib"), f"{lacking('matplotlib')}; without it: --plots svg", UsageError)
+    if isinstance(asked, PlotFormat):
+        return asked.value
+    return not values["no_plots"]
 
 
 def _with_help(parameter: Parameter, hint: object, description: str, names: Sequence[str]) -> object:

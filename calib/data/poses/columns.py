@@ -29,8 +29,9 @@ from calib.data.poses.name_shapes import (
     with_shape,
 )
 from calib.data.schema import BOUNDS, Column, Joints
-from calib.errors import MeasurementError, one_of, suggestion
+from calib.errors import MeasurementError, listing, one_of, suggestion
 from calib.units import ANGLES as ANGLE_UNITS
+from calib.units import COUNT_WORDS, EFFORTS, encoder_counts
 
 SUFFIXES = ("", "_meas", "_measured")
 POSITION = Column(("x", "y", "z"), "length", "position", BOUNDS.max_length, "mm")
@@ -51,8 +52,10 @@ DISTANCE = Column(("distance",), "length", "distance", BOUNDS.max_length, "mm", 
 SIGMA_DISTANCE = Column(("sigma_distance",), "length", "sigma", positive=SIGMA.positive)
 LATE = Column(("late_x", "late_y", "late_z"), "speed", "late")
 TIME = Column(("time",), "time", "time")
+TORQUE = Column((), "torque", "torque")
+PAYLOAD = Column(("payload",), "mass", "payload")
 LABELS = ("distance", "pair", "bar", "socket", "plane", "tool")
-UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation")
+UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation", "torque")
 BASE_TIME = "base_time"
 _OF_FRAME = (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION)
 _FAMILIES = (*_OF_FRAME, SIGMA_DISTANCE, LATE)
@@ -61,6 +64,7 @@ OURS = (
     *(f"base_{name}" for column in _OF_FRAME for name in column.names),
     BASE_TIME,
     *LABELS,
+    *PAYLOAD.names,
 )
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
@@ -115,7 +119,11 @@ class Sheet:
             column: the file's name of the column.
             family: family of columns under which the options may have the unit.
         """
-        return self.table.units[self.table.index(column)] or self._unit_of_options(column, family)
+        header_unit = self.table.units[self.table.index(column)]
+        unit = self._unit_of_options(column, family)
+        if encoder_counts(unit) and header_unit.lower() in COUNT_WORDS:
+            return unit
+        return header_unit or unit
 
     def _unit_of_options(self, column: str, family: str) -> str:
         units = self.options.units
@@ -159,7 +167,8 @@ class Sheet:
         Args:
             joints: names of the robot's joints, which the options may map, too.
         """
-        names = (*OURS, *joints, *(f"q{i + 1}" for i in range(len(joints))))
+        numbers = range(1, len(joints) + 1)
+        names = (*OURS, *joints, *(f"q{number}" for number in numbers), *(f"tau{number}" for number in numbers))
         for name, heading in self.options.columns.items():
             if name not in names and not _TARGET.fullmatch(name):
                 near = suggestion(name, names)
@@ -205,16 +214,17 @@ class Sheet:
                 break
         return self._joints_by_words(robot, message, missing[0] if message else None)
 
-    def has_our_names(self, columns: Sequence[str], joints: Sequence[str]) -> bool:
+    def has_our_names(self, columns: Sequence[str], joints: Sequence[str], mapped: bool = True) -> bool:
         """Return whether joint columns have names of the robot's joints or of this toolkit, or the options map them.
 
         Args:
             columns: the file's names of the joint columns.
             joints: names of the robot's joints.
+            mapped: whether columns that the options map count.
         """
-        mapped = self.options.columns.values()
+        by_options = self.options.columns.values() if mapped else ()
         for number, (column, joint) in enumerate(zip(columns, joints), 1):
-            if column not in (joint, f"q_{joint}", f"q{number}", *mapped):
+            if column not in (joint, f"q_{joint}", f"q{number}", *by_options):
                 return False
         return True
 
@@ -227,7 +237,8 @@ class Sheet:
             column: the name of the missing column, for the message.
 
         Raises:
-            MeasurementError: no series, or several; the message ends with a line for the options, where it can.
+            MeasurementError: no series; the message ends with a line for the options, where it can.
+        Undecided: several series.
         """
         table, n = self.table, len(robot.names)
         series = series_named_in_cells(table, robot.names) or joint_series(table.header, robot.names, robot.kinds)
@@ -235,8 +246,14 @@ class Sheet:
         if len(positions) == 1:
             return positions[0].columns
         if len(positions) > 1:
-            choices = " or ".join(map(described, positions))
-            self.fail(f"joints may be {choices}: choose by one line in the options: {mapping_line(positions[0])}")
+            choices = {}
+            for entry in positions:
+                columns = {**_of_joints(entry.columns), **self.options.columns}
+                choices[mapping_line(entry)] = replace(self.options, columns=columns)
+            names = " or ".join(map(described, positions))
+            lines = " or ".join(list(choices)[:2])
+            message = f"joints may be {names}: choose by one line in the options: {lines}"
+            raise Undecided(table, message, choices)
         if not message:
             expected = f"expected q1 to q{n}, or {', '.join(robot.names)}"
             message = f"no joint columns: {expected}; found {', '.join(table.header)}"
@@ -341,6 +358,8 @@ class Layout:
         base: three names for the position of a frame on the robot's base, then those of its orientation; or none.
         base_sigma, base_sigma_rotation: three names each for the sigmas of the base frame, or none.
         late: four names for the target's velocity and the time, or none.
+        torques: n names of the joints' torques at rest, or none.
+        payload: name of the column with the mass that the tip carries; "" without one.
         notes: remarks for the user on how the columns were chosen.
     """
 
@@ -357,13 +376,17 @@ class Layout:
     base_sigma: tuple[str, ...] = ()
     base_sigma_rotation: tuple[str, ...] = ()
     late: tuple[str, ...] = ()
+    torques: tuple[str, ...] = ()
+    payload: str = ""
     notes: tuple[str, ...] = ()
 
     @property
     def used(self) -> frozenset[str]:
         """The file's names of all columns that are read."""
         families = (*self.positions, *self.sigmas, self.orientation, self.sigma_rotation, self.distance, self.group)
-        return frozenset().union(*families, self.joints, *self.of_base, self.late, (self.tool,))
+        return frozenset().union(
+            *families, self.joints, *self.of_base, self.late, self.torques, (self.tool, self.payload)
+        )
 
     @property
     def of_base(self) -> tuple[tuple[str, ...], ...]:
@@ -384,7 +407,7 @@ def find_layout(sheet: Sheet, joints: Joints | Sequence[str]) -> Layout:
     """
     robot = Joints.of(joints)
     sheet.check_names(robot.names)
-    layout = _layout(sheet, robot)
+    layout = replace(_layout(sheet, robot), torques=_find_torques(sheet, robot), payload=sheet.find("payload"))
     if not sheet.has_our_names(layout.joints, robot.names):
         note = f"the joints are read from {', '.join(layout.joints)}"
         layout = replace(layout, notes=(note, *layout.notes))
@@ -405,6 +428,24 @@ def find_layout(sheet: Sheet, joints: Joints | Sequence[str]) -> Layout:
                 heading,
             )
     return layout
+
+
+def _find_torques(sheet: Sheet, robot: Joints) -> tuple[str, ...]:
+    """Return the names of the joints' torques, ``tau1`` … or ``tau_<joint name>``; () where not all are there.
+
+    Columns in a unit of currents are none: gravity at rest is compared with torques.
+
+    Args:
+        sheet: the table with its options.
+        robot: the robot's joints.
+    """
+    numbers = range(1, len(robot.names) + 1)
+    for form in ([f"tau{number}" for number in numbers], [f"tau_{name}" for name in robot.names]):
+        columns = tuple(filter(None, map(sheet.find, form)))
+        if len(columns) == len(form):
+            units = {sheet.unit(column, "torque").lower() for column in columns}
+            return columns if units <= {"", *EFFORTS} else ()
+    return ()
 
 
 def _layout(sheet: Sheet, robot: Joints) -> Layout:
@@ -445,8 +486,7 @@ def with_shapes(sheet: Sheet, robot: Joints) -> Sheet:
         robot: the robot's joints.
 
     Raises:
-        Undecided: a quaternion whose components are numbered.
-        MeasurementError: several positions or orientations have such names.
+        Undecided: a quaternion whose components are numbered; several positions or orientations have such names.
     """
     _refuse_base_alone(sheet)
     joints = sheet.find_joints(robot)
@@ -484,15 +524,44 @@ def _with_only_shape(sheet: Sheet, shapes: Sequence[Shape]) -> Sheet:
         shapes: columns that by their names are the quantity.
 
     Raises:
-        MeasurementError: there are several.
+        Undecided: there are several.
     """
     if len(shapes) > 1:
+        choices = {_mapping(shape.columns): with_shape(sheet.options, shape) for shape in shapes}
         first, second = (", ".join(shape.columns.values()) for shape in shapes[:2])
-        line = _mapping(shapes[0].columns)
-        sheet.fail(f"{first} or {second} may be meant: choose by one line in the options, as in {line}")
+        line, other_line = list(choices)[:2]
+        message = f"{first} or {second} may be meant: choose by one line in the options: {line} or {other_line}"
+        raise Undecided(sheet.table, message, choices)
     if not shapes:
         return sheet
     return replace(sheet, options=with_shape(sheet.options, shapes[0]))
+
+
+def unread_rivals(sheet: Sheet, layout: Layout, robot: Joints) -> tuple[str, ...]:
+    """Return notes on columns that are not read and may be joints or a position as well as those that are read.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns that are read.
+        robot: the robot's joints.
+    """
+    unread = [name for name in sheet.table.header if name not in layout.used]
+    series = position_series(joint_series(unread, robot.names, robot.kinds))
+    mappings = [_of_joints(entry.columns) for entry in series if not entry.is_commanded]
+    if len(layout.positions) == 1:
+        shapes = positions_by_shape(unread)
+        mappings += [dict(shape.columns) for shape in shapes if not shape.is_commanded]
+    notes = []
+    for columns in mappings:
+        names = listing(columns.values(), 3)
+        line = _mapping(columns)
+        notes.append(f"{names} are not read; if they are meant (another arm's?), state it in the options: {line}")
+    return tuple(notes)
+
+
+def _of_joints(columns: Sequence[str]) -> dict[str, str]:
+    """Return the names q1 … of joints → the file's names of their columns."""
+    return {f"q{number}": column for number, column in enumerate(columns, 1)}
 
 
 def _mapping(columns: Mapping[str, str]) -> str:

@@ -17,6 +17,7 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
     planned = "poses.csv"            # of a file without joints: the poses driven, in this order or found by geometry
     base_frame = "auto"              # a frame on the base in columns base_x …: used where it is there; "measured": it
                                      # must be there; "ignored": the target is seen from the instrument
+    payload = { mass = 2.5, centre = [0, 0, 0.1] } # that the tip carries [kg], [m] in the tip's frame; mass 0: none
     socket_distance = 0.05           # between two sockets of the same fixture position
     socket_pairs = [["0", "1"]]      # which sockets that joins, where there are more than two
     model = "auto"                   # or the largest model of the ladder to fit; all names: below
@@ -31,7 +32,7 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
     x = "X_leica"
     [units]                          # of columns whose header states none: our name, or joints, position, distance,
                                      # orientation, sigma, sigma_rotation
-    joints = "deg"
+    joints = "deg"                   # or encoder counts per turn, and the count at zero: "counts/4096@2048"
     [sigma]                          # standard deviations: a number, or one per axis
     position = [1e-5, 1e-5, 2e-5]
     orientation = 1e-4
@@ -60,7 +61,7 @@ from calib.config_types import Expect, Flag, Hidden, Label, Name, Names, OneOf, 
 from calib.data.poses import IGNORED, IN_HAND, MEASURED, MIN_SIGMA, TO_HAND, Loss, Model
 from calib.data.poses.measurements import KINDS
 from calib.errors import refuse_option, suggestion
-from calib.units import ANGLES, LENGTHS
+from calib.units import ANGLES, COUNTS, LENGTHS
 
 FORMATS = ("csv", "robodk", "three_smr")
 AXES = ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "zyz", "zxz")
@@ -75,9 +76,24 @@ RadiansOrZero = Annotated[float, Real(above=0, least=MIN_SIGMA, most=1.0, unit="
 Each = Spread(3, "a number or three")
 
 
-OF_COLUMNS = ("sign", "coupling", "still", "order", "zero", "rows", "targets", "reflection", "convention", "copies")
+OF_COLUMNS = (
+    "sign",
+    "coupling",
+    "still",
+    "order",
+    "zero",
+    "rows",
+    "targets",
+    "reflection",
+    "convention",
+    "copies",
+    "units",
+)
 FINDINGS = ("unexplained", *OF_COLUMNS, "moved", "scale", "commanded", "range")
 """Names in ``accept``: those of chapter 1 of the catalogue of findings."""
+
+
+COUNTED = "or counts/4096@2048: an encoder's counts per turn, and its count at the joint's zero"
 
 
 @strict
@@ -112,6 +128,20 @@ class CameraOptions:
 
 @strict
 @dataclass(frozen=True)
+class Carried:
+    """What the tip carries, beyond the masses of the robot's description; None for what is not stated.
+
+    Attributes:
+        mass: its mass [kg]; 0 for nothing.
+        centre: its centre of mass in the tip's frame [m].
+    """
+
+    mass: Annotated[float, Real(above=0, most=1e4, unit="kg", zero=True)] | None = None
+    centre: Annotated[tuple[float, float, float], Expect("three numbers [m]")] | None = None
+
+
+@strict
+@dataclass(frozen=True)
 class FileOptions:
     """Options for reading one measurement file; by default its header determines everything. Keys as in the file.
 
@@ -122,6 +152,7 @@ class FileOptions:
         external: names of joints that are external axes of the controller, where names and kinds do not tell.
         planned: CSV of the poses that were to be measured, for a file without joints.
         base_frame: whether the target is seen from the base frame that the file's columns ``base_`` contain.
+        payload: what the tip carries; a column ``payload`` replaces its mass.
     """
 
     kind: Annotated[str, OneOf(tuple(KINDS))] = ""
@@ -130,7 +161,7 @@ class FileOptions:
     format: Annotated[str, OneOf(FORMATS)] = ""
     euler: Annotated[str, OneOf(EULER)] = ""
     columns: Mapping[str, Name] = field(default_factory=dict)
-    units: Mapping[str, Annotated[str, OneOf((*ANGLES, *LENGTHS))]] = field(default_factory=dict)
+    units: Mapping[str, Annotated[str, OneOf((*ANGLES, *LENGTHS), COUNTED, COUNTS)]] = field(default_factory=dict)
     sigma: Sigma = field(default_factory=Sigma)
     groups: Names = ()
     where: Mapping[str, Annotated[tuple[Label, ...], Spread(words="a text, a number, or a list of them")]] = field(
@@ -143,6 +174,7 @@ class FileOptions:
     check_limits: Flag = True
     planned: Name = ""
     base_frame: Annotated[str, OneOf(("auto", MEASURED, IGNORED))] = "auto"
+    payload: Carried = field(default_factory=Carried)
     camera: CameraOptions = field(default_factory=CameraOptions)
 
 

@@ -19,7 +19,7 @@ from calib.identification.physical_consistency import information
 from calib.identification.prediction import Dynamics, Score, predict
 from calib.identification.rows import Case
 from calib.identification.uncertainty.torque_errors import TorqueErrorModel, read_uncertainty
-from calib.procedure.dynamic_stage import geometry_tables
+from calib.procedure.dynamic_stage import geometry_tables, with_geometry
 from calib.procedure.dynamic_stage.identify import (
     DynamicsAssessment,
     IdentificationOutcome,
@@ -57,9 +57,10 @@ OURS = (
     geometry_tables.SENSITIVITY,
     geometry_tables.GEOMETRIES,
     geometry_tables.TORQUE_COVARIANCE,
-    "plot_torque_[0-9]*.png",
-    *(f"plot_{name}.png" for name in ("errors", "residuals", "friction", "significance")),
-    *(f"plot_{name}.png" for name in ("geometries", "geometry_effects")),
+    with_geometry.TABLE,
+    with_geometry.COVARIANCE,
+    *folders.figure_files("torque_[0-9]*", "velocity_[0-9]*", "errors", "residuals", "friction", "significance"),
+    *folders.figure_files("geometries", "geometry_effects"),
 )
 """Files of an earlier identification that a new one replaces."""
 INSTRUMENTAL_HEADER = ("name", "unit", "instrumental", "sigma", "least_squares", "shift_sigma", "explained_percent")
@@ -237,6 +238,8 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
         covariance = outcome.carried.covariance
     folders.write_covariance(folder / folders.COVARIANCE, identification.names, covariance)
     geometry_tables.write(outcome, folder)
+    if outcome.jointly is not None and outcome.carried is not None:
+        with_geometry.write(outcome.jointly, outcome.carried, folder)
     if identification.loop.table:
         files.write_table(folder / INSTRUMENTAL, INSTRUMENTAL_HEADER, identification.loop.table)
     # without a prior and constraints, estimate and covariance say it all

@@ -60,7 +60,7 @@ def test_motion_is_written_within_its_limits(cell, calib):
     """The motion keeps its limits, and is written for a controller."""
     Path("limits.toml").write_text(LIMITS)
     stands = "-0.8,-1.0,-1.0,-1.2,0.2,-1.5,0.3"
-    played = ("--start", stands, "--repeat", 2, "--slower", 3, "--plots")
+    played = ("--start", stands, "--repeat", 2, "--slower", 3, "--plots", "png")
     code, out, err = calib("excite", "lwr4plus", "--limits", "limits.toml", "--out", "e", *QUICK, *played)
     assert code == 0, err
     assert "self-collision (capsules" in out and "NOT checked: walls of the cell (not known), obstacles" in out
