@@ -9,7 +9,9 @@ from calib import files
 from calib.config_types import Plots
 from calib.data.csv_table import Table, read_table
 from calib.errors import UsageError, require
+from calib.folders import GRAVITY_SUMMARY
 from calib.procedure.excitation.coefficients import PLANNED, RUN, SAMPLES
+from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.selection import FIGURES_PAGE
 from calib.procedure.report.page import ChartPicture, chart_pictures
 from calib.result_kinds import kind_of, refusal
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
     from calib.results.scene import Scene
 
 FIGURE_SUFFIXES = (".html", ".png", ".svg")
+# Beginning of the line with a verdict.
+VERDICT = "verdict "
 
 
 class StoredMotion(Viewed):
@@ -103,10 +107,24 @@ class StoredSelection(StoredFile):
         return scene_files.read(self.path, robot)
 
 
+class StoredGravity(StoredResult):
+    """Folder of the gravity that standing poses identify."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict in the summary."""
+        for line in (self.path / GRAVITY_SUMMARY).read_text(encoding="utf-8").splitlines():
+            if line.startswith(VERDICT):
+                level, _, reason = line.removeprefix(VERDICT).partition(": ")
+                return Verdict(level, reason)
+        return super().verdict
+
+
 # classes of the kinds that have functions of their own, by name; the others are plain `StoredResult`
 CLASSES: dict[str, type[StoredResult]] = {
     "fit": StoredFit,
     "identification": StoredIdentification,
+    "gravity": StoredGravity,
     "excitation": StoredMotion,
     "plan": StoredMotion,
     "selection": StoredSelection,

@@ -86,7 +86,7 @@ def update(
     Each log is predicted before it is learnt from. One that is not as predicted (a load that was not stated, other
     friction, another unit, another arm) is named with its cause, and not averaged in.
 
-    Example: calib update dynamics log_2026-03-14.csv log_2026-03-21.csv --out dynamics-march
+    Example: calib update dynamics log.csv --out today
 
     Args:
         folder: folder of calib identify, or of an earlier update

@@ -144,7 +144,7 @@ def test_mistakes_in_files_are_shown_with_their_cure(session: Session, client: T
     """What cannot be read is no measurement; the page says why, and what to do."""
     names = ",".join(f"joint{k}" for k in range(1, 8))
     for name, content, words in (
-        ("book.xlsx", b"PK\x03\x04" + bytes(range(256)), "save a spreadsheet as CSV"),
+        ("book.xlsx", b"PK\x03\x04" + bytes(range(256)), "save the sheet as CSV"),
         ("far.csv", b"x,y,z\n1000,2,3\n1100,2,3\n", "[mm]"),
         ("deg.csv", f"{names}\n0,0,0,0,0,0,0\n90,0,0,0,0,0,0\n".encode(), "[deg]"),
         ("<i>.csv", b"u,v\n1,2\n", "say below which of them is what"),

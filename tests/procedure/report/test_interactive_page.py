@@ -20,7 +20,13 @@ from calib.procedure.report.figures import figure_data
 from calib.procedure.report.figures.charts import Captioned, Chart, Line, Panel
 from calib.procedure.report.figures.drawing import figure
 from calib.procedure.report.figures.svg import svg
-from calib.procedure.report.geometry_figures import correlation_map, error_histogram, error_map, residuals_by_joint
+from calib.procedure.report.geometry_figures import (
+    correlation_map,
+    error_histogram,
+    error_map,
+    image_coverage,
+    residuals_by_joint,
+)
 from calib.procedure.report.page import Pictures, ReportTable, Section, Text, chart_pictures
 from calib.procedure.report.templates import read, script_sources
 
@@ -57,6 +63,7 @@ def geometry(count: int = 60) -> dict[str, Captioned]:
         "map": (error_map(points, after), "map"),
         "rows": (Chart([by_row], 2.0), "by row"),
         "correlations": (correlation_map(["a", "b", HOSTILE], np.eye(3)), "correlations"),
+        "coverage": (image_coverage((640, 480), rng.integers(0, 3, (6, 8)), rng.uniform(size=(6, 8))), "corners"),
     }
 
 
@@ -246,6 +253,7 @@ def test_stored_figures_are_those_that_were_written(tmp_path):
             assert svg(again).startswith(b"<svg") and HOSTILE.encode() not in svg(again)
     drawn, again = (figure(one["map"][0]) for one in (charts, read_back))
     assert [axes.get_title(loc="left") for axes in again.axes] == [axes.get_title(loc="left") for axes in drawn.axes]
+    assert read_back["coverage"][0].panels[0].layers[0].limits == (0.0, None)
     curve = charts["torque_1"][0].panels[0].layers[0]
     stored = figure_data.read(tmp_path / figure_data.NAME)["torque_1"][0].panels[0].layers[0]
     np.testing.assert_allclose(stored.y, curve.y, atol=10.0 / 65535)

@@ -26,7 +26,7 @@ NAME = FIGURES
 BEGIN = '<script type="application/json" id="figures">'
 SCHEMA = 1
 # Numbers from which on a sequence is written as an array.
-SHORTEST_ARRAY = 4
+SHORTEST_ARRAY = 16
 # numbers of a curve up to which they have four bytes; others have steps, so many between their limits
 LONGEST_FLOATS, STEPS = 256, 65535
 # samples of all curves in a page: about 0.7 MB
@@ -205,9 +205,9 @@ def _value(value: FieldValue, arrays: Arrays, name: str) -> object:
         return {str(key): _value(item, arrays, str(key)) for key, item in value.items()}
     if isinstance(value, np.generic):
         return _value(value.item(), arrays, name)
-    if isinstance(value, float):
-        return value if np.isfinite(value) else None
-    if isinstance(value, str | int):
+    if isinstance(value, float) and not np.isfinite(value):
+        return {"float": str(value)}
+    if value is None or isinstance(value, str | float | int):
         return value
     if len(value) < SHORTEST_ARRAY or _of_records(value):
         return [_value(item, arrays, name) for item in value]
@@ -274,8 +274,10 @@ def _read(value: FieldValue, arrays: Sequence[np.ndarray]) -> FieldValue:
     """Return a JSON value as the value of a field."""
     if isinstance(value, Mapping) and "array" in value:
         return arrays[value["array"]]
-    if isinstance(value, list) and value and not isinstance(value[0], Mapping):
-        return tuple(np.nan if item is None else item for item in value)
+    if isinstance(value, Mapping) and "float" in value:
+        return float(value["float"])
+    if isinstance(value, list):
+        return tuple(_read(item, arrays) for item in value)
     return value
 
 

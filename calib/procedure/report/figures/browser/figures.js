@@ -38,6 +38,7 @@
     const filled = value => {
       if (!value || typeof value !== "object") return value;
       if (value.array !== undefined) return arrays[value.array];
+      if (value.float !== undefined) return value.float === "nan" ? NaN : value.float === "inf" ? Infinity : -Infinity;
       if (Array.isArray(value)) return value.map(filled);
       return Object.fromEntries(Object.entries(value).map(([key, item]) => [key, key === "arrays" ? null : filled(item)]));
     };
