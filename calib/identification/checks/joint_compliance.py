@@ -146,7 +146,8 @@ def _samples(dynamics: Dynamics[IdentificationModel], cases: Sequence[Case]) -> 
     result = {}
     for joint in sorted(parts):
         stacked = np.concatenate(parts[joint])
-        result[joint] = _Samples(*stacked[:, :5].T, stacked[:, 5:])
+        difference, torque, speed, recording, block = stacked[:, :5].T
+        result[joint] = _Samples(difference, torque, speed, recording, block, stacked[:, 5:])
     return result
 
 
