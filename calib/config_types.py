@@ -10,13 +10,14 @@ import ast
 import datetime
 import math
 import operator
+import re
 import reprlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeAlias, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, TypeAlias, get_args
 
 from calib.errors import CalibError, UsageError, suggestion
 from calib.units import QUANTITIES
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
 
 ParsedTable: TypeAlias = dict[str, Any]
 """A table of a TOML or JSON file as its parser returns it; who reads a value checks it."""
+
+Plots: TypeAlias = bool | Literal["png", "svg"]
+"""Figures of a result: False none, True as data and in its page, a format as files of this format, too."""
 
 # Pydantic's name of the error for an unknown key.
 UNKNOWN = "unexpected_keyword_argument"
@@ -118,8 +122,8 @@ def _expression(text: str, quantity: str) -> float:
     factor = 1.0
     factors = QUANTITIES.get(quantity, {})
     for unit in sorted(factors, key=len, reverse=True):
-        if text.endswith(unit):
-            text = text.removesuffix(unit).strip()
+        if text.endswith(unit):  # ty: ignore[invalid-argument-type]
+            text = text.removesuffix(unit).strip()  # ty: ignore[no-matching-overload]
             factor = factors[unit]
             break
     return evaluated(ast.parse(text, mode="eval").body) * factor
@@ -274,10 +278,12 @@ class OneOf(_Read):
     Attributes:
         allowed: the texts; or ``module:Name`` of a `Literal` with them, if the module is to be imported only when
             needed.
+        pattern: regular expression of further texts, which the hint names; "" for none.
     """
 
     allowed: tuple[str, ...] | str
     hint: str = ""
+    pattern: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -295,14 +301,15 @@ class OneOf(_Read):
         return f"{', '.join(self.allowed[:-1])} or {self.allowed[-1]}"
 
     def read(self, value: object) -> str:
-        if isinstance(value, str) and value in self.names:
+        if isinstance(value, str) and (value in self.names or (self.pattern and re.fullmatch(self.pattern, value))):
             return value
         near = suggestion(value, self.names) if isinstance(value, str) else ""
         raise _Refused(f"one of {', '.join(self.names)}{near}", value, self.hint)
 
     @property
     def json(self) -> Mapping[str, object]:
-        return {"enum": [*self.names], "type": "string"}
+        names: Mapping[str, object] = {"enum": [*self.names], "type": "string"}
+        return {"anyOf": [names, {"type": "string", "pattern": self.pattern}]} if self.pattern else names
 
 
 @dataclass(frozen=True)

@@ -4,12 +4,19 @@ Numbers in all files written by the toolkit are in SI, unless a header or a key 
 """
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Protocol
 
 DEG = math.pi / 180
 ANGLES = {"rad": 1.0, "deg": DEG, "mrad": 1e-3, "°": DEG, "degrees": DEG}
 LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "cm": 1e-2, "in": 0.0254}
+
+# counts per turn of an encoder, and the count at the joint's zero: counts/4096@2048
+COUNTS = r"counts/(\d+(?:\.\d+)?)(?:@(-?\d+(?:\.\d+)?))?"
+
+# units of encoders that do not say how many counts a turn has
+COUNT_WORDS = frozenset(("count", "counts", "cts", "tick", "ticks", "inc", "incs", "increments", "pulses", "steps"))
 
 # words for units in headers, in small letters, with the unit
 UNIT_WORDS: Mapping[str, str] = {
@@ -144,6 +151,17 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def encoder_counts(unit: str) -> tuple[float, float] | None:
+    """Return the counts per turn of an encoder and the count at zero, of a unit such as ``counts/4096@2048``.
+
+    None for other units, and for no counts per turn.
+    """
+    match = re.fullmatch(COUNTS, unit.lower())
+    if match is None or not float(match[1]):
+        return None
+    return float(match[1]), float(match[2] or 0.0)
 
 
 def unit_of(text: str) -> str:

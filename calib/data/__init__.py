@@ -1,5 +1,6 @@
 OFFERS = {
     "exports": (
+        "nested_tables:translated",
         "recordings.controller_logs:translated",
         "recordings.ros_texts:translated",
         "poses.exports:translated",

@@ -30,6 +30,7 @@ from calib.files import check_regular
 from calib.records import frozen, plain_text, read_only
 from calib.units import (
     ANGLES,
+    COUNT_WORDS,
     CURRENTS,
     EFFORTS,
     LENGTHS,
@@ -38,6 +39,7 @@ from calib.units import (
     TIMES,
     UNIT_WORDS,
     VELOCITIES,
+    encoder_counts,
     is_number,
     unit_of,
 )
@@ -57,8 +59,12 @@ _DETACHED_UNIT = re.compile(r"[ ]+([\[(])")
 # A cell of a spreadsheet, not a comment.
 _ERROR = re.compile(r"#(REF!|N/A|NUM!|DIV/0!|VALUE!|NAME\?|NULL!)", re.I)
 _DECIMAL_COMMA = re.compile(r"^[+-]?\d*,\d+([eE][+-]?\d+)?$")
-# 1.045,8959 and 1,045.8959
-_GROUPED = re.compile(r"^[+-]?(\d{1,3}(\.\d{3})+,\d*|\d{1,3}(,\d{3})+\.\d*)$")
+# 1.045,8959 and 1,045.8959, 1'045.8959 (Swiss) and 1 045,8959 (French, SI)
+_GROUPED = re.compile(
+    r"^[+-]?(\d{1,3}(\.\d{3})+,\d*|\d{1,3}(,\d{3})+\.\d*|\d{1,3}(['\u2019 \u00a0\u2009\u202f]\d{3})+([.,]\d*)?)$"
+)
+# 470,801: a decimal comma, or thousands
+_AMBIGUOUS = re.compile(r"^[+-]?\d{1,3}(,\d{3})+$")
 # Rows read at a time.
 _CHUNK = 20_000
 # Bytes of a file by which its encoding is told (our choice).
@@ -162,8 +168,8 @@ class Table:
         if dimension is None:
             return cells
         units = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}
-        units |= {"speed": QUANTITIES["speed"], "time": TIMES, "torque": EFFORTS, "mass": MASSES}
-        return cells * self.factor(column, units[dimension], unit)
+        units |= {"speed": QUANTITIES["speed"], "time": TIMES, "torque": EFFORTS, "mass": MASSES}  # ty: ignore[unsupported-operator]
+        return (cells - self.zero(column, unit)) * self.factor(column, units[dimension], unit)
 
     def check(self, names: Sequence[str], gaps: Collection[str] = ()) -> list[np.ndarray]:
         """Return columns (m,) as floats, not converted to SI, after checking that every cell is a finite number.
@@ -195,15 +201,33 @@ class Table:
             unit: unit stated by the options; "" if none. If both the header and the options state one, they must agree.
         """
         name, header_unit = self.header[column], self.units[column]
+        if encoder_counts(unit) and header_unit.lower() in COUNT_WORDS:
+            header_unit = ""
         if header_unit and unit and header_unit != unit:
             self.fail(f"the header states [{header_unit}], the options state {unit}: remove one of them", name)
         unit = header_unit or unit
         if not unit:
             return 1.0
+        counts = encoder_counts(unit)
+        if counts is not None and "rad" in factors:
+            return math.tau / counts[0]
         if unit.lower() not in factors:
             expected = ", ".join(name for name in factors if name.isascii())
-            self.fail(f"unit [{unit}] is not one of {expected}", name)
+            counts = ""
+            if unit.lower() in COUNT_WORDS and "rad" in factors:
+                counts = "; of an encoder, state counts per turn and the count at zero, as in [counts/4096@2048]"
+            self.fail(f"unit [{unit}] is not one of {expected}{counts}", name)
         return factors[unit.lower()]
+
+    def zero(self, column: int, unit: str) -> float:
+        """Return the count of an encoder at the joint's zero, by its unit; 0 for other units.
+
+        Args:
+            column: index of the column.
+            unit: unit stated by the options; "" if none.
+        """
+        counts = encoder_counts(unit) or encoder_counts(self.units[column])
+        return counts[1] if counts else 0.0
 
     def where(self, keep: np.ndarray) -> Table:
         """Return the table with only those rows that the mask `keep` (m,) selects."""
@@ -601,6 +625,11 @@ def _as_floats(texts: np.ndarray) -> np.ndarray:
 
 def _not_a_number(cell: str | float) -> str:
     text = str(cell)
+    if _AMBIGUOUS.match(text):
+        return (
+            f"found '{text}', with a decimal comma or separators between thousands: save the table with decimal "
+            "points, and without such separators"
+        )
     if _DECIMAL_COMMA.match(text):
         return f"found '{text}', with a decimal comma: save the table with decimal points (1.5, not 1,5)"
     if _GROUPED.match(text):

@@ -156,6 +156,21 @@ def joints_in(header: Sequence[str], joints: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(result))
 
 
+def longest_numbering(header: Sequence[str]) -> int:
+    """Return the number of columns of the longest series numbered from 0 or 1 whose words, or letter, may mean joints.
+
+    Args:
+        header: names of the columns.
+    """
+    longest = 0
+    for terms, columns in _numbered(header).items():
+        count = len(columns)
+        is_letter = len("".join(terms)) == 1 and OTHER_WORDS.isdisjoint(terms)
+        if _by_numbers({terms: columns}, count) and (is_letter or JointSeries((), terms).is_position):
+            longest = max(longest, count)
+    return longest
+
+
 def mapping_line(series: JointSeries) -> str:
     """Return the line of an options file that maps the joints to the columns of a series."""
     entries = [f'q{number} = "{column}"' for number, column in enumerate(series.columns, 1)]

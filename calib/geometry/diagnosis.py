@@ -21,6 +21,7 @@ from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, ta
 from calib.data.poses.plausible import from_angles, to_angles
 from calib.errors import CalibError, Finding, finding
 from calib.geometry.accuracy import errors
+from calib.geometry.checks.mixed_rows import CONVENTIONS, unit_changes
 from calib.geometry.checks.wrong_rows import Blocks, least_error, row_shifts, two_targets
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
@@ -45,8 +46,6 @@ MAX_NEIGHBOUR_SHARE = 0.6
 MAX_TIMES = 5.0
 # a robust fit, since orientations with angles beyond the range of a convention were lost
 ROBUST = Settings(loss="cauchy", limit=40, passes=4)
-# conventions for orientation angles that robot makers use; others are rare (our choice)
-CONVENTIONS = ("vector", "xyz fixed", "xyz moving", "zyx fixed", "zyx moving", "zyz moving", "zxz moving")
 # largest share of the error that may remain after a change made alone, and after reversing a joint's sign (our choice)
 MAX_LEFT = 1.0 / 3.0
 MAX_LEFT_SIGN = 0.8
@@ -299,6 +298,7 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
         changes.append(Change("left-handed", _mirrored, max_left=MAX_LEFT))
     changes += row_shifts(nominal, blocks, MAX_LEFT)
     changes += two_targets(nominal, _few(blocks), MAX_LEFT)
+    changes += unit_changes(nominal, blocks, MAX_LEFT)
     return best_changes(
         blocks,
         changes,

@@ -288,7 +288,7 @@ def contradiction(chain: Chain, block: PoseMeasurements) -> float:
     worst = 0.0
     for tool in np.unique(sample.tool):
         rows = np.flatnonzero(sample.tool == tool)
-        station, offset = _place_position(arm[rows], sample.position[rows], None, None)
+        station, offset = place_position(arm[rows], sample.position[rows], None, None)
         placed = station @ arm[rows] @ offset
         distance = np.linalg.norm(placed[:, :3, 3] - sample.position[rows], axis=1)
         worst = max(worst, float(np.median(distance)) / max(spread, 1e-9))
@@ -479,7 +479,7 @@ def guess(
             return average_pose(measured @ invert(arm @ tool)), tool
         return place_pose(arm, measured)
     if isinstance(block, Positions):
-        return _place_position(arm, block.position[rows], station, tool)
+        return place_position(arm, block.position[rows], station, tool)
     if tool is not None:
         return None, tool
     if isinstance(block, Sockets):
@@ -487,7 +487,7 @@ def guess(
     return None, np.eye(4)
 
 
-def _place_position(
+def place_position(
     arm: np.ndarray, measured: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return station S and target position t that solve y_i = S (R_i t + a_i); a placement that is given is kept.

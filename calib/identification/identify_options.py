@@ -32,6 +32,8 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     folds = 6                        # time blocks of the cross-validation
     samples = 20000                  # largest number of rows per torque; beyond it every second, third … row
     deflections = true               # joint corrections of the fit (compliance, gears, encoders) move the links
+    with_geometry = false            # joint offsets, lengths and gravity's direction together with the dynamics: poses
+                                     # (the fit's covariance) and torques; a payload of known mass helps
     accept = []                      # findings that are meant so, by the name that their line prints
 
     [filter]                         # default: from the data
@@ -54,7 +56,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     samples = 600000                 # used of a longer recording, in pieces spread over it
     lag = 0.0                        # by which torques and currents come later than the positions of their row [s]
     names = { torque = "tau_m" }     # our name = the file's; [columns] says the same, and joint by joint
-    units = { q = "deg" }            # of columns that state none
+    units = { q = "deg" }            # of columns that state none; "counts/4096@2048": encoder counts, and that at zero
     [columns]                        # of recordings: our name = the file's
     q = "/states/{joint}/position"   # {joint} stands for each joint's name or number
     torque_1 = "Axis A load"         # or joint by joint: q1, torque_1, i1, or a joint's name for its position

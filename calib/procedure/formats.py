@@ -57,7 +57,7 @@ TOPICS: Mapping[str, tuple[str, str]] = {
     "logs": (
         "logs of robot controllers, by brand, and ROS bags",
         "calib.data.recordings.controller_logs calib.data.recordings.ros_texts calib.data.recordings.bags "
-        "calib.data.recordings.datasets",
+        "calib.data.recordings.datasets calib.data.nested_tables",
     ),
     "descriptions": (
         "robots as xacro, MJCF and a UR's calibration.conf",

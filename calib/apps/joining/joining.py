@@ -63,7 +63,7 @@ from calib.toolkit.pose_data import (
     read_fit_options,
     read_table,
 )
-from calib.toolkit.recordings import dataset_table, is_dataset, series_of, words_of
+from calib.toolkit.recordings import bag_table, dataset_table, is_bag, is_dataset, series_of, words_of
 from calib.toolkit.result_folders import joints_of, lines_of
 
 METHODS = ("name", "time", "row", "geometry", "motion")
@@ -150,7 +150,9 @@ def join(
 
 
 def _table(path: Path) -> Table:
-    """Return a CSV file, or a LeRobot data set, as a table."""
+    """Return a CSV file, the joint states in a ROS bag, or a LeRobot data set, as a table."""
+    if is_bag(path) and path.exists():
+        return bag_table(path)
     return dataset_table(path) if is_dataset(path) else read_table(path)
 
 
@@ -511,6 +513,12 @@ def _at_times(
     # torques and currents are never at rest
     may_be_position = np.array([series_of(words_of(name)) in ("", "q") for name in names])
     still = (motion <= MAX_MOTION * travel + 1e-12)[:, may_be_position].all(axis=1)
+    # one row per pose: the arm's motion between them is not known, and each was taken at rest
+    if np.median(np.diff(t)) > 2.0 * STANDSTILL:
+        row = np.abs(point_times[:, None] - t).argmin(axis=1)
+        same_time = np.abs(point_times - t[row]) <= STANDSTILL
+        around[2, same_time] = values[row[same_time]]
+        still |= same_time
     at_points = Table(joints.file, tuple(names), tuple(units), tuple(around[2].T), points.rows)
 
     notes = [f"{len(points)} points, joined by time with a log of {t[-1] - t[0]:.4g} s"]

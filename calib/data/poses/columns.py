@@ -29,9 +29,9 @@ from calib.data.poses.name_shapes import (
     with_shape,
 )
 from calib.data.schema import BOUNDS, Column, Joints
-from calib.errors import MeasurementError, one_of, suggestion
+from calib.errors import MeasurementError, listing, one_of, suggestion
 from calib.units import ANGLES as ANGLE_UNITS
-from calib.units import EFFORTS
+from calib.units import COUNT_WORDS, EFFORTS, encoder_counts
 
 SUFFIXES = ("", "_meas", "_measured")
 POSITION = Column(("x", "y", "z"), "length", "position", BOUNDS.max_length, "mm")
@@ -119,7 +119,11 @@ class Sheet:
             column: the file's name of the column.
             family: family of columns under which the options may have the unit.
         """
-        return self.table.units[self.table.index(column)] or self._unit_of_options(column, family)
+        header_unit = self.table.units[self.table.index(column)]
+        unit = self._unit_of_options(column, family)
+        if encoder_counts(unit) and header_unit.lower() in COUNT_WORDS:
+            return unit
+        return header_unit or unit
 
     def _unit_of_options(self, column: str, family: str) -> str:
         units = self.options.units
@@ -210,16 +214,17 @@ class Sheet:
                 break
         return self._joints_by_words(robot, message, missing[0] if message else None)
 
-    def has_our_names(self, columns: Sequence[str], joints: Sequence[str]) -> bool:
+    def has_our_names(self, columns: Sequence[str], joints: Sequence[str], mapped: bool = True) -> bool:
         """Return whether joint columns have names of the robot's joints or of this toolkit, or the options map them.
 
         Args:
             columns: the file's names of the joint columns.
             joints: names of the robot's joints.
+            mapped: whether columns that the options map count.
         """
-        mapped = self.options.columns.values()
+        by_options = self.options.columns.values() if mapped else ()
         for number, (column, joint) in enumerate(zip(columns, joints), 1):
-            if column not in (joint, f"q_{joint}", f"q{number}", *mapped):
+            if column not in (joint, f"q_{joint}", f"q{number}", *by_options):
                 return False
         return True
 
@@ -232,7 +237,8 @@ class Sheet:
             column: the name of the missing column, for the message.
 
         Raises:
-            MeasurementError: no series, or several; the message ends with a line for the options, where it can.
+            MeasurementError: no series; the message ends with a line for the options, where it can.
+        Undecided: several series.
         """
         table, n = self.table, len(robot.names)
         series = series_named_in_cells(table, robot.names) or joint_series(table.header, robot.names, robot.kinds)
@@ -240,8 +246,14 @@ class Sheet:
         if len(positions) == 1:
             return positions[0].columns
         if len(positions) > 1:
-            choices = " or ".join(map(described, positions))
-            self.fail(f"joints may be {choices}: choose by one line in the options: {mapping_line(positions[0])}")
+            choices = {}
+            for entry in positions:
+                columns = {**_of_joints(entry.columns), **self.options.columns}
+                choices[mapping_line(entry)] = replace(self.options, columns=columns)
+            names = " or ".join(map(described, positions))
+            lines = " or ".join(list(choices)[:2])
+            message = f"joints may be {names}: choose by one line in the options: {lines}"
+            raise Undecided(table, message, choices)
         if not message:
             expected = f"expected q1 to q{n}, or {', '.join(robot.names)}"
             message = f"no joint columns: {expected}; found {', '.join(table.header)}"
@@ -474,8 +486,7 @@ def with_shapes(sheet: Sheet, robot: Joints) -> Sheet:
         robot: the robot's joints.
 
     Raises:
-        Undecided: a quaternion whose components are numbered.
-        MeasurementError: several positions or orientations have such names.
+        Undecided: a quaternion whose components are numbered; several positions or orientations have such names.
     """
     _refuse_base_alone(sheet)
     joints = sheet.find_joints(robot)
@@ -513,15 +524,44 @@ def _with_only_shape(sheet: Sheet, shapes: Sequence[Shape]) -> Sheet:
         shapes: columns that by their names are the quantity.
 
     Raises:
-        MeasurementError: there are several.
+        Undecided: there are several.
     """
     if len(shapes) > 1:
+        choices = {_mapping(shape.columns): with_shape(sheet.options, shape) for shape in shapes}
         first, second = (", ".join(shape.columns.values()) for shape in shapes[:2])
-        line = _mapping(shapes[0].columns)
-        sheet.fail(f"{first} or {second} may be meant: choose by one line in the options, as in {line}")
+        line, other_line = list(choices)[:2]
+        message = f"{first} or {second} may be meant: choose by one line in the options: {line} or {other_line}"
+        raise Undecided(sheet.table, message, choices)
     if not shapes:
         return sheet
     return replace(sheet, options=with_shape(sheet.options, shapes[0]))
+
+
+def unread_rivals(sheet: Sheet, layout: Layout, robot: Joints) -> tuple[str, ...]:
+    """Return notes on columns that are not read and may be joints or a position as well as those that are read.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns that are read.
+        robot: the robot's joints.
+    """
+    unread = [name for name in sheet.table.header if name not in layout.used]
+    series = position_series(joint_series(unread, robot.names, robot.kinds))
+    mappings = [_of_joints(entry.columns) for entry in series if not entry.is_commanded]
+    if len(layout.positions) == 1:
+        shapes = positions_by_shape(unread)
+        mappings += [dict(shape.columns) for shape in shapes if not shape.is_commanded]
+    notes = []
+    for columns in mappings:
+        names = listing(columns.values(), 3)
+        line = _mapping(columns)
+        notes.append(f"{names} are not read; if they are meant (another arm's?), state it in the options: {line}")
+    return tuple(notes)
+
+
+def _of_joints(columns: Sequence[str]) -> dict[str, str]:
+    """Return the names q1 … of joints → the file's names of their columns."""
+    return {f"q{number}": column for number, column in enumerate(columns, 1)}
 
 
 def _mapping(columns: Mapping[str, str]) -> str:

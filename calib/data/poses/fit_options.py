@@ -32,7 +32,7 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
     x = "X_leica"
     [units]                          # of columns whose header states none: our name, or joints, position, distance,
                                      # orientation, sigma, sigma_rotation
-    joints = "deg"
+    joints = "deg"                   # or encoder counts per turn, and the count at zero: "counts/4096@2048"
     [sigma]                          # standard deviations: a number, or one per axis
     position = [1e-5, 1e-5, 2e-5]
     orientation = 1e-4
@@ -61,7 +61,7 @@ from calib.config_types import Expect, Flag, Hidden, Label, Name, Names, OneOf, 
 from calib.data.poses import IGNORED, IN_HAND, MEASURED, MIN_SIGMA, TO_HAND, Loss, Model
 from calib.data.poses.measurements import KINDS
 from calib.errors import refuse_option, suggestion
-from calib.units import ANGLES, LENGTHS
+from calib.units import ANGLES, COUNTS, LENGTHS
 
 FORMATS = ("csv", "robodk", "three_smr")
 AXES = ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "zyz", "zxz")
@@ -76,9 +76,24 @@ RadiansOrZero = Annotated[float, Real(above=0, least=MIN_SIGMA, most=1.0, unit="
 Each = Spread(3, "a number or three")
 
 
-OF_COLUMNS = ("sign", "coupling", "still", "order", "zero", "rows", "targets", "reflection", "convention", "copies")
+OF_COLUMNS = (
+    "sign",
+    "coupling",
+    "still",
+    "order",
+    "zero",
+    "rows",
+    "targets",
+    "reflection",
+    "convention",
+    "copies",
+    "units",
+)
 FINDINGS = ("unexplained", *OF_COLUMNS, "moved", "scale", "commanded", "range")
 """Names in ``accept``: those of chapter 1 of the catalogue of findings."""
+
+
+COUNTED = "or counts/4096@2048: an encoder's counts per turn, and its count at the joint's zero"
 
 
 @strict
@@ -146,7 +161,7 @@ class FileOptions:
     format: Annotated[str, OneOf(FORMATS)] = ""
     euler: Annotated[str, OneOf(EULER)] = ""
     columns: Mapping[str, Name] = field(default_factory=dict)
-    units: Mapping[str, Annotated[str, OneOf((*ANGLES, *LENGTHS))]] = field(default_factory=dict)
+    units: Mapping[str, Annotated[str, OneOf((*ANGLES, *LENGTHS), COUNTED, COUNTS)]] = field(default_factory=dict)
     sigma: Sigma = field(default_factory=Sigma)
     groups: Names = ()
     where: Mapping[str, Annotated[tuple[Label, ...], Spread(words="a text, a number, or a list of them")]] = field(

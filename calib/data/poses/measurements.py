@@ -47,11 +47,11 @@ class PoseMeasurements:
     q: np.ndarray
     joint_names: tuple[str, ...]
     _: KW_ONLY
-    tool: np.ndarray = None  # type: ignore[assignment]  # set below
+    tool: np.ndarray = None  # ty: ignore[invalid-assignment]  # set below
     tool_names: tuple[str, ...] = ("tool",)
     station: str = "station"
     file: str = ""
-    rows: np.ndarray = None  # type: ignore[assignment]  # set below
+    rows: np.ndarray = None  # ty: ignore[invalid-assignment]  # set below
     torque: np.ndarray | None = None
     load: np.ndarray | None = None
     measured_torque: np.ndarray | None = None
@@ -249,7 +249,7 @@ class GroupedMeasurements(PoseMeasurements):
     """
 
     _: KW_ONLY
-    group: np.ndarray = None  # type: ignore[assignment]  # set in the base class
+    group: np.ndarray = None  # ty: ignore[invalid-assignment]  # set in the base class
     group_names: tuple[str, ...] = ()
     sigma: np.ndarray | None = None
 

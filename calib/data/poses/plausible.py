@@ -23,7 +23,7 @@ from calib.data.schema import (
     two_conventions,
 )
 from calib.errors import MeasurementError, refuse_data, require
-from calib.units import ANGLES, DEG
+from calib.units import ANGLES, COUNT_WORDS, DEG, encoder_counts
 
 # share of rows with an impossible angle from which on the columns are in degrees (our choice)
 MOST_ROWS = 0.5
@@ -161,7 +161,8 @@ def _check_joint_units(sheet: Sheet, columns: Sequence[str], kinds: Sequence[str
         units: unit of each joint column; "" without one.
     """
     for name, kind, unit in zip(columns, kinds, units):
-        if unit and (unit.lower() in ANGLES) == (kind == "prismatic"):
+        turns = unit.lower() in (*ANGLES, *COUNT_WORDS) or encoder_counts(unit) is not None
+        if unit and turns == (kind == "prismatic"):
             advice = "is it the right column?"
             if not sheet.table.units[sheet.table.index(name)]:
                 advice = "the unit is from the options; if only some joints have it, state it by their column names"

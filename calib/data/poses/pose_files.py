@@ -47,7 +47,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.csv_table import Table, read_header, read_table, split_units
-from calib.data.joint_columns import words_of
+from calib.data.joint_columns import COMMANDED_WORDS, words_of
 from calib.data.poses import plausible
 from calib.data.poses.base_frame import rows_with_base, seen_from_base
 from calib.data.poses.columns import (
@@ -67,6 +67,7 @@ from calib.data.poses.columns import (
     Sheet,
     Undecided,
     find_layout,
+    unread_rivals,
     with_shapes,
 )
 from calib.data.poses.fit_options import FileOptions
@@ -290,7 +291,9 @@ def read_measurements(
         block = read_groups(sheet, layout, q)
     block = _with_loads(sheet, layout, block)
     ignored = tuple(name for name in sheet.table.header if name not in layout.used)
-    if layout.kind == Positions.kind and not options.kind:
+    rivals = unread_rivals(sheet, layout, robot)
+    notes += rivals
+    if layout.kind == Positions.kind and not options.kind and not rivals:
         notes += _unread_angles(sheet.table, ignored)
     station = options.station or Path(path).stem
     return [replace(block, station=station, ignored=ignored, notes=(*notes, *block.notes))]
@@ -337,7 +340,8 @@ def _unread_angles(table: Table, ignored: Sequence[str]) -> tuple[str, ...]:
         if not set(map(str.lower, table.units[first : first + 3])) <= {"", *ANGLES}:
             continue
         # x_target y_target z_target: a commanded position, or another quantity
-        if positions_by_shape(names) or any(not REJECTED_WORDS.isdisjoint(words_of(name)) for name in names):
+        terms = {term for name in names for term in words_of(name)}
+        if positions_by_shape(names) or terms & (REJECTED_WORDS | COMMANDED_WORDS):
             continue
         values = np.stack(cells, axis=1)
         largest = np.abs(values).max(initial=0.0)

@@ -13,11 +13,16 @@ import numpy as np
 from calib.data.joint_columns import words_of
 from calib.data.poses.columns import Layout, Sheet, Undecided
 from calib.data.schema import BOUNDS, Joints
-from calib.units import ANGLES
+from calib.errors import listing
+from calib.units import ANGLES, COUNT_WORDS
 
 # share of rows that must be impossible in SI (our choice)
 MOST_ROWS = 0.5
 # units that are told from a word of a name; single letters are not
+# encoders' usual counts per turn: powers of two, and thousands of lines or of degrees (our choice)
+COUNTS_PER_TURN = (*(2**bits for bits in range(10, 25)), 1000, 2000, 4000, 8000, 10_000, 20_000, 36_000, 360_000)
+# largest value of a joint in deg: two turns
+MAX_DEGREES = 720.0
 WORD_UNITS = ("mm", "cm", "um", "deg", "degrees", "rad", "mrad")
 SI = {"deg": "rad", "mm": "m"}
 
@@ -31,10 +36,11 @@ def with_silent_units(sheet: Sheet, layout: Layout, robot: Joints) -> tuple[Shee
         robot: names, types and limits of the joints.
 
     Raises:
-        Undecided: angles of an orientation that may be rad or deg beside joints in deg.
+        Undecided: angles of an orientation that may be rad or deg beside joints in deg; joints in encoder counts.
     """
+    _ask_for_counts(sheet, layout, robot)
     sheet = _with_units_of_names(sheet, layout)
-    if sheet.has_our_names(layout.joints, robot.names) and not _is_mapped(sheet, layout):
+    if sheet.has_our_names(layout.joints, robot.names, mapped=False) and not _is_mapped(sheet, layout):
         return sheet, ()
     turning: list[str] = []
     sliding: list[str] = []
@@ -55,6 +61,34 @@ def with_silent_units(sheet: Sheet, layout: Layout, robot: Joints) -> tuple[Shee
     read = replace(sheet, options=replace(sheet.options, units=units))
     _ask_for_angles(read, layout, turning)
     return read, tuple(notes)
+
+
+def _ask_for_counts(sheet: Sheet, layout: Layout, robot: Joints) -> None:
+    """Raise `Undecided` for turning joints whose values are whole numbers that no joint reaches in deg.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns to read.
+        robot: types of the joints.
+    """
+    turning = [name for name, kind in zip(layout.joints, robot.kinds) if kind != "prismatic"]
+    units = {sheet.unit(name, "joints").lower() for name in turning}
+    if not turning or not units <= {"", *COUNT_WORDS}:
+        return
+    counts = np.column_stack([sheet.table.numbers(name, None, gaps=True) for name in turning])
+    if (counts % 1.0 != 0.0).any() or _share_above(sheet, turning, MAX_DEGREES) <= MOST_ROWS:
+        return
+    encoders = [f"counts/{per_turn}@{zero}" for per_turn in COUNTS_PER_TURN for zero in (0, per_turn // 2)]
+    choices = {}
+    for unit in (*encoders, *["mrad"] * ("" in units)):
+        stated = {**sheet.options.units, **dict.fromkeys(turning, unit)}
+        choices[f"units = {{ joints = '{unit}' }}"] = replace(sheet.options, units=stated)
+    message = (
+        f"{listing(turning, 3)} are whole numbers, too large for deg: encoder counts? One line in the options states "
+        "the counts per turn and the count at the joints' zero: units = { joints = 'counts/4096@2048' }; joint by "
+        f"joint: units = {{ {turning[0]} = 'counts/4096@2048', ... }}"
+    )
+    raise Undecided(sheet.table, message, choices, turning[0])
 
 
 def _with_units_of_names(sheet: Sheet, layout: Layout) -> Sheet:

@@ -76,7 +76,7 @@ def read_archived_positions(path: Path, joints: Joints, options: RecordingOption
             archive.fail(f"has shape {q.shape}, expected (samples, joints)", names[series])
         order = joint_order(_joint_names(archive), joints, q.shape[1], path)[0]
         t, _ = _stamps(archive, names, options, len(q))
-        return t, _arrange(q, order, options.factor(series))
+        return t, _arrange(q - options.zero(series), order, options.factor(series))
 
 
 @contextmanager
@@ -201,7 +201,7 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
         values = archive.read(member, rows)
         if values.shape != q.shape:
             archive.fail(f"has shape {values.shape}, {names['q']} has {q.shape} (samples, joints)", member)
-        series["effort" if name == kind else name] = _arrange(values, order, options.factor(name))
+        series["effort" if name == kind else name] = _arrange(values - options.zero(name), order, options.factor(name))
 
     gain = archive.few("drive_gain", q.shape[1])
     if gain is not None:
@@ -218,7 +218,7 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
         notes = [*notes, f"not read: {', '.join(sorted(unused))}"]
     return Recording(
         t[rows],
-        _arrange(q, order, options.factor("q")),
+        _arrange(q - options.zero("q"), order, options.factor("q")),
         kind=kind,
         joint_names=joint_names,
         drive_gain=gain,
@@ -226,7 +226,7 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
         file=str(path),
         rows=rows + 1,
         notes=tuple(notes),
-        **series,
+        **series,  # ty: ignore[invalid-argument-type]
     )
 
 

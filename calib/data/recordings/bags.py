@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from calib.data.csv_table import Table
 from calib.data.recordings.recording import Recording
 from calib.data.recordings.recording_options import RecordingOptions
 from calib.data.schema import Joints
@@ -126,10 +127,34 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
         parts["effort"],
         options.kind or stated_kind,
         names,
-        **optional,
+        **optional,  # ty: ignore[invalid-argument-type]
         file=str(path),
         notes=tuple(notes),
     )
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path is a ROS bag: a file by its suffix, a folder by its metadata."""
+    return path.suffix in (".bag", ".mcap", ".db3") or (path / "metadata.yaml").is_file()
+
+
+def bag_table(path: Path) -> Table:
+    """Return the joint states in a ROS bag as a table: ``t`` [s], and ``q_``, ``v_`` and ``tau_`` with joints' names.
+
+    Args:
+        path: the bag, a file or a folder.
+    """
+    with opened(path) as reader:
+        connections = _with_torques(reader, "", None, path)
+        names, parts, skipped = joint_states(reader, connections, None, path)
+    header, columns = ["t"], [parts["stamp"] * 1e-9]
+    for letters, series in (("q", "q"), ("v", "v"), ("tau", "effort")):
+        if parts[series].size and not np.isnan(parts[series]).all():
+            header += [f"{letters}_{name}" for name in names]
+            columns += list(parts[series].T)
+    note = f"read as {len(columns[0])} joint states from {connections[0].topic}; {skipped} lack a joint"
+    rows = np.arange(1, len(columns[0]) + 1)
+    return Table(str(path), tuple(header), ("",) * len(header), tuple(columns), rows, (note,))
 
 
 def _with_torques(reader: AnyReader, topic: str, joints: Joints | None, path: Path) -> list[Connection]:

@@ -317,7 +317,8 @@ def _likely_unit(recording: Recording, joint: int, unit: str) -> str:
     """
     if unit == "deg" and np.abs(recording.q[:, joint]).max() > LIMITS.max_degrees:
         return (
-            "too large for deg, too: encoder counts? Convert them to rad or deg, zero and counts per turn allowed for"
+            "too large for deg, too: encoder counts? Then state the counts per turn and the count at zero in the "
+            "options (--options): recording.units.q = 'counts/4096@2048'"
         )
     stated = f"header 'q{joint + 1} [{unit}]', or in the options (--options): recording.units.q = '{unit}'"
     return f"looks like {unit}; if so, state the unit ({stated})"

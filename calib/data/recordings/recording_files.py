@@ -484,8 +484,9 @@ def _values(table: Table, column: int, series: str, options: RecordingOptions) -
         series: the toolkit's name of the series, which determines the accepted units.
         options: options for reading the file, which may state a unit.
     """
-    factor = table.factor(column, SCALES[series], options.units.get(series, ""))
-    return table.numbers(table.header[column], None, gaps=True) * factor
+    unit = options.units.get(series, "")
+    factor = table.factor(column, SCALES[series], unit)
+    return (table.numbers(table.header[column], None, gaps=True) - table.zero(column, unit)) * factor
 
 
 def _stamps(table: Table, columns_of: dict[str, list[int]], options: RecordingOptions) -> tuple[np.ndarray, list[str]]:
@@ -642,13 +643,13 @@ def _reader(path: Path, ends: Ends, companions: Sequence[Path]) -> Reader:
     except OSError as error:
         hint = "; write a cut as log.npz@0:9.4, in seconds" if "@" in path.name else ""
         raise MeasurementError(f"cannot be read: {error.strerror}{hint}", path) from error
-    if head[:2] == b"PK":
+    if head[:2] == b"PK" and path.suffix.lower() != ".xlsx":
         return partial(read_archive, ends=ends)
     if head and path.suffix == ".npz":
         refuse_data(path, "is not a NumPy archive despite its name: was it written by np.savez?")
-    if not head or b"\0" in head:
+    if not head or (b"\0" in head and head[:2] != b"PK"):
         fault = "is neither a NumPy archive, a bag nor text" if head else "is empty"
         refuse_data(path, f"{fault}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder")
-    if len(head) == 1 << 16 and b"\n" not in head:
+    if len(head) == 1 << 16 and b"\n" not in head and head[:2] != b"PK":
         refuse_data(path, "has a first line of more than 64 kB: it is not a table; was it saved as CSV?")
     return table_reader

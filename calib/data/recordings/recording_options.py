@@ -22,6 +22,7 @@ FloBaRoID writes times, positions, velocities, torques. Words before a name that
 (`MEASURED`: ``actual_q_0``, ``state.q[0]``) do not matter where no column has the plain name.
 """
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,7 +34,7 @@ from calib.config_types import Checked, Flag, Hidden, Name, OneOf, Positive, Rea
 from calib.data.recordings.recording import named
 from calib.data.schema import Joints
 from calib.errors import UsageError, refuse_data, refused_as, require, suggestion
-from calib.units import CURRENTS, EFFORTS, POSITIONS, TIMES, TURNED, VELOCITIES
+from calib.units import COUNT_WORDS, CURRENTS, EFFORTS, POSITIONS, TIMES, TURNED, VELOCITIES, encoder_counts
 
 SYNONYMS: Mapping[str, tuple[str, ...]] = {
     "t": ("t", "time", "times", "timestamp", "timestamps", "stamp", "__time", "%time"),
@@ -98,6 +99,8 @@ def _known(units: object) -> object:
         return units
     _ours(units)
     for name, unit in units.items():
+        if isinstance(unit, str) and SCALES[name] is POSITIONS and encoder_counts(unit):
+            continue
         if unit and (not isinstance(unit, str) or unit.lower() not in SCALES[name]):
             raise ValueError(f"unit {shown(unit)} of {name} is unknown; expected one of {', '.join(SCALES[name])}")
     return units
@@ -151,7 +154,15 @@ class RecordingOptions:
     def factor(self, name: str) -> float:
         """Return the factor to SI for the unit that the options state for the series `name`; 1 if they state none."""
         unit = self.units.get(name, "")
+        counts = encoder_counts(unit)
+        if counts is not None:
+            return math.tau / counts[0]
         return SCALES[name][unit.lower()] if unit else 1.0
+
+    def zero(self, name: str) -> float:
+        """Return the count at zero that the options state for a series in encoder counts; 0 for other units."""
+        counts = encoder_counts(self.units.get(name, ""))
+        return counts[1] if counts else 0.0
 
 
 def check_units(name: str, units: Sequence[str], joints: Joints | None, path: str | Path) -> None:
@@ -166,7 +177,8 @@ def check_units(name: str, units: Sequence[str], joints: Joints | None, path: st
     if joints is None or len(units) != len(joints.names) or name not in ("q", "v", "q_link", "q_ref"):
         return
     for joint, kind, unit in zip(joints.names, joints.kinds, units):
-        if unit and (unit.lower() in TURNED) == (kind == "prismatic"):
+        turns = unit.lower() in (*TURNED, *COUNT_WORDS) or encoder_counts(unit) is not None
+        if unit and turns == (kind == "prismatic"):
             message = f"the unit [{unit}] of {name} does not suit {joint}, a {kind} joint: is it the file's unit?"
             refuse_data(path, message)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data.images.pixels import Pixels
-from calib.data.joint_columns import joints_in
+from calib.data.joint_columns import joints_in, longest_numbering
 from calib.data.pose_pairs.pair_files import read_pairs
 from calib.data.poses import JOINTS, is_image_folder
 from calib.data.poses.columns import Undecided
@@ -328,7 +328,7 @@ def _measured_joints(source: Path, measured: Path, options: FitOptions) -> list[
     if len(with_words) > len(names):
         names = with_words
     # numbered columns hold more joints than are named
-    if f"q{len(names) + 1}" in header:
+    if f"q{len(names) + 1}" in header or longest_numbering(header) > len(names):
         return []
     return names
 

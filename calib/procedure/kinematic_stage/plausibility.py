@@ -15,6 +15,7 @@ from calib.errors import Finding, finding
 from calib.geometry.accuracy import NATURE, errors
 from calib.geometry.checks.base_motion import base_motion
 from calib.geometry.checks.joint_range import JointRange
+from calib.geometry.checks.mixed_rows import mixed_orientations
 from calib.geometry.checks.readings import repeated_readings
 from calib.geometry.diagnosis import Scale, length_factor, scale_of, wrong_angles, wrong_columns
 from calib.geometry.installation import Installation
@@ -255,7 +256,7 @@ def _wrong_columns(
 
 
 def _misread(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> list[Finding]:
-    """Return a finding if the measured orientations fit the arm by another convention of angles than the stated one.
+    """Return findings if the measured orientations fit the arm in another reading than the stated one, or in two.
 
     Otherwise, the list is empty.
 
@@ -266,7 +267,7 @@ def _misread(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> list[
     angle = errors(nominal, blocks).orientation
     if angle is None or not np.sqrt(np.mean(angle**2)) > limit("orientations-off", "angle"):
         return []
-    return _explanation(wrong_angles(nominal, blocks), nominal)
+    return mixed_orientations(nominal, blocks) or _explanation(wrong_angles(nominal, blocks), nominal)
 
 
 def _explanation(change: Explanation | None, nominal: Installation) -> list[Finding]:

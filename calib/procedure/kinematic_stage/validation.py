@@ -188,8 +188,13 @@ def _figures(worst: _Proof, arm: str, tolerance: float | None = None) -> str:
         arm: name of the deliverable if there are several; otherwise empty.
         tolerance: largest acceptable rms on held-out poses [m]; None if not stated.
     """
-    figures = finding("errors", after=worst.after, before=worst.before, where=worst.where, arm=arm, tolerance=tolerance)
-    return sentence(figures)
+    before = worst.before
+    if before == worst.after:
+        # the arm was not changed
+        before = None
+    return sentence(
+        finding("errors", after=worst.after, before=before, where=worst.where, arm=arm, tolerance=tolerance)
+    )
 
 
 def _far_off(

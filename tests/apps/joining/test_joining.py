@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import Writer
+from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 from sessions import begin
 
@@ -24,6 +26,7 @@ from calib.robot.library import load
 
 SHUFFLED = np.random.default_rng(4).permutation(40)[:37]
 JOINTS = [f"joint{k} [rad]" for k in range(1, 8)]
+STORE = get_typestore(Stores.ROS2_HUMBLE)
 POINT = ["x [mm]", "y [mm]", "z [mm]"]
 
 
@@ -226,3 +229,22 @@ def test_a_written_join_is_read_back(tmp_path, joints, arm, q):
     found = calib.join(joints, write(tmp_path / "p.csv", POINT, seen(arm, q)))
     table = read_table(found.write(tmp_path / "m.csv"))
     assert table.header == ("pose", *(name[:6] for name in JOINTS), "x", "y", "z") and len(table) == 40
+
+
+def test_joint_states_of_a_bag_are_joints(tmp_path, arm, q):
+    """A bag with one joint state per pose is joined to points of the same times, in any order."""
+    state = STORE.types["sensor_msgs/msg/JointState"]
+    header, stamp = (STORE.types[name] for name in ("std_msgs/msg/Header", "builtin_interfaces/msg/Time"))
+    with Writer(tmp_path / "bag", version=9) as writer:
+        topic = writer.add_connection("/joint_states", state.__msgtype__, typestore=STORE)
+        for number, row in enumerate(q):
+            message = state(
+                header(stamp(100 + 9 * number, 0), ""), list(arm.joint_names), row, np.zeros(0), np.zeros(0)
+            )
+            writer.write(topic, 10**9 * (100 + 9 * number), STORE.serialize_cdr(message, state.__msgtype__))
+    times = 100.0 + 9.0 * SHUFFLED
+    points = write(tmp_path / "p.csv", ["t [s]", *POINT], np.column_stack([times, seen(arm, q)[SHUFFLED]]))
+    calib.join(tmp_path / "bag", points, robot="lwr4plus").write(tmp_path / "m.csv")
+    table = read_table(tmp_path / "m.csv")
+    measured = np.column_stack([table.numbers(f"q_{name}") for name in arm.joint_names])
+    np.testing.assert_allclose(measured, q[SHUFFLED], atol=1e-6)

@@ -313,3 +313,20 @@ def test_half_hour_stamps_fall_on_grid(rate):
     recording = Recording(t, q, q, "torque", ("a",))
     assert abs(find_clock(recording).period * rate - 1.0) < 1e-12
     np.testing.assert_array_equal(resample(recording).series["q"], q)
+
+
+def test_encoder_counts(archive, tmp_path, series):
+    """A count is a share of a turn from the count at zero, in archives and tables, by header or options."""
+    counts = np.round(series["q"] * 4096 / (2 * np.pi) + 2048)
+    options = RecordingOptions(units={"q": "counts/4096@2048"})
+    step = np.pi / 4096 + 1e-9
+    np.testing.assert_allclose(read_recording(archive(q=counts), ROBOT, options).q, series["q"], atol=step)
+    path = tmp_path / "log.csv"
+    for unit, stated in (("", options), ("[counts/4096@2048]", None), ("[ticks]", options)):
+        header = ",".join(["t", *(f"q{j}{unit}" for j in (1, 2, 3)), "tau_a,tau_b,tau_c"])
+        columns = np.column_stack([series["t"], counts, series["tau"]])
+        np.savetxt(path, columns, delimiter=",", comments="", header=header)
+        np.testing.assert_allclose(read_recording(path, ROBOT, stated).q, series["q"], atol=step)
+    refused(path, r"\[ticks\] is not one of .*\[counts/4096@2048\]")
+    with pytest.raises(UsageError, match="unit 'counts/0' of q is unknown"):
+        RecordingOptions(units={"q": "counts/0"})

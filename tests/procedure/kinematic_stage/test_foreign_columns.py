@@ -11,7 +11,7 @@ from calib.data.poses.fit_options import FileOptions, FitOptions
 from calib.data.poses.measurements import Positions
 from calib.data.poses.pose_files import read_measurements
 from calib.data.schema import Joints
-from calib.errors import MeasurementError, UsageError
+from calib.errors import MeasurementError, RobotError, UsageError
 from calib.geometry.checks.readings import without_unseen
 from calib.procedure.kinematic_stage.inputs import load_robot, read_file
 from calib.robot.kinematics import forward
@@ -247,3 +247,66 @@ def test_stated_arm_without_columns_is_refused(tmp_path):
     with pytest.raises(UsageError, match=r"another arm .*give --tip left_tool0"):
         load_robot(source, table, FitOptions(), tip="right_tool0")
     assert load_robot(source, table, FitOptions(), tip="left_tool0")[0].tip == "left_tool0"
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_the_arm_that_was_measured_is_told_from_two(arm, tmp_path, first):
+    """Of the columns of two arms those are read with which the measured positions agree, in any order."""
+    chain, q, position, _ = arm
+    still = np.random.default_rng(7).uniform(-2.0, 2.0, q.shape)
+    joints = [("left_j{}", q * DEGREES), ("right_j{}", still * DEGREES)]
+    names, values = zip(*(joints[first], joints[1 - first]))
+    path = written(tmp_path / "m.csv", [*numbered(*names), "x", "y", "z"], [*values, position])
+    (block,) = read_file(path, chain, FitOptions())
+    assert "left_j1" in block.notes[0] and "contradicts" in block.notes[0]
+    np.testing.assert_allclose(block.q, q, atol=2e-6)
+    with pytest.raises(MeasurementError, match=r'q1 = "left_j1".* or .*q1 = "right_j1"|"right_j1".* or .*"left_j1"'):
+        read_measurements(path, chain.joint_names)
+
+
+def test_columns_of_another_arm_are_said_with_a_line(arm, tmp_path):
+    """Columns named as this arm's are read; a second set is not passed over in silence."""
+    chain, q, position, _ = arm
+    header = [*numbered("q{}"), "x", "y", "z", *numbered("right_q{}"), *(f"right_{axis}" for axis in "xyz")]
+    (block,) = read_file(written(tmp_path / "m.csv", header, [q, position, q + 0.1, position]), chain, FitOptions())
+    notes = "; ".join(block.notes)
+    assert 'columns = { q1 = "right_q1"' in notes and 'columns = { x = "right_x"' in notes
+    columns = {f"q{number}": f"right_q{number}" for number in SIX}
+    (block,) = read_measurements(tmp_path / "m.csv", chain.joint_names, FileOptions(columns=columns))
+    np.testing.assert_allclose(block.q, q + 0.1, atol=2e-6)
+    commanded = [*numbered("q{}"), "x", "y", "z", *numbered("q_cmd_{}")]
+    (block,) = read_file(written(tmp_path / "c.csv", commanded, [q, position, q]), chain, FitOptions())
+    assert not block.notes
+
+
+def test_numbered_columns_of_a_torso_with_two_arms(tmp_path):
+    """One joint by name beside numbered ones does not make an arm of one joint: which arm is asked."""
+    tags = [joint("lift", "prismatic", "base", "torso", axis("0 0 1"))]
+    for side in "lr":
+        for number in SIX:
+            parent = "torso" if number == 1 else f"{side}_{number - 1}"
+            turn = axis("0 0 1" if number % 2 else "0 1 0")
+            tags.append(joint(f"{side}_joint_{number}", "revolute", parent, f"{side}_{number}", turn, "0.1 0 0.2"))
+    (tmp_path / "two.urdf").write_text(robot(*tags))
+    header = ["lift", *numbered("joint_{}"), "x", "y", "z"]
+    path = written(tmp_path / "m.csv", header, [np.random.default_rng(1).uniform(0.0, 0.3, (9, 10))])
+    with pytest.raises(RobotError, match="two arms: choose one by its last link"):
+        load_robot(tmp_path / "two.urdf", path, FitOptions())
+
+
+@pytest.mark.parametrize(("per_turn", "zero"), [(4096, 2048), (10_000, 0), (2**20, 0)])
+def test_encoder_counts_are_told_by_the_arm(arm, tmp_path, per_turn, zero):
+    """Whole numbers too large for deg are read by the usual encoder that agrees with the arm, or asked for."""
+    chain, q, position, _ = arm
+    counts = np.round(q * per_turn / (2.0 * np.pi)) + zero
+    path = written(tmp_path / "m.csv", [*numbered("q{}"), "x", "y", "z"], [counts, position])
+    (block,) = read_file(path, chain, FitOptions())
+    np.testing.assert_allclose(block.q, q, atol=np.pi / per_turn + 1e-6)
+    assert f"counts/{per_turn}@{zero}" in block.notes[0]
+    with pytest.raises(MeasurementError, match=r"encoder counts.*one line|encoder counts.*One line"):
+        read_measurements(path, chain.joint_names)
+    odd = written(tmp_path / "odd.csv", [*numbered("q{} [ticks]"), "x", "y", "z"], [counts + per_turn // 10, position])
+    with pytest.raises(MeasurementError, match="joint by joint: units = "):
+        read_file(odd, chain, FitOptions())
+    options = FitOptions(units={"joints": f"counts/{per_turn}@{zero + per_turn // 10}"})
+    np.testing.assert_allclose(read_file(odd, chain, options)[0].q, block.q, atol=1e-9)
