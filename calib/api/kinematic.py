@@ -23,6 +23,7 @@ from calib.errors import TaskLost, UsageError, as_ours, require
 from calib.estimation.estimate import Estimate
 from calib.estimation.robust import Loss, check_loss
 from calib.geometry.observation import pose_sigmas
+from calib.geometry.static_torques.gravity_fit import payload_load
 from calib.geometry.static_torques.sources import gravity_of
 from calib.procedure.kinematic_stage import fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
@@ -190,7 +191,7 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         return self.selection.fit.estimate
 
     @one_blas_thread()
-    def predict(self, q: ArrayLike, tool: int = 0) -> PredictedPoses:
+    def predict(self, q: ArrayLike, tool: int = 0, payload: float | Sequence[float] | None = None) -> PredictedPoses:
         """Return the tool poses of the calibrated robot at given joint values, in its base frame, with their σ.
 
         If the fit has an error model, σ of the position contains all expected errors (`position_sigma`), else only
@@ -199,17 +200,19 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         Args:
             q: joint values (m, n) [rad or m], or (n,) for one pose.
             tool: index of the fitted tool, from 0.
+            payload: mass that the tip carries [kg], or mass and its centre x, y, z in the tip's frame [m]; None: what
+                the arm carried in the fit.
         """
         geometry = self.selection.fit
-        poses = self._poses(q)
+        poses = self._poses(q, payload)
         sigma = pose_sigmas(geometry.cell, poses, geometry.free, geometry.estimate.covariance, -1, tool)
         if self.expected is not None:
             sigma[:, 0] = self.expected.position_sigma(poses, -1, tool)
-        tool_poses = self.robot.forward(poses.q, poses.torque) @ geometry.cell.tools[tool]
+        tool_poses = self.robot.forward(poses.q, poses.torque, poses.load) @ geometry.cell.tools[tool]
         return PredictedPoses(like_joints(q, tool_poses), like_joints(q, sigma))
 
     @one_blas_thread()
-    def position_sigma(self, q: ArrayLike, tool: int = 0) -> Floats:
+    def position_sigma(self, q: ArrayLike, tool: int = 0, payload: float | Sequence[float] | None = None) -> Floats:
         """Return the standard deviation (m,) [m] of the tool position error (norm over the axes) at given poses.
 
         It contains the parameters' covariance and unmodelled effects. It is estimated on held-out rows, and grows with
@@ -219,18 +222,30 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         Args:
             q: joint values (m, n) [rad or m], or (n,) for one pose.
             tool: index of the fitted tool, from 0.
+            payload: mass that the tip carries [kg], or mass and its centre x, y, z in the tip's frame [m]; None: what
+                the arm carried in the fit.
 
         Raises:
             UsageError: fewer than 20 positions were measured.
         """
         if self.expected is None:
             raise UsageError("this fit has no expected errors: they need at least 20 measured positions")
-        return like_joints(q, self.expected.position_sigma(self._poses(q), tool=tool))
+        return like_joints(q, self.expected.position_sigma(self._poses(q, payload), tool=tool))
 
-    def _poses(self, q: ArrayLike) -> PoseMeasurements:
-        """Return poses at joint values q (m, n), with gravity torques (m, n) [N m] if the links' masses are known."""
+    def _poses(self, q: ArrayLike, payload: float | Sequence[float] | None = None) -> PoseMeasurements:
+        """Return poses at joint values q (m, n), with gravity torques (m, n) [N m] if the links' masses are known.
+
+        Args:
+            q: joint values.
+            payload: mass [kg], or mass and centre in the tip's frame [m]; None for no payload.
+        """
         joints = self.robot.joint_rows(q)
-        return PoseMeasurements(joints, self.inputs.chain.joint_names, torque=gravity_of(self.inputs.weighed, joints))
+        chain = self.inputs.weighed
+        load = payload_load(chain, payload)
+        if load is not None:
+            load = np.tile(load, (len(joints), 1))
+        torque = gravity_of(chain, joints, load)
+        return PoseMeasurements(joints, self.inputs.chain.joint_names, torque=torque, load=load)
 
     @checked
     def save(self, out: str | Path, *, plots: Plots = True) -> Path:

@@ -100,6 +100,23 @@ class Deflection:
     def with_coefficients(self, values: np.ndarray) -> Deflection:
         return replace(self, coefficients=np.asarray(values, dtype=float))
 
+    def carrying(self, load: np.ndarray) -> Deflection:
+        """Return the deflection under a load that the last body carries in every pose.
+
+        Args:
+            load: (4,) first moments [kg m] and mass [kg] beyond the reference chain's masses, in the last body's frame.
+        """
+        if self.reference is None or self.reference.inertias is None:
+            return self
+        inertias = np.array(self.reference.inertias)
+        inertias[-1, 6:] += load
+        return replace(self, reference=replace(self.reference, inertias=inertias))
+
+    @property
+    def by_torque(self) -> bool:
+        """Whether any term is compliance by torques, which scales with the load."""
+        return any(term.basis in BY_TORQUE for term in self.terms)
+
     def names(self, chain: Chain) -> tuple[str, ...]:
         """Return one name per term for tables, such as ``theta3 per N·m`` or ``theta3 sin 2 q4``.
 

@@ -22,6 +22,7 @@ from calib.geometry.observation import (
     step,
     target_jacobian,
 )
+from calib.geometry.static_torques.gravity_fit import payload_load
 from calib.geometry.weighing import calibrated_chain
 
 __all__ = [
@@ -52,6 +53,7 @@ __all__ = [
     "observe",
     "outside",
     "parameter_values",
+    "payload_load",
     "plausible_deviation",
     "pose_sigmas",
     "prepare",

@@ -66,6 +66,7 @@ def compensate(
     dof: int | None = None,
     start: Sequence[float] | None = None,
     tolerance: tuple[float, float] = joint_commands.TOLERANCE,
+    payload: float | Sequence[float] | None = None,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> JointCommands:
@@ -82,6 +83,8 @@ def compensate(
         start: (n,) joint values [rad or m] near which targets without joints are sought; None: the middle of the
             limits.
         tolerance: largest accepted position [m] and orientation [rad] residual at a target, by the calibrated model.
+        payload: mass that the tip carries [kg], or mass and its centre x, y, z in the tip's frame [m]; None: what the
+            arm carried in the fit.
         seed: seed of the starts for targets without joints.
         progress: called with a short text as the computation proceeds; None for no report.
 
@@ -97,7 +100,7 @@ def compensate(
     if isinstance(targets, str | Path):
         targets = read_targets(targets, joints_of(chain))
     commands = joint_commands.computed(
-        calibrated,
+        calibrated.carrying(payload),
         Targets.of(targets),
         frame=frame,
         tool=tool,

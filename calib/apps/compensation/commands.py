@@ -30,6 +30,7 @@ def compensate(
     controller: str = "",
     external: list[str] | None = None,
     pulses: Annotated[str | None, typer.Option("--pulse", metavar="NUMBERS")] = None,
+    payload: str | None = None,
     partial: bool = False,
     overwrite: bool = False,
     seed: Seed = 0,
@@ -64,6 +65,7 @@ def compensate(
         controller: whose program it is, if not as its suffix says: calib program --list
         external: program: joint that is an external axis, where names and kinds do not tell; repeatable
         pulses: program: pulses per degree or mm of each axis, the arm's first (Yaskawa)
+        payload: mass[,x,y,z] [kg, m] at the tip and its centre; default: what the arm carried in the fit
         partial: write the reached targets even if others are not reached
     """
     from calib import files
@@ -77,6 +79,8 @@ def compensate(
 
     position_mm, turn_mrad = numbers(tolerance, 2, "--tolerance")
     fitted = api.read_fitted(folder)
+    if payload:
+        fitted = fitted.carrying(numbers(payload, 4 if "," in payload else 1, "--payload"))
     program = None
     suffix = ".csv"
     if controller or is_program(targets):

@@ -38,6 +38,7 @@ from calib.toolkit.installations import (
     layout,
     nearest,
     outside,
+    payload_load,
     pose_sigmas,
     reach,
     read_arms,
@@ -93,6 +94,7 @@ class Fitted:
         fitted: rms error at the fitted poses [m]; None where the fit does not contain it.
         fitted_q: (k, n) joint values of the fitted poses [rad or m]; None where the fit does not contain them.
         discrepancy: model of the variance of position errors at other poses; None where the fit does not contain one.
+        load: (4,) first moments [kg m] and mass [kg] of a payload, in the last body's frame; None without one.
     """
 
     folder: Path
@@ -104,6 +106,20 @@ class Fitted:
     fitted: float | None
     fitted_q: np.ndarray | None = None
     discrepancy: Discrepancy | None = None
+    load: np.ndarray | None = None
+
+    def carrying(self, payload: float | Sequence[float] | None) -> "Fitted":
+        """Return the arm with a payload at the tip; unchanged for None.
+
+        Args:
+            payload: mass [kg], or mass and centre of mass x, y, z in the tip's frame [m].
+
+        Raises:
+            UsageError: a payload of other numbers.
+        """
+        if payload is None:
+            return self
+        return replace(self, load=payload_load(self.cell.chain, payload))
 
     @property
     def placed(self) -> bool:
@@ -198,6 +214,8 @@ def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tup
         UsageError: a frame or tool that the fit does not have.
     """
     cell, nominal = fitted.cell, fitted.nominal
+    if fitted.load is not None:
+        cell = replace(cell, deflection=cell.deflection.carrying(fitted.load))
     tool_pose = _tool(cell, tool)
     # the nominal robot's flange need not be the calibrated one's
     T_flange_flange = np.eye(4)
@@ -308,6 +326,8 @@ def computed(
     say("sigmas")
     sigma, expected = _predicted_sigmas(fitted, q, frame, tool, goal)
     notes = [_frame_note(fitted, frame), finding("at-targets", tool=tool), dof_note, *_turn_note(fitted, count)]
+    if fitted.load is not None and not fitted.cell.deflection.by_torque:
+        notes.append(finding("load-not-modelled", mass=float(fitted.load[3])))
     arm_error = None
     if frame == "base" and fitted.placed:
         # the arm's own error, its base placed where it fits the measurements best
@@ -522,7 +542,8 @@ def _predicted_sigmas(
         cell = replace(cell, tools=np.repeat(goal.cell.tools, len(cell.tools), axis=0))
     station = -1 if frame == "base" else _station(fitted, frame)
     torque = None if goal.torques is None else goal.torques(q)
-    poses = PoseMeasurements(q, cell.chain.joint_names, torque=torque)
+    load = None if fitted.load is None else np.tile(fitted.load, (len(q), 1))
+    poses = PoseMeasurements(q, cell.chain.joint_names, torque=torque, load=load)
     parameter_sigma = pose_sigmas(cell, poses, free, covariance, station, tool_index)
     if goal.dof == 3:
         parameter_sigma[:, 1] = np.nan

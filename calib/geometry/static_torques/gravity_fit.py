@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
-from calib.errors import Finding, finding
+from calib.errors import Finding, UsageError, finding, require
 from calib.geometry.static_torques.column_faults import column_fault
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, gravity_torques, joint_frames
@@ -114,6 +114,26 @@ def carried_load(chain: Chain, payload: np.ndarray) -> np.ndarray:
     mass = np.nan_to_num(payload[:, 0])
     centre = np.nan_to_num(payload[:, 1:]) @ flange[:3, :3].T + flange[:3, 3]
     return np.column_stack([mass[:, None] * centre, mass])
+
+
+def payload_load(chain: Chain, payload: float | Sequence[float] | None) -> np.ndarray | None:
+    """Return a payload as a load (4,) of the last body; None for no payload.
+
+    Args:
+        chain: the arm.
+        payload: mass [kg], or mass and centre of mass x, y, z in the tip's frame [m]; by default the centre is the
+            tip.
+
+    Raises:
+        UsageError: other numbers than these, or a negative mass.
+    """
+    if payload is None:
+        return None
+    values = np.atleast_1d(np.asarray(payload, dtype=float))
+    valid = values.shape in ((1,), (4,)) and np.isfinite(values).all() and values[0] >= 0.0
+    require(valid, f"payload {payload}: expected a mass [kg], or mass,x,y,z [kg, m]", UsageError)
+    complete = np.concatenate([values, np.full(4 - len(values), np.nan)])
+    return carried_load(chain, complete[None])[0]
 
 
 def reference_masses(chain: Chain) -> np.ndarray:

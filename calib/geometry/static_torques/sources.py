@@ -17,7 +17,7 @@ from calib.geometry.static_torques.gravity_fit import (
     carried_load,
 )
 from calib.geometry.static_torques.load_errors import SAME_LOAD, load_masses
-from calib.robot.calibrated import BY_TORQUE, Deflection
+from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import gravity_torques
 
@@ -113,7 +113,7 @@ def torques_used(deflection: Deflection, gravity: GravityFit | None, source: str
         gravity: the fitted gravity; None without measured torques.
         source: `MEASURED` or `MODELLED`.
     """
-    if not any(term.basis in BY_TORQUE for term in deflection.terms):
+    if not deflection.by_torque:
         return []
     if gravity is None:
         return [finding("torques-used", source="of the described masses", sigma=None, joint=None, worst=None)]

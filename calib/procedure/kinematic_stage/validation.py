@@ -18,6 +18,7 @@ from calib.geometry.error_model import ErrorModel
 from calib.geometry.fit import without_corrections
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.ladder import MIN_GAIN
+from calib.geometry.static_torques.load_check import suspected_load
 from calib.geometry.static_torques.sources import load_changes
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import NOT_JUDGED, Verdict, catalogue, level_of, limit, lines_of, sentence
@@ -456,6 +457,8 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
         usual = float(np.median(fitted.errors[0].main))
     for name, rows in validation.items():
         noticed += _noticed(name, rows, usual)
+        if rows.proves:
+            noticed += filter(None, [suspected_load(rows.cells[1], block) for block in rows.blocks])
         others = [block for block in rows.blocks if block.file not in fitted_files]
         if rows.shares_frames and rows.proves and others:
             noticed += changed_since_fit(rows.cells[1], others, fitted.errors[1].rms)
