@@ -391,6 +391,7 @@ def identify_jointly(
         progress: called with a short text at each step; None: not called.
     """
     joint = None
+    updated_robot = robot
     for _ in range(PASSES):
         previous = joint
         joint = estimate_jointly(identification, robot, cases, previous, doubted, fitted, progress)
