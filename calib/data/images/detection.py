@@ -15,7 +15,14 @@ import numpy as np
 from calib.data.images.board import MIN_CORNERS, Board, corners
 from calib.data.images.board_print import charuco, dictionary
 from calib.data.images.images import quiet, read_image
-from calib.data.images.marker_layout import INNER, OLD_PATTERN, has_two_patterns, layout_words, other_dictionary
+from calib.data.images.marker_layout import (
+    INNER,
+    OLD_PATTERN,
+    exchange_words,
+    has_two_patterns,
+    layout_words,
+    other_dictionary,
+)
 from calib.data.images.pixels import Detection, Detections
 from calib.errors import MeasurementError
 from calib.workers.extras import needing
@@ -318,6 +325,10 @@ def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, tho
     """
     if count:
         return f"only {count} corners of the board are in view, {MIN_CORNERS} are needed: move it into view"
+    if thorough and board.kind != "chessboard":
+        exchange = exchange_words(coarse, board)
+        if exchange:
+            return exchange
     sample = image[::5, ::5]
     if np.percentile(sample, 99) < DARK:
         return "too dark: hardly anything is brighter than 30 of 255; expose longer"

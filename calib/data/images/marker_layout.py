@@ -22,6 +22,8 @@ MAX_COLUMNS = 40
 MAX_ERROR = 0.25
 # Largest number of samples of RANSAC: nearly all corners of the right layout agree.
 MAX_ITERATIONS = 50
+# The same where two markers may be exchanged: samples need four right corners.
+EXCHANGE_ITERATIONS = 2000
 # Smallest share of the corners that a layout has to explain.
 MIN_SHARE = 0.9
 # What differs from board.toml, in words.
@@ -137,6 +139,34 @@ def _explains(board: Board, ids: np.ndarray, pixels: np.ndarray) -> bool:
     tolerance = max(1.0, MAX_ERROR * float(np.median(sides)))
     plane, inliers = cv2.findHomography(points, corner_pixels, cv2.RANSAC, tolerance, maxIters=MAX_ITERATIONS)
     return plane is not None and float(inliers.mean()) >= MIN_SHARE
+
+
+def exchange_words(image: np.ndarray, board: Board) -> str:
+    """Return which two markers are exchanged on a board, if all others are in their places, as text; else "".
+
+    Args:
+        image: (height, width) 8-bit grey.
+        board: the board of ``board.toml``.
+    """
+    ids, pixels = markers(image, board.dictionary)
+    if len(ids) < MIN_MARKERS + 2:
+        return ""
+    corners = marker_corners(board, int(ids.max()) + 1)
+    centres = corners.mean(axis=1)
+    plane, _ = cv2.findHomography(
+        corners[ids].reshape(-1, 2), pixels.reshape(-1, 2).astype(float), cv2.RANSAC, 8.0, maxIters=EXCHANGE_ITERATIONS
+    )
+    if plane is None:
+        return ""
+    predicted = cv2.perspectiveTransform(centres[:, None], plane)[:, 0]
+    distances = np.linalg.norm(pixels.mean(axis=1)[:, None] - predicted, axis=2)
+    nearest = distances.argmin(axis=1)
+    places = dict(zip(ids.tolist(), nearest.tolist()))
+    displaced = [marker for marker, place in places.items() if marker != place]
+    if len(displaced) != 2 or places[displaced[0]] != displaced[1] or places[displaced[1]] != displaced[0]:
+        return ""
+    first, second = sorted(displaced)
+    return f"markers {first} and {second} are exchanged on the board, the other {len(ids) - 2} fit: print it anew"
 
 
 def marker_corners(board: Board, count: int) -> np.ndarray:

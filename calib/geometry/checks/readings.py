@@ -23,6 +23,9 @@ from calib.robot.chain import Chain
 SAME = 1e-8
 # distance between predicted targets [m] above which equal readings are impossible (our choice)
 MIN_APART = 1e-3
+# distance of two targets [m] below which one has the readings of the other, with the noise of a filter or of a
+# conversion: no two targets are so close (our choice)
+TOUCHING = 1e-4
 # share of a target's rows above which repeated readings are no exceptions, and are left in (our choice)
 MOST_ROWS = 0.5
 # smallest distance of a single reading of zeros [m] from the nominal arm's prediction, and its smallest ratio to the
@@ -137,25 +140,24 @@ def _readings(block: Positions) -> np.ndarray:
 
 
 def _copies(block: Positions) -> list[Copies]:
-    """Return for each target the rows in which it has the readings of an earlier one; zeros are no reading.
+    """Return for each target the rows in which it is where an earlier one is; zeros are no reading.
 
     Args:
         block: measured positions of several targets.
     """
-    readings = _readings(block)
     is_zero = np.all(np.abs(block.position) < SAME, axis=1)
-    # per target: its readings by row number
-    reading_of_row = []
+    # per target: its position by row number
+    position_of_row = []
     for tool in range(len(block.tool_names)):
         rows = (block.tool == tool) & ~is_zero
-        reading_of_row.append(dict(zip(block.rows[rows].tolist(), readings[rows])))
+        position_of_row.append(dict(zip(block.rows[rows].tolist(), block.position[rows])))
     result = []
     copied: set[int] = set()
     for first, second in combinations(range(len(block.tool_names)), 2):
-        first_readings = reading_of_row[first]
-        second_readings = reading_of_row[second]
-        common = sorted(first_readings.keys() & second_readings.keys())
-        equal = [row for row in common if first_readings[row] == second_readings[row]]
+        first_positions = position_of_row[first]
+        second_positions = position_of_row[second]
+        common = sorted(first_positions.keys() & second_positions.keys())
+        equal = [row for row in common if np.linalg.norm(first_positions[row] - second_positions[row]) < TOUCHING]
         if equal and second not in copied:
             copied.add(second)
             result.append(Copies(first, second, tuple(equal), len(common)))

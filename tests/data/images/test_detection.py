@@ -87,6 +87,25 @@ def test_other_layout_is_told_from_no_board():
     assert re.search(r"\d+ markers of 4x4_50 are seen, but not where board.toml has them", found.problem)
 
 
+def test_two_exchanged_markers_are_named():
+    """Of a self-made board, the two markers that lie in each other's places are named, bright as the picture may be."""
+    board = BOARDS["charuco"]
+    old_board = cv2.aruco.CharucoBoard((7, 5), 0.03, 0.022, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+    picture = cv2.copyMakeBorder(old_board.generateImage((560, 400)), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
+    assert detect(picture, board).problem == ""
+    pixels, ids, _ = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)).detectMarkers(
+        picture
+    )
+    regions = {}
+    for marker, corner_pixels in zip(ids.ravel().tolist(), pixels):
+        left, top = np.round(corner_pixels[0].min(axis=0)).astype(int)
+        regions[marker] = np.s_[top - 2 : top + 64, left - 2 : left + 64]
+    exchanged = picture.copy()
+    exchanged[regions[4]] = picture[regions[11]]
+    exchanged[regions[11]] = picture[regions[4]]
+    assert "markers 4 and 11 are exchanged on the board" in detect(exchanged, board).problem
+
+
 @pytest.mark.slow
 def test_motion_is_told_from_defocus():
     way = np.array([placed(right=shift) for shift in np.linspace(-0.0025, 0.0025, 7)])
