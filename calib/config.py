@@ -145,7 +145,7 @@ def plain_values(value: object) -> Any:
 
 def strict(kind: type[T]) -> type[T]:
     """Return a dataclass as the description of a file's table; keys that are not its fields are refused."""
-    kind.__pydantic_config__ = {"extra": "forbid"}  # type: ignore[attr-defined]
+    kind.__pydantic_config__ = {"extra": "forbid"}  # ty: ignore[missing-attribute]
     return kind
 
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TypeAlias, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NoReturn, TypeAlias, get_args
 
 from calib.errors import CalibError, UsageError, suggestion
 from calib.units import QUANTITIES
@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 ParsedTable: TypeAlias = dict[str, Any]
 """A table of a TOML or JSON file as its parser returns it; who reads a value checks it."""
+
+Plots: TypeAlias = bool | Literal["png", "svg"]
+"""Figures of a result: False none, True as data and in its page, a format as files of this format, too."""
 
 # Pydantic's name of the error for an unknown key.
 UNKNOWN = "unexpected_keyword_argument"
@@ -119,8 +122,8 @@ def _expression(text: str, quantity: str) -> float:
     factor = 1.0
     factors = QUANTITIES.get(quantity, {})
     for unit in sorted(factors, key=len, reverse=True):
-        if text.endswith(unit):
-            text = text.removesuffix(unit).strip()
+        if text.endswith(unit):  # ty: ignore[invalid-argument-type]
+            text = text.removesuffix(unit).strip()  # ty: ignore[no-matching-overload]
             factor = factors[unit]
             break
     return evaluated(ast.parse(text, mode="eval").body) * factor

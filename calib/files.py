@@ -266,7 +266,7 @@ def _alive_on_windows(process: int) -> bool:
     """Return whether a process runs; ``os.kill`` would end it there."""
     import ctypes
 
-    kernel = ctypes.windll.kernel32  # type: ignore[attr-defined]
+    kernel = ctypes.windll.kernel32  # ty: ignore[missing-attribute]
     handle = kernel.OpenProcess(QUERY_INFORMATION, False, process)
     if not handle:
         return False

@@ -30,6 +30,8 @@ REPORT, CERTIFICATE = "report.json", "certificate.html"
 """The certificate, and the data for it and its figures."""
 PAGES = (CERTIFICATE, "certificate.pdf", "report.html")
 """The certificate as a page and as a document, and the report with all tables and figures."""
+FIGURES = "figures.json"
+"""Figures as data, where no page has them."""
 OFFSETS, PARAMETERS = "joint_offsets.csv", "parameters.json"
 """Files that identify an export, of a geometry and of dynamics."""
 
@@ -45,6 +47,16 @@ class InFolder:
 
     def __get__(self, folder: Any, kind: type | None = None) -> Path:
         return folder.path / self.name
+
+
+def figure_files(*names: str) -> tuple[str, ...]:
+    """Return the names of all files that hold figures: their data, each as PNG and SVG, and its samples.
+
+    Args:
+        names: names of the figures, or patterns of names.
+    """
+    drawn = [f"plot_{name}{suffix}" for name in names for suffix in (".png", ".svg")]
+    return (FIGURES, *drawn, *(f"figure_{name}.js" for name in names))
 
 
 def check_target(

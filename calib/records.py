@@ -74,7 +74,7 @@ def read_rows(kind: type[T], path: Path) -> tuple[T, ...]:
         # Without units.
         columns = [name.partition(" [")[0] for name in rows.fieldnames or ()]
         rows.fieldnames = columns
-        optional_columns: Mapping[str, object] = kind._field_defaults  # type: ignore[attr-defined]  # of named tuples
+        optional_columns: Mapping[str, object] = kind._field_defaults  # ty: ignore[missing-attribute]  # of named tuples
         missing = optional_columns.keys() - set(columns)
         hints = {name: hint for name, hint in get_type_hints(kind).items() if name not in missing}
         result = []
@@ -187,7 +187,7 @@ def plain(value: object, null: bool = False) -> Any:
 def _keys(kind: type) -> dict[str, bool]:
     """Return, for each field and stored property of a record type, whether non-finite numbers are written as null."""
     hints = get_type_hints(kind, include_extras=True)
-    keys = {field.name: _nullable(hints[field.name]) for field in fields(kind)}
+    keys = {field.name: _nullable(hints[field.name]) for field in fields(kind)}  # ty: ignore[invalid-argument-type]
     for base in kind.__mro__:
         for name, item in base.__dict__.items():
             if isinstance(item, stored):
@@ -274,7 +274,7 @@ class Frozen:
     """Base class of dataclasses whose ``np.ndarray`` fields are stored as read-only copies (floats or booleans)."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):  # type: ignore[arg-type]
+        for field in fields(self):  # ty: ignore[invalid-argument-type]
             if field.type in (np.ndarray, "np.ndarray"):
                 value = np.asarray(getattr(self, field.name))
                 kind = bool if value.dtype == bool else float

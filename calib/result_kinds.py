@@ -85,6 +85,21 @@ KINDS = (
         (("dynamics.json",),),
         _NOT_A_SESSION | {"compensate": "give the fit that it is based on"},
     ),
+    ResultKind(
+        "gravity",
+        "the gravity of standing poses",
+        ((GRAVITY_SUMMARY,),),
+        {
+            "certificate": "what it says is in {folder}/gravity_summary.txt; certificates are of fits and of "
+            "identifications from motions",
+            "compensate": "give the folder of a fit; gravity does not change where the robot goes",
+            "deliver": "give the folder of a fit; the robot with this gravity is {folder}/robot.urdf",
+            "diff": "give folders of fits, of identifications or of sessions; compare the files gravity.csv by hand",
+            "export": "the robot with this gravity is {folder}/robot.urdf, unless the verdict left it out",
+            "robot": "the robot with this gravity is {folder}/robot.urdf, unless the verdict left it out",
+            "view": "its robot is {folder}/robot.urdf, and its errors are in {folder}/gravity_summary.txt",
+        },
+    ),
     ResultKind("excitation", "a motion of calib excite", (("trajectory.toml",),)),
     ResultKind("plan", "a motion of calib plan", (("motion.csv",),)),
     ResultKind("fit", "the result of a fit", (("robot.toml", METRICS),), _NOT_A_SESSION),
@@ -139,8 +154,6 @@ def refusal(path: str | Path, verb: str) -> str:
         what = (
             "contains no result" if Path(path).is_dir() else "is a file" if Path(path).is_file() else "does not exist"
         )
-        if (Path(path) / GRAVITY_SUMMARY).is_file():
-            what = "has the gravity of standing poses only: use robot.urdf in it"
         return f"{path} {what}; give {TAKES[verb]}"
     advice = kind.advice.get(verb, f"give {TAKES[verb]}")
     return f"{path} is {kind.noun}; {advice.format(folder=path)}"

@@ -40,6 +40,7 @@ EFFORTS = {
     "knm": 1e3,
 }
 CURRENTS = {"a": 1.0, "ma": 1e-3}
+MASSES = {"kg": 1.0, "g": 1e-3}
 
 QUANTITIES: Mapping[str, Mapping[str, float]] = {
     "angle": ANGLES,

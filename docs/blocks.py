@@ -127,7 +127,8 @@ def _run(block: Block, folder: Path, names: dict[str, object]) -> tuple[str, str
             return printed.getvalue(), f"{type(error).__name__}: {error}"
         return printed.getvalue(), ""
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    places = {"PATH": path, "COLUMNS": COLUMNS, "D": str(DATA)}
+    # of BLAS one thread, as the commands have by themselves, for scripts
+    places = {"PATH": path, "COLUMNS": COLUMNS, "D": str(DATA), "OPENBLAS_NUM_THREADS": "1"}
     command = ["bash", "-euo", "pipefail", "-c", block.code]
     done = subprocess.run(
         command, cwd=folder, env=os.environ | places, capture_output=True, text=True, stdin=subprocess.DEVNULL

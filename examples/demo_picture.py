@@ -47,7 +47,7 @@ def run(folder: Path) -> dict[str, float]:
     """Run the demonstration in a new folder; return its figures for README and picture."""
     began = time.process_time()
     with one_blas_thread():  # as in the command
-        found = demo.run(folder, demo.ROBOT, 0, print, lambda words: None)
+        found = demo.run(folder, demo.ROBOT, 0, print, lambda words: None, plots="png")
     seconds, session = time.process_time() - began, found.session
     truth = json.loads(session.path("truth.json").read_text(encoding="utf-8"))
     nominal, calibrated = position_errors(session)

@@ -157,6 +157,7 @@ def test_no_core_module_names_an_application():
     assert [path for path in core if named.search(path.read_text(encoding="utf-8"))] == []
 
 
+@pytest.mark.slow
 def test_applications_can_be_removed(monkeypatch):
     """Without any application the core's commands, methods and formats are there; what they offer is asked for by name.
 
@@ -180,6 +181,7 @@ def test_applications_can_be_removed(monkeypatch):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_geometry_is_fitted_without_nlopt(tmp_path):
     """It is for a few searches of poses and motions, which import it where they use it."""
     code = "import sys; sys.modules['nlopt'] = None; import calib, practice; from calib.cli import run; "

@@ -4,6 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 NAMES = ("poses", "trajectories", "robot", "data", "geometry", "files", "errors", "units")
 SCRIPT = """
 import poses, trajectories, robot, data
@@ -21,6 +23,7 @@ raise SystemExit(run(["formats", "mdh"]))
 """
 
 
+@pytest.mark.slow
 def test_a_folder_with_a_users_modules(tmp_path: Path):
     for name in NAMES:
         (tmp_path / f"{name}.py").write_text("MINE = True\n")
@@ -29,6 +32,7 @@ def test_a_folder_with_a_users_modules(tmp_path: Path):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 def test_no_calib_module_has_two_names(tmp_path: Path):
     """In a checkout the folders poses and trajectories can be imported by accident, too, with other classes."""
     script = (

@@ -124,6 +124,7 @@ def test_task_of_killed_process_runs_again(crews: dict[str, Workers], tmp_path: 
     assert sorted(crews["processes"].completed(die_at_first, tasks)) == [(x, f"{x}") for x in range(3)]
 
 
+@pytest.mark.slow
 def test_lost_task_costs_no_other_result(crews: dict[str, Workers]) -> None:
     """A task lost for good costs no other result."""
     found = dict(crews["processes"].completed(die_of_two, range(5)))
@@ -265,6 +266,7 @@ def assert_gone(pids: list[int]) -> None:
             raise AssertionError(f"process {pid} is still there")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("run", "hit"), [("map", "group"), pytest.param("completed", "parent", marks=pytest.mark.slow), ("map", "workers")]
 )
@@ -280,6 +282,7 @@ def test_ctrl_c_hands_back_tasks_under_way(tmp_path: Path, run: str, hit: str) -
     assert_gone(pids)
 
 
+@pytest.mark.slow
 def test_second_signal_hides_worker_output(tmp_path: Path) -> None:
     """A terminal sends its own beside the parent's."""
     running = script(tmp_path, task="slow_to_say")

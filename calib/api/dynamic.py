@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from calib.api.rendering import ChartedResult, Progress, ReportedResult, listed, optional
 from calib.api.result_table import ResultTable, data_frame
 from calib.arguments import checked
+from calib.config_types import Plots
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
 from calib.estimation.estimate import Estimate
@@ -31,7 +32,7 @@ from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from calib.api.result_table import DataFrame
-    from calib.procedure.report.charts import Chart
+    from calib.procedure.report.figures.charts import Chart
     from calib.procedure.report.page import Section
 
 Recorded = str | Path | Recording
@@ -125,12 +126,12 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
         return positions, velocities, accelerations
 
     @checked
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the result folder, with the same files as `calib identify --out`, and return its path.
 
         Args:
             out: folder to write; an earlier result of the same kind in it is replaced.
-            plots: whether to write the figures.
+            plots: False: no figures, True: in the page, ``png`` or ``svg``: as files, too.
         """
         from calib.procedure.report import outputs
 
@@ -196,6 +197,7 @@ def identify_dynamics(
     terms: Sequence[FrictionTerm] = (),
     options: IdentifyOptions | str | Path | None = None,
     excitation: str | Path | None = None,
+    with_geometry: bool | None = None,
     base: str | None = None,
     tip: str | None = None,
     seed: int = 0,
@@ -223,6 +225,9 @@ def identify_dynamics(
             instead of `settings`; None for no file.
         excitation: folder written by `design_excitation`, for methods that simulate the closed loop ([loop] in the
             options). Its motion is the reference motion for recordings that contain none. None for no folder.
+        with_geometry: whether the geometry is estimated again together with the dynamics: the covariance of the fit is
+            its prior, and torques of motions with and without a known payload tell joint offsets. ``robot`` of the
+            result has the geometry after the torques. None takes the settings' choice.
         seed: seed of all random numbers.
         on_read: called with the inputs before the identification begins; None for no call.
         progress: called with the name of each step; None for no report.
@@ -241,6 +246,8 @@ def identify_dynamics(
     elif not isinstance(options, IdentifyOptions):
         options = read_options(optional(options))
     options = replace(options, settings=replace(options.settings, functions=tuple(terms)))
+    if with_geometry is not None:
+        options = replace(options, settings=replace(options.settings, with_geometry=with_geometry))
     designed = [] if excitation is None else [coefficients.read(Path(excitation))]
     stage = stage_of(robot, "identify", base, tip)
     if stage is not None:

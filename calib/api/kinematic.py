@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,18 +12,19 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from calib import files
-from calib.api.rendering import ChartedResult, Progress, ReportedResult, WithoutVerdict, listed, optional
+from calib.api.rendering import ChartedResult, Progress, ReportedResult, WithoutVerdict, charts_of, listed, optional
 from calib.api.result_table import ResultTable, data_frame
 from calib.arguments import checked
 from calib.config import Tables
+from calib.config_types import Plots
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import TaskLost, UsageError, as_ours, require
 from calib.estimation.estimate import Estimate
 from calib.estimation.robust import Loss, check_loss
 from calib.geometry.observation import pose_sigmas
+from calib.geometry.static_torques.sources import gravity_of
 from calib.procedure.kinematic_stage import fit, folder, inputs, selection
-from calib.procedure.kinematic_stage.inputs import gravity_of
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import prediction
 from calib.procedure.measuring.measuring_run import write_run
@@ -31,12 +32,11 @@ from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import Floats, as_subclass, plain
 from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain, like_joints
-from calib.workers.extras import available
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from calib.api.result_table import DataFrame
-    from calib.procedure.report.charts import Chart
+    from calib.procedure.report.figures.charts import Captioned, Chart
     from calib.procedure.report.page import Section
 
 Measured = str | Path | PoseMeasurements
@@ -58,7 +58,7 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
         return np.asarray(self.selection.q)
 
     @checked
-    def save(self, path: str | Path, *, plots: bool = True, overwrite: bool = False) -> Path:
+    def save(self, path: str | Path, *, plots: Plots = True, overwrite: bool = False) -> Path:
         """Write the poses [deg or mm] as CSV, and the predicted errors beside it; return the path of the CSV.
 
         The columns are the joints' names. The predicted errors are written to ``…_prediction.json``, which the argument
@@ -67,22 +67,34 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
 
         Args:
             path: the CSV to write.
-            plots: whether to write the figures.
+            plots: False: no figures, True: in the page, ``png`` or ``svg``: as files, too.
             overwrite: whether to replace any existing file.
 
         Raises:
             UsageError: a file exists and must not be replaced.
         """
         path = Path(path)
-        plots = plots and available("matplotlib")
-        figure_paths = selection.beside_poses(path, plots)
+        paths = selection.beside_poses(path, plots, self)
         with files.results(selection.targets(path, plots), overwrite=overwrite):
-            if plots:
-                from calib.procedure.report.style import save
-
-                for name, figure in self.plot().items():
-                    save(figure, figure_paths[name])
+            if "figures" in paths:
+                self._write_figures(paths, plots)
             return selection.write(self, path)
+
+    def _write_figures(self, paths: Mapping[str, Path], plots: Plots) -> None:
+        """Write the page with the figures, and each as a file, if `plots` is a format.
+
+        Args:
+            paths: ``figures``: the page, and the files of the figures by name.
+            plots: True or the format.
+        """
+        from calib.procedure.report import outputs
+        from calib.procedure.report.figures import figure_files
+
+        charts = self._captioned()
+        files.write(paths["figures"], outputs.figures_page(f"Poses for {self.chain.name}", [str(self)], charts))
+        if isinstance(plots, str):
+            for name, (chart, _) in charts.items():
+                files.write(paths[name], figure_files.drawn(chart, plots))
 
     @checked
     def save_run(self, path: str | Path, *, overwrite: bool = False) -> Path:
@@ -102,17 +114,22 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
 
         Empty if a parameter is not identifiable.
         """
+        return charts_of(self._captioned())
+
+    def _captioned(self) -> dict[str, Captioned]:
         from calib.procedure.report.geometry_figures import outlook_figure, predicted_map
 
-        result: dict[str, Chart] = {}
+        result: dict[str, Captioned] = {}
         for name in self.figure_names:
             if name == "predicted":
                 selected = self.outlook.poses
-                result[name] = predicted_map(selected.points, selected.spread)
+                chart = predicted_map(selected.points, selected.spread)
+                result[name] = chart, "How well the tool's position will be known over the workspace."
             else:
                 curve = [(float(forecast.poses), 1e3 * forecast.rms) for forecast in self.outlook.others]
                 point = (float(self.outlook.poses.poses), 1e3 * self.outlook.poses.rms)
-                result[name] = outlook_figure(curve, point, "poses", "σ of the tool's position [mm]")
+                chart = outlook_figure(curve, point, "poses", "σ of the tool's position [mm]")
+                result[name] = chart, "What fewer and more poses are predicted to identify."
         return result
 
     def to_dict(self) -> dict[str, object]:
@@ -216,14 +233,14 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         return PoseMeasurements(joints, self.inputs.chain.joint_names, torque=gravity_of(self.inputs.weighed, joints))
 
     @checked
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the result folder, with the same files as `calib fit --out`, and return its path.
 
         The files are robot.toml, URDF, estimate, residuals and certificate.
 
         Args:
             out: folder to write; an earlier result of the same kind in it is replaced.
-            plots: whether to write the figures.
+            plots: False: no figures, True: in the page, ``png`` or ``svg``: as files, too.
         """
         from calib.procedure.report import outputs
 
@@ -234,8 +251,7 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         from calib.procedure.report import geometry_figures
         from calib.procedure.report.fit_report import collect
 
-        captioned = geometry_figures.captioned(collect(self))
-        return {name: chart for name, (chart, _) in captioned.items()}
+        return charts_of(geometry_figures.captioned(collect(self)))
 
     def to_dict(self) -> dict[str, object]:
         """Return the metrics of the result, the content of ``metrics.json``."""

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.rendering import ChartedResult, Progress, WithoutVerdict, optional, saved
+from calib.api.rendering import ChartedResult, Progress, WithoutVerdict, charts_of, optional, saved
 from calib.arguments import checked
 from calib.config import Tables
+from calib.config_types import Plots
 from calib.data.poses.pose_lists import Targets
 from calib.errors import TaskLost, UsageError, as_ours, require
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
@@ -23,10 +25,9 @@ from calib.records import as_subclass
 from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain
 from calib.trajectories.setpoints import Setpoints
-from calib.workers.extras import available
 
 if TYPE_CHECKING:
-    from calib.procedure.report.charts import Chart
+    from calib.procedure.report.figures.charts import Chart
 
 Sampled = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
@@ -53,26 +54,25 @@ class ExcitationDesign(ChartedResult, WithoutVerdict, design.Designed):
         return _columns(folder.one_period(self, rate))
 
     @checked
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the result folder, with the same files as `calib excite --out`, and return its path.
 
         The files are trajectory.csv, ROS 2 messages, metrics and figures.
 
         Args:
             out: folder to write; an earlier result of the same kind in it is replaced.
-            plots: whether to write the figures.
+            plots: False: no figures, True: in the page, ``png`` or ``svg``: as files, too.
         """
-        write_figures = None
-        if plots and available("matplotlib"):
-            from calib.procedure.report.motion_figures import write_design as write_figures
+        from calib.procedure.report import outputs
 
-        return folder.write_design(self, Path(out), write_figures)
+        draw = partial(outputs.write_design, plots=plots) if plots else None
+        return folder.write_design(self, Path(out), draw)
 
     def charts(self) -> dict[str, Chart]:
         """Return the charts of the figures by name: motion, tool path, search, Pareto front."""
         from calib.procedure.report import motion_figures
 
-        return motion_figures.design_figures(self)
+        return charts_of(motion_figures.design_figures(self))
 
     def to_dict(self) -> dict[str, object]:
         """Return the metrics of the result, the content of ``metrics.json``."""
@@ -104,24 +104,23 @@ class MotionPlan(ChartedResult, WithoutVerdict, planning.Planned):
         return _columns(self.track)
 
     @checked
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the result folder, with the same files as `calib plan --out`, and return its path.
 
         Args:
             out: folder to write; an earlier result of the same kind in it is replaced.
-            plots: whether to write the figures.
+            plots: False: no figures, True: in the page, ``png`` or ``svg``: as files, too.
         """
-        write_figures = None
-        if plots and available("matplotlib"):
-            from calib.procedure.report.motion_figures import write_plan as write_figures
+        from calib.procedure.report import outputs
 
-        return folder.write_plan(self, Path(out), write_figures)
+        draw = partial(outputs.write_plan, plots=plots) if plots else None
+        return folder.write_plan(self, Path(out), draw)
 
     def charts(self) -> dict[str, Chart]:
         """Return the charts of the figures by name: motion and speed profile."""
         from calib.procedure.report import motion_figures
 
-        return motion_figures.plan_figures(self)
+        return charts_of(motion_figures.plan_figures(self))
 
     def to_dict(self) -> dict[str, object]:
         """Return the metrics of the result, the content of ``metrics.json``."""

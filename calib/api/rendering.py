@@ -15,6 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, overload
 
+from calib.config_types import Plots
 from calib.errors import CalibError, UsageError, one_of
 from calib.procedure.findings import NOT_JUDGED, Verdict
 from calib.result_kinds import ResultKind
@@ -25,8 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from calib.data.csv_table import Table
-    from calib.procedure.report.charts import Chart
-    from calib.procedure.report.page import Picture, Section
+    from calib.procedure.report.figures.charts import Captioned, Chart
+    from calib.procedure.report.page import ChartPicture, Section
     from calib.results.scene import Scene
 
 Progress = Callable[[str], None]
@@ -44,6 +45,11 @@ def listed(value: object | Sequence[object]) -> list:
     return result
 
 
+def charts_of(captioned: Mapping[str, Captioned]) -> dict[str, Chart]:
+    """Return charts by name, without their captions."""
+    return {name: chart for name, (chart, _) in captioned.items()}
+
+
 def optional(value: object) -> Any:
     """Return a text as a path, and any other value unchanged."""
     return Path(value) if isinstance(value, str) else value
@@ -52,12 +58,12 @@ def optional(value: object) -> Any:
 class SavedResult(Protocol):
     """A result that can be written to a folder."""
 
-    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, /, *, plots: Plots = True) -> Path:
         """Write the result's folder, and return the folder's path.
 
         Args:
             out: folder to write.
-            plots: whether to write the figures.
+            plots: False: no figures, True: in the page, ``png`` or ``svg``: as files, too.
         """
         ...
 
@@ -98,7 +104,7 @@ def as_text(renderables: Iterable[object]) -> str:
     console = Console(file=io.StringIO(), width=WIDTH, highlight=False, color_system=None, force_jupyter=False)
     for renderable in renderables:
         console.print(renderable, soft_wrap=True)
-    return console.file.getvalue().rstrip()  # type: ignore[attr-defined]
+    return console.file.getvalue().rstrip()  # ty: ignore[missing-attribute]
 
 
 class Shown:
@@ -128,16 +134,16 @@ class Kept(Shown, ABC):
     kind: ClassVar[ResultKind]
 
     @abstractmethod
-    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, /, *, plots: Plots = True) -> Path:
         """Write the result's folder, and return the folder's path.
 
         Args:
             out: folder to write.
-            plots: whether to write the figures.
+            plots: False: no figures, True: in the page, ``png`` or ``svg``: as files, too.
         """
 
-    def figures(self) -> Mapping[str, Picture]:
-        """Return the figures by name, as PNG images; empty for a result without figures."""
+    def figures(self) -> Mapping[str, ChartPicture]:
+        """Return the figures by name; empty for a result without figures."""
         return {}
 
     def tables(self) -> Mapping[str, Table]:
@@ -171,12 +177,11 @@ class WithoutVerdict(Kept):
 class ChartedResult(Kept):
     """A result with figures, made from charts."""
 
-    def figures(self) -> Mapping[str, Picture]:
-        """Return the figures by name, as PNG images."""
-        with needing("matplotlib"):
-            from calib.procedure.report.charts import picture
+    def figures(self) -> Mapping[str, ChartPicture]:
+        """Return the figures by name: charts, which are drawn when their ``image`` is asked for."""
+        from calib.procedure.report.page import ChartPicture
 
-        return {name: picture(chart, "") for name, chart in self.charts().items()}
+        return {name: ChartPicture(chart, "", name) for name, chart in self.charts().items()}
 
     @abstractmethod
     def charts(self) -> Mapping[str, Chart]:
@@ -194,13 +199,13 @@ class ChartedResult(Kept):
             UsageError: there is no figure of this name.
         """
         with needing("matplotlib"):
-            from calib.procedure.report import charts
+            from calib.procedure.report.figures.drawing import figure
 
-        charts_by_name = self.charts()
+        charts = self.charts()
         if name is None:
-            return {title: charts.figure(chart) for title, chart in charts_by_name.items()}
-        one_of(name, charts_by_name, "plot", UsageError)
-        return charts.figure(charts_by_name[name])
+            return {title: figure(chart) for title, chart in charts.items()}
+        one_of(name, charts, "plot", UsageError)
+        return figure(charts[name])
 
 
 class ReportedResult(Kept):

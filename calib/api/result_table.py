@@ -12,7 +12,7 @@ from calib.errors import UsageError, one_of
 from calib.workers.extras import needing
 
 if TYPE_CHECKING:
-    import pandas  # pyright: ignore[reportMissingImports]
+    import pandas
 
     DataFrame: TypeAlias = pandas.DataFrame
 
@@ -128,5 +128,5 @@ def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:
         UsageError: pandas is not installed.
     """
     with needing("pandas", "; to_dict() and save() do without"):
-        import pandas  # pyright: ignore[reportMissingImports]
+        import pandas
     return pandas.DataFrame(list(rows), columns=list(columns))

@@ -124,7 +124,7 @@ def _runs(over: Over) -> list[dict[str, object]]:
         for values in product(*over.values()):
             runs.append(dict(zip(over, values)))
     require(len(over) > 0 and len(runs) > 0, "over: nothing to run: give one value or more for each name", UsageError)
-    return runs
+    return runs  # ty: ignore[invalid-explicit-return]
 
 
 def _task(
@@ -143,7 +143,7 @@ def _task(
     kind = _settings_class(verb)
     setting_names: set[str] = set()
     if kind is not None:
-        setting_names.update(entry.name for entry in fields(kind))
+        setting_names.update(entry.name for entry in fields(kind))  # ty: ignore[invalid-argument-type]
     call_options = dict(options)
     changes: dict[str, object] = {}
     for name, value in varied.items():
@@ -153,14 +153,14 @@ def _task(
             call_options[name] = value
         else:
             names = ", ".join(sorted({*setting_names, *parameters}))
-            raise UsageError(f"over: '{name}' is neither a setting nor an argument of {verb.__name__}: {names}")
+            raise UsageError(f"over: '{name}' is neither a setting nor an argument of {verb.__name__}: {names}")  # ty: ignore[missing-attribute]
     if changes and kind is not None:
         base = call_options.get("settings")
         positional = list(parameters).index("settings") < len(arguments)
         require(not positional, "settings: give them by name: settings=…", UsageError)
         if base is None:
             base = kind()
-        call_options["settings"] = replace(base, **changes)  # type: ignore[type-var]
+        call_options["settings"] = replace(base, **changes)  # ty: ignore[invalid-argument-type]
     return _Task(verb, arguments, call_options, figures, varied)
 
 
@@ -221,7 +221,7 @@ def _check_figures(cells: object, varied: Mapping[str, object]) -> None:
     kind = type(cells).__name__
     is_mapping = isinstance(cells, Mapping)
     require(is_mapping, f"figures: expected a mapping of names to numbers or texts, found {kind}", UsageError)
-    for name, value in dict(cells).items():  # type: ignore[call-overload]
+    for name, value in dict(cells).items():  # ty: ignore[no-matching-overload]
         require(isinstance(name, str), f"figures: expected names as texts, found {name!r}", UsageError)
         is_free = name != ERROR and name not in varied
         require(is_free, f"figures: '{name}' is a column of the sweep itself: choose another name", UsageError)

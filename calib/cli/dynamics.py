@@ -7,6 +7,7 @@ import typer
 
 from calib.cli.completion import Robot
 from calib.cli.shared import Out, Seed, check_destination, command, progress, say, say_written
+from calib.config_types import Plots
 from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ def excite(
     workers: str = "1",
     base: str | None = None,
     tip: str | None = None,
-    plots: bool = True,
+    plots: Plots = True,
 ) -> None:
     """Design a motion that excites ROBOT's dynamics, within limits.
 
@@ -97,10 +98,11 @@ def identify_dynamics(
     friction: str | None = None,
     options: Path | None = None,
     excitation: Path | None = None,
+    with_geometry: bool = False,
     base: str | None = None,
     tip: str | None = None,
     seed: Seed = 0,
-    plots: bool = True,
+    plots: Plots = True,
 ) -> None:
     """Identify ROBOT's dynamics from recordings, and judge them. What counts is how well other motion is predicted.
 
@@ -117,6 +119,7 @@ def identify_dynamics(
         options: TOML: drives, payloads, gains, filters, identification
         excitation: folder of calib excite: its prediction is compared with the result; its motion is the reference of
             recordings that have none (methods with a [loop])
+        with_geometry: estimate joint offsets, lengths and the direction of gravity again, together with the dynamics
     """
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.report.dynamics_section import read_lines
@@ -140,6 +143,7 @@ def identify_dynamics(
             options=options,
             base=base,
             excitation=excitation,
+            with_geometry=with_geometry or None,
             tip=tip,
             seed=seed,
             on_read=read,
@@ -210,7 +214,7 @@ def plan(
     drives: Path | None = None,
     base: str | None = None,
     tip: str | None = None,
-    plots: bool = True,
+    plots: Plots = True,
 ) -> None:
     """Plan the fastest motion of ROBOT through waypoints. Speeds and torques stay within its limits.
 

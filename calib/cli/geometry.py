@@ -7,8 +7,8 @@ import typer
 
 from calib.cli.completion import Robot
 from calib.cli.shared import Out, check_destination, command, exit_failed, progress, say, say_written
+from calib.config_types import Plots
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
-from calib.workers.extras import available
 
 if TYPE_CHECKING:
     from calib.procedure.kinematic_stage.inputs import Inputs
@@ -28,14 +28,14 @@ def select(
     workers: str = "1",
     base: str | None = None,
     tip: str | None = None,
-    plots: bool = True,
+    plots: Plots = True,
     overwrite: bool = False,
 ) -> None:
     """Choose the poses that determine the geometry of ROBOT best.
 
     Beside OUT.csv, OUT_prediction.json holds what the poses are predicted to identify (calib fit --selection),
-    OUT_predicted.png shows how well the tool will be known over the workspace, and OUT_outlook.png what fewer and more
-    poses would identify.
+    OUT_figures.html shows how well the tool will be known over the workspace, and what fewer and more poses would
+    identify.
 
     Example: calib select robot.urdf -m 40 --out poses.csv
 
@@ -58,7 +58,6 @@ def select(
         sources += beside(constraints).values()
     stage_of(robot, "choosing poses")
     load_robot(robot, existing, FitOptions(), base, tip)
-    plots = plots and available("matplotlib")
     targets = selection.targets(out, plots)
     if run:
         targets = [*targets, (run, (".csv",))]
@@ -100,7 +99,7 @@ def fit(
     selection: Path | None = None,
     base: str | None = None,
     tip: str | None = None,
-    plots: bool = True,
+    plots: Plots = True,
 ) -> None:
     """Fit the geometry of ROBOT to measured poses, and judge it.
 

@@ -8,6 +8,7 @@ import typer
 
 from calib.cli.completion import codes, topics
 from calib.cli.shared import Seed, command, exit_failed, reporting, say
+from calib.config_types import Plots
 from calib.errors import CalibError, UsageError, command_line, require
 from calib.procedure.answers import Answers
 
@@ -134,7 +135,7 @@ def explain(code: Annotated[str | None, typer.Argument(autocompletion=codes)] = 
 
 
 @command(app, "Start", "next")
-def next_step(folder: Folder, pick: Annotated[int | None, typer.Option(min=1)] = None, plots: bool = True) -> None:
+def next_step(folder: Folder, pick: Annotated[int | None, typer.Option(min=1)] = None, plots: Plots = True) -> None:
     """Continue a session, then print what to do at the robot.
 
     Example: calib next cell
@@ -146,7 +147,7 @@ def next_step(folder: Folder, pick: Annotated[int | None, typer.Option(min=1)] =
 
 
 @command(app, "Start")
-def redo(folder: Folder, step: str, plots: bool = True) -> None:
+def redo(folder: Folder, step: str, plots: Plots = True) -> None:
     """Repeat a step of a session and all steps that depend on it.
 
     Example: calib redo cell fit
@@ -170,7 +171,7 @@ def status(folder: Folder) -> None:
     say(*commands.noted(folder))
 
 
-def _go_on(folder: Path, command: str, step: str = "", plots: bool = True, pick: int = 0) -> None:
+def _go_on(folder: Path, command: str, step: str = "", plots: Plots = True, pick: int = 0) -> None:
     from calib.procedure.session import commands
 
     arguments: list[object] = [command, folder]

@@ -9,11 +9,12 @@ import os
 import re
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from copy import copy
 from dataclasses import fields, is_dataclass
+from enum import StrEnum
 from functools import partial, wraps
 from inspect import Parameter, cleandoc, signature
 from math import inf, isfinite
@@ -27,9 +28,10 @@ from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
 from calib.cli.completion import completion
 from calib.cli.help import Command, type_word
 from calib.config import described, parse
-from calib.config_types import OneOf, Typed
+from calib.config_types import OneOf, Plots, Typed
 from calib.errors import UsageError, require
 from calib.units import plain_number
+from calib.workers.extras import installed, lacking
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -278,7 +280,8 @@ class Common:
         base: URDF: the link the arm starts at.
         tip: URDF: the link the arm ends at; else its flange (tool0, flange), which is printed with the reason.
         workers: local processes, or the address of a Dask scheduler.
-        plots: draw figures, or leave them out.
+        plots: write each figure as a file, too. Default: figures are on the page.
+        no_plots: leave figures out.
         verbose: print all details, tables included.
         overwrite: replace all existing files; without it, only those of an earlier run.
     """
@@ -317,6 +320,8 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
         for key, parameter in parameters.items():
             if key in settings:
                 options += [option for option in _options(settings[key]) if option.name not in parameters]
+            elif key == "plots":
+                options += _plots_options(descriptions)
             elif listing or key != "verbose":
                 names = (f"--{key.replace('_', '-')}",) if parameter.default is False else ()
                 annotation = _with_help(parameter, hints[key], descriptions.get(key, ""), names)
@@ -333,18 +338,58 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
                 arguments = {key: _built(kind, values) for key, kind in settings.items()}
                 with printing(bool(values.get("verbose", True))):
                     arguments |= {key: value for key, value in values.items() if key in parameters}
+                    if "plots" in parameters:
+                        arguments["plots"] = _plots(values)
                     return function(**arguments)
             except UsageError as error:
                 error.args = (_as_typed(str(error), options),)
                 raise
 
-        call.__signature__ = signature(function).replace(parameters=options)  # type: ignore[attr-defined]
+        call.__signature__ = signature(function).replace(parameters=options)  # ty: ignore[missing-attribute]
         call.__annotations__ = {}
         help_text = cleandoc(function.__doc__ or "").partition("\n\nArgs:\n")[0]
         app.command(name, cls=Command, help=help_text, rich_help_panel=group)(call)
         return function
 
     return add
+
+
+class PlotFormat(StrEnum):
+    """Formats of figures that are written as files."""
+
+    PNG = "png"
+    SVG = "svg"
+
+
+def _plots_options(descriptions: Mapping[str, str]) -> Iterator[Parameter]:
+    """Yield the options ``--plots`` and ``--no-plots`` of a command that has the parameter `plots`.
+
+    Args:
+        descriptions: name of a parameter -> its help.
+    """
+    file_format = typer.Option("--plots", metavar="png|svg", help=descriptions["plots"])
+    kind = Annotated[PlotFormat | None, file_format]
+    yield Parameter("plots", Parameter.KEYWORD_ONLY, default=None, annotation=kind)
+    none = typer.Option("--no-plots", metavar=type_word(bool), help=descriptions["no_plots"])
+    yield Parameter("no_plots", Parameter.KEYWORD_ONLY, default=False, annotation=Annotated[bool, none])
+
+
+def _plots(values: Mapping[str, object]) -> Plots:
+    """Return which figures a command writes.
+
+    Args:
+        values: the command line's values.
+
+    Raises:
+        UsageError: figures are asked for and left out.
+    """
+    asked = values["plots"]
+    require(not (asked and values["no_plots"]), "--plots and --no-plots exclude each other", UsageError)
+    if asked == PlotFormat.PNG:
+        require(installed("matplotlib"), f"{lacking('matplotlib')}; without it: --plots svg", UsageError)
+    if isinstance(asked, PlotFormat):
+        return asked.value
+    return not values["no_plots"]
 
 
 def _with_help(parameter: Parameter, hint: object, description: str, names: Sequence[str]) -> object:
@@ -368,7 +413,7 @@ def _with_help(parameter: Parameter, hint: object, description: str, names: Sequ
     if not option.metavar:
         is_argument = isinstance(option, ArgumentInfo)
         option.metavar = parameter.name.upper() if is_argument else type_word(_plain(kind)[0])
-    return Annotated[kind, option]
+    return Annotated[kind, option]  # ty: ignore[invalid-type-form]
 
 
 def _options(kind: type) -> Iterator[Parameter]:
@@ -379,7 +424,7 @@ def _options(kind: type) -> Iterator[Parameter]:
     """
     hints = get_type_hints(kind, include_extras=True)
     descriptions = described(kind)
-    for field in fields(kind):
+    for field in fields(kind):  # ty: ignore[invalid-argument-type]
         if is_dataclass(hints[field.name]):
             yield from _options(hints[field.name])
             continue
@@ -406,7 +451,7 @@ def _options(kind: type) -> Iterator[Parameter]:
         option = typer.Option(*names, help=help_text, metavar=metavar, autocompletion=complete)
         default = field.default if isinstance(field.default, int | float | str) else None
         value_type = plain | None if default is None else plain
-        yield Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[value_type, option])
+        yield Parameter(field.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[value_type, option])  # ty: ignore[invalid-type-form]
 
 
 def _typed(metadata: Sequence[object]) -> Typed:
@@ -487,7 +532,7 @@ def _built(kind: type[S], values: dict[str, object]) -> S:
 def _chosen(kind: type, values: dict[str, object]) -> dict[str, object]:
     result = {}
     hints = get_type_hints(kind, include_extras=True)
-    for field in fields(kind):
+    for field in fields(kind):  # ty: ignore[invalid-argument-type]
         if is_dataclass(hints[field.name]):
             value = _chosen(hints[field.name], values)
         else:

@@ -34,6 +34,7 @@ from calib.units import (
     CURRENTS,
     EFFORTS,
     LENGTHS,
+    MASSES,
     QUANTITIES,
     TIMES,
     UNIT_WORDS,
@@ -154,8 +155,8 @@ class Table:
 
         Args:
             name: name of the column.
-            dimension: ``angle`` [rad], ``length`` [m], ``joint`` (either), ``speed`` [m/s], ``time`` [s], "" (a plain
-                number) or None (not converted).
+            dimension: ``angle`` [rad], ``length`` [m], ``joint`` (either), ``speed`` [m/s], ``time`` [s], ``torque``
+                [N m], ``mass`` [kg], "" (a plain number) or None (not converted).
             unit: unit of the column if its header has none; "" for SI.
             gaps: whether empty and NaN cells become NaN; otherwise they are refused.
 
@@ -167,7 +168,7 @@ class Table:
         if dimension is None:
             return cells
         units = {"angle": ANGLES, "length": LENGTHS, "joint": ANGLES | LENGTHS, "": {"1": 1.0, "-": 1.0}}
-        units |= {"speed": QUANTITIES["speed"], "time": TIMES}
+        units |= {"speed": QUANTITIES["speed"], "time": TIMES, "torque": EFFORTS, "mass": MASSES}  # ty: ignore[unsupported-operator]
         return (cells - self.zero(column, unit)) * self.factor(column, units[dimension], unit)
 
     def check(self, names: Sequence[str], gaps: Collection[str] = ()) -> list[np.ndarray]:

@@ -59,9 +59,9 @@ class Joints:
 
     names: tuple[str, ...]
     kinds: tuple[str, ...] | list[str] = ()
-    lower: np.ndarray = None  # type: ignore[assignment]  # set below
-    upper: np.ndarray = None  # type: ignore[assignment]  # set below
-    effort: np.ndarray = None  # type: ignore[assignment]  # set below
+    lower: np.ndarray = None  # ty: ignore[invalid-assignment]  # set below
+    upper: np.ndarray = None  # ty: ignore[invalid-assignment]  # set below
+    effort: np.ndarray = None  # ty: ignore[invalid-assignment]  # set below
 
     @staticmethod
     def of(joints: Joints | Sequence[str]) -> Joints:

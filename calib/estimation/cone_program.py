@@ -1,8 +1,5 @@
 """Cone programs solved by Clarabel: least squares under linear constraints and semidefinite matrix constraints."""
 
-# pyright: reportAttributeAccessIssue=false
-# clarabel is a compiled extension without stubs
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

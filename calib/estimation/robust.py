@@ -134,7 +134,7 @@ def weights(size: np.ndarray, loss: str | Loss, scale: float | None = None) -> n
     """
     if callable(loss):
         constant = 1.0 if scale is None else scale
-        return _loss_rows(loss, (size.ravel() / constant) ** 2)[1].reshape(size.shape)
+        return _loss_rows(loss, (size.ravel() / constant) ** 2)[1].reshape(size.shape)  # ty: ignore[invalid-argument-type]
     if loss == "none":
         return np.ones_like(size)
     if loss == "huber":

@@ -33,6 +33,7 @@ from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.observation import layout, observe, prepare
 from calib.geometry.residuals import ResidualPart
+from calib.geometry.static_torques.load_errors import DESCRIBED, load_masses, load_variance
 from calib.geometry.weighing import GeometricFit
 from calib.records import evenly
 from calib.robot.calibrated import Deflection
@@ -49,6 +50,8 @@ MIN_POSES = 20
 MAX_POSES = 1500
 # prior standard deviation of a parameter without prior, for folds that do not determine it [m, rad] (our choice)
 PRIOR_SIGMA = 1.0
+# smallest factor κ of the parameters' variance by which other variances are divided
+SMALLEST_FACTOR = 1e-6
 # number of poses and step [rad or m] by which a joint's lever is computed, and the smallest lever [m/rad or 1]
 LEVER_POSES = 50
 LEVER_STEP = 1e-4
@@ -70,6 +73,8 @@ class Discrepancy:
         profile: log s as one function per joint; empty for s = 1 everywhere.
         placed: radii for rows on which base and tool placement are fitted; None if equal to `radii`.
         wider: factors by which the 95 % interval widens below and above each joint's range; empty if unknown.
+        loads: masses that the arm carried in the fitted poses beyond its masses [kg]; empty if unknown.
+        mass_doubt: standard deviation of the masses by which compliance was fitted, as a share of them.
     """
 
     parameters: float
@@ -82,6 +87,8 @@ class Discrepancy:
     profile: Profile = ()
     placed: tuple[float, float] | None = None
     wider: tuple[tuple[float, float], ...] = ()
+    loads: tuple[float, ...] = ()
+    mass_doubt: float = DESCRIBED
 
     @property
     def radius(self) -> float:
@@ -116,6 +123,7 @@ class ErrorModel:
             tool: index of the tool, one or (m,).
         """
         variance = position_variances(self.cell, rows, self.free, self.covariance, station, tool)
+        variance = variance + self._load_variance(rows)
         sigma, radius = self._sigma_and_radius(variance, rows.q, self.discrepancy.radii)
         return sigma * (radius * self._widening(rows.q)) / self.discrepancy.radius
 
@@ -145,13 +153,24 @@ class ErrorModel:
         count = len(root)
         spread = root.T @ jacobian.reshape(count, 3 * len(block))
         spread = spread.reshape(count, 3, len(block))
-        variance = np.sum(spread**2, axis=(0, 1))
+        variance = np.sum(spread**2, axis=(0, 1)) + self._load_variance(block)
         radii = self.discrepancy.placed
         if radii is not None:
             sigma, radius = self._sigma_and_radius(variance, block.q, radii)
             return sigma * radius / self.discrepancy.radius
         sigma, radius = self._sigma_and_radius(variance, block.q, self.discrepancy.radii)
         return sigma * (radius * self._widening(block.q)) / self.discrepancy.radius
+
+    def _load_variance(self, rows: PoseMeasurements) -> np.ndarray | float:
+        """Return the variance (m,) due to a load with which no pose was fitted, as a part of trace J Σ Jᵀ [m²].
+
+        Args:
+            rows: the poses.
+        """
+        variance = load_variance(self.cell, rows, self.discrepancy.loads, self.discrepancy.mass_doubt)
+        if variance is None:
+            return 0.0
+        return variance / max(self.discrepancy.parameters, SMALLEST_FACTOR)
 
     def _sigma_and_radius(
         self, parameter_variance: np.ndarray, q: np.ndarray, radii: tuple[float, float]
@@ -276,7 +295,9 @@ def _joint_levers(chain: Chain, q: np.ndarray) -> np.ndarray:
     return np.maximum(result, MIN_LEVER)
 
 
-def learn_errors(selection: ModelSelection, measured: Sequence[PoseMeasurements], seed: int = 0) -> ErrorModel | None:
+def learn_errors(
+    selection: ModelSelection, measured: Sequence[PoseMeasurements], seed: int = 0, mass_doubt: float = DESCRIBED
+) -> ErrorModel | None:
     """Return the error model, estimated from the errors on held-out rows; None where too few positions were measured.
 
     For every fold, the geometry and the ridges (prior standard deviations) of all chosen effects are estimated again,
@@ -287,6 +308,7 @@ def learn_errors(selection: ModelSelection, measured: Sequence[PoseMeasurements]
         selection: the model and its fit of all rows.
         measured: the blocks to which it was fitted.
         seed: seed of the random folds.
+        mass_doubt: standard deviation of the masses by which compliance was fitted, as a share of them.
     """
     fit = selection.fit
     poses = sum(len(block) for block in measured)
@@ -318,6 +340,8 @@ def learn_errors(selection: ModelSelection, measured: Sequence[PoseMeasurements]
         profile=profile,
         placed=radii,
         wider=samples.wider(weights, wide_radii, reach, rows.poses),
+        loads=load_masses(measured),
+        mass_doubt=mass_doubt,
     )
     return ErrorModel(fit.cell, fit.free, fit.estimate.covariance, q, discrepancy)
 
@@ -377,7 +401,8 @@ class _Rows:
             self.counts.append(np.array(good, bool))
         cell = fit.cell
         if terms:
-            cell = replace(cell, deflection=Deflection(terms, np.zeros(len(terms)), selection.nominal.cell.chain))
+            reference = selection.reference or selection.nominal.cell.chain
+            cell = replace(cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
         table = layout(cell)
         terms_index = table.index("deflection")
         geometry = np.flatnonzero(~np.isin(fit.free, terms_index))

@@ -22,7 +22,7 @@ from calib.robot.calibrated import evaluate, extra_displacements, target_element
 from calib.robot.kinematics import element_jacobian
 from calib.transforms import displace
 
-TERM_UNITS = {"torque": "/(N m)", "joint": "/rad"}
+TERM_UNITS = {"torque": "/(N m)", "moment": "/(N m)", "joint": "/rad"}
 FRAME_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 KINDS = ("arm", "station", "tool", "optics", "deflection")
 # number of rows evaluated at once: their Jacobian has 50 MB at 500 parameters (our choice)
@@ -260,10 +260,10 @@ def rows_of(cell: Installation, block: Block, rows: np.ndarray) -> Block:
     measured = take(block.measured, rows)
     bases = None
     if cell.deflection.terms:
-        bases = evaluate(cell.deflection, measured.q, measured.torque)
+        bases = evaluate(cell.deflection, measured.q, measured.torque, measured.load)
     known_bases = None
     if cell.known.terms:
-        known_bases = evaluate(cell.known, measured.q, measured.torque)
+        known_bases = evaluate(cell.known, measured.q, measured.torque, measured.load)
     displacements = extra_displacements(cell.chain, cell.known, measured.q, known_bases)
     return Block(measured, block.station, block.tool[rows], bases, displacements)
 

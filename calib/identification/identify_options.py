@@ -32,6 +32,8 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     folds = 6                        # time blocks of the cross-validation
     samples = 20000                  # largest number of rows per torque; beyond it every second, third … row
     deflections = true               # joint corrections of the fit (compliance, gears, encoders) move the links
+    with_geometry = false            # joint offsets, lengths and gravity's direction together with the dynamics: poses
+                                     # (the fit's covariance) and torques; a payload of known mass helps
     accept = []                      # findings that are meant so, by the name that their line prints
 
     [filter]                         # default: from the data

@@ -303,9 +303,9 @@ class LoopMetrics:
     cragg_donald: Number = 0.0
     instruments_weak: bool = False
     least_partial_r2: float = 0.0
-    distance_percent: Array = ()  # type: ignore[assignment]
-    simulated_torque_error_percent: Array = ()  # type: ignore[assignment]
-    strays_times: Array = ()  # type: ignore[assignment]
+    distance_percent: Array = ()  # ty: ignore[invalid-assignment]
+    simulated_torque_error_percent: Array = ()  # ty: ignore[invalid-assignment]
+    strays_times: Array = ()  # ty: ignore[invalid-assignment]
     valid: bool = True
     explains: bool = True
     controller: LoopController | None = None

@@ -38,12 +38,16 @@ rows per second), ``error_growth`` (share of this variance that grows with the v
 ``torque_variance``, on another motion), ``seed``, ``schema`` (3; files without one are of earlier versions and are
 read, too). No number: null.
 
-Figures: those of the report, as ``plot_torque_N.png`` of every unseen recording in the order given, of those to learn
-from where none is unseen (measured, predicted, residual, low-passed to the identification band), ``plot_errors.png``,
-``plot_residuals.png`` (autocorrelation; dashed: white noise), ``plot_significance.png``, and, where the geometry's
-uncertainty is known, what it adds to sigma; ``plot_friction.png`` (over velocity), in a session that
-alone: its report has the others. Recordings to learn from are drawn by ``model.plot("torque_N")``, where N counts on
-after the unseen ones.
+``joint_compliance.csv``, of recordings with encoders on motors and links: joint, compliance (negative: -1 / stiffness,
+as in the geometric fit's corrections) with sigma, whether it is identified, and the rms difference of the encoders: as
+recorded, without their delay, and what delay and compliance leave.
+
+Figures are in report.html, and with ``--plots png`` (or svg) as files, too: ``plot_torque_N.png`` of every unseen
+recording in the order given, of those to learn from where none is unseen (measured, predicted, residual, low-passed to
+the identification band), ``plot_errors.png``, ``plot_residuals.png`` (autocorrelation; dashed: white noise),
+``plot_significance.png``, and, where the geometry's uncertainty is known, what it adds to sigma; ``plot_friction.png``
+(over velocity), in a session that alone: its report has the others. Recordings to learn from are drawn by
+``model.plot("torque_N")``, where N counts on after the unseen ones.
 """
 
 import json

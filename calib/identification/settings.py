@@ -97,6 +97,8 @@ class Choices:
         folds: number of time blocks for cross-validation.
         deflections: whether joint corrections of the fit (compliance, gears, encoders) move the links; never where the
             closed loop is simulated.
+        with_geometry: whether the geometry is estimated again together with the dynamics (calib identify
+            --with-geometry).
         loop: the closed loop in which recordings were made, for instrumental variables.
         constraints: constraints on parameters for the methods pc-*; None: their defaults. By a function of parameters,
             or a file of it, also for ols, wls and iv.
@@ -118,6 +120,7 @@ class Choices:
     samples: Annotated[int, Whole(1000, 10_000_000)] = 20_000
     folds: Annotated[int, Whole(2, 50)] = 6
     deflections: Flag = True
+    with_geometry: Flag = False
     loop: Annotated[LoopSettings, Checked(check_loop)] | None = None
     constraints: Annotated[ConstraintSettings | None, Checked(ConstraintSettings.of)] = None
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from calib import files
 from calib.api.motions import ExcitationDesign, Sampled
+from calib.config_types import Plots
 from calib.errors import UsageError, one_of, require
-from calib.folders import METRICS, check_target, write_staged
+from calib.folders import METRICS, check_target, figure_files, write_staged
 from calib.identification.identify_options import IdentifySettings
 from calib.parallel.design_goal import Purpose, foretold, of_folder, of_options, purpose_of, read_model, whole
 from calib.parallel.mechanism.closure import ClosedRobot
@@ -34,7 +35,6 @@ from calib.trajectories.constraints import BoxLimit, MotionConstraint, TwoSided
 from calib.trajectories.design.verify import dense_motion
 from calib.trajectories.setpoints import Setpoints
 from calib.units import headings
-from calib.workers.extras import available
 
 # Number of instants over the period during the search.
 SAMPLES = 100
@@ -55,9 +55,9 @@ READ = (
 )
 # Design criteria that are available for parallel robots.
 GOALS = ("raw", "normalised", "logdet", "smallest")
-FIGURES = "plot_*.png"
+FIGURES = figure_files("*")
 # Files of a motion's folder.
-MOTION = (ROBOT, COVARIANCE, METRICS, PLANNED, coefficients.NAME, prediction.NAME, FIGURES)
+MOTION = (ROBOT, COVARIANCE, METRICS, PLANNED, coefficients.NAME, prediction.NAME, folder.PAGE, *FIGURES)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,10 +76,10 @@ class _ActuatorLimit(TwoSided):
     plan: PlatformRegressor
     of: Callable[[LoopMotion], np.ndarray]
     limits: np.ndarray
-    rows: tuple[str, ...] = ()
+    rows: tuple[str, ...] = ()  # ty: ignore[incompatible-attribute-override]
     name: str = "torque"
     unit: str = "N m"
-    joints: np.ndarray = field(init=False)
+    joints: np.ndarray = field(init=False)  # ty: ignore[incompatible-attribute-override]
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "joints", np.arange(len(self.limits)))
@@ -156,7 +156,7 @@ class ParallelExcitation(ExcitationDesign):
         peak_accelerations = np.abs(a).max(axis=0)
         return peak_torques, peak_accelerations
 
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the result folder of `calib excite`: one period at the controller's rate, and the actuators' series."""
         period_motion = folder.one_period(self)
         bounds = self.inputs.limits.bounds
@@ -166,10 +166,10 @@ class ParallelExcitation(ExcitationDesign):
             files.write(target / coefficients.NAME, dumps(series))
             if self.predicted:
                 prediction.write(self.predicted, target)
-            if plots and available("matplotlib"):
-                from calib.procedure.report.motion_figures import write_design
+            if plots:
+                from calib.procedure.report.outputs import write_design
 
-                write_design(self, target)
+                write_design(self, target, plots)
 
         track = self._actuators(period_motion)
         return write_motion(self.robot, Path(out), track, period_motion.q, bounds, self.to_dict(), write_series)
@@ -413,7 +413,7 @@ def write_motion(
         names.append(f"{name} [{unit}]")
     for part in parts:
         names += headings(part, robot.chain.joints)
-    table = np.hstack([track.times[:, None], coordinates, *parts.values()])
+    table = np.hstack([track.times[:, None], coordinates, *parts.values()])  # ty: ignore[no-matching-overload]
 
     def write(folder: Path) -> None:
         robot.write(folder)

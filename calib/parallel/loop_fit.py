@@ -24,11 +24,22 @@ from calib import files
 from calib.api.rendering import ChartedResult, ReportedResult
 from calib.api.result_table import data_frame
 from calib.arguments import checked
+from calib.config_types import Plots
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.fit_options import FitOptions
 from calib.errors import CalibError, MeasurementError, NoPosture, UsageError, finding, refuse_option, suggestion
 from calib.estimation.estimate import Estimate
-from calib.folders import COVARIANCE, ESTIMATE, METRICS, PAGES, REPORT, check_target, write_covariance, write_staged
+from calib.folders import (
+    COVARIANCE,
+    ESTIMATE,
+    METRICS,
+    PAGES,
+    REPORT,
+    check_target,
+    figure_files,
+    write_covariance,
+    write_staged,
+)
 from calib.parallel.mechanism import parallel_robot
 from calib.parallel.mechanism.closure import ClosedRobot
 from calib.parallel.mechanism.geometric_fit import (
@@ -51,14 +62,14 @@ from calib.robot.calibrated import ROBOT
 
 if TYPE_CHECKING:
     from calib.api.result_table import DataFrame
-    from calib.procedure.report.charts import Chart
+    from calib.procedure.report.figures.charts import Chart
     from calib.procedure.report.page import Section
 
 # Names of the settings that apply to parallel robots.
 READ = ("holdout", "tolerance", "seed")
-FIGURES = "plot_*.png"
+FIGURES = figure_files("*")
 # Files of a fit's folder.
-FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE, calibrated.COVARIANCE, RESIDUALS, REPORT, *PAGES, FIGURES)
+FIT = (ROBOT, METRICS, ESTIMATE, COVARIANCE, calibrated.COVARIANCE, RESIDUALS, REPORT, *PAGES, *FIGURES)
 HEADER = ("name", "unit", "value", "sigma")
 # Number of folds of the cross-validation that replaces missing held-out rows (our choice).
 FOLDS = 4
@@ -150,7 +161,7 @@ class ParallelFit(ChartedResult, ReportedResult):
         return self.unseen or {"fitted": self.errors}
 
     @checked
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the result folder of `calib fit`: either all files or none."""
         # slow to load, as all reports
         from calib.parallel import loop_report

@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
+from calib.config_types import Plots
 from calib.estimation.estimate import Estimate
 from calib.folders import REPORT
 from calib.geometry.accuracy import Errors
@@ -19,7 +20,6 @@ from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.report import fit_report
 from calib.procedure.report.fit_report import CorrelatedPair, FittedParameter, Report, RowErrors
-from calib.workers.extras import available
 
 
 class ReportedFit(Protocol):
@@ -95,19 +95,18 @@ def report_of(fit: ReportedFit) -> Report:
     )
 
 
-def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
+def write(fit: ReportedFit, folder: Path, plots: Plots) -> None:
     """Write ``report.json``, figures (if `plots`) and the certificate into a fit's folder."""
+    from calib.procedure.report import geometry_figures
     from calib.procedure.report.certificate import results
+    from calib.procedure.report.figures import figure_files
+    from calib.procedure.report.page import chart_pictures
 
     report = report_of(fit)
     fit_report.write(report, folder / REPORT)
-    drawn = {}
-    if plots and available("matplotlib"):
-        from calib.procedure.report.charts import saved
-        from calib.procedure.report.geometry_figures import captioned
-
-        drawn = saved(captioned(report), folder)
-    results.write_fit(report, drawn, folder)
+    charts = geometry_figures.captioned(report) if plots else {}
+    figure_files.write(folder, charts, plots, paged=True)
+    results.write_fit(report, chart_pictures(charts), folder)
 
 
 def _metrics(fit: ReportedFit) -> FitMetrics:

@@ -15,6 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from calib.api.motions import MotionPlan
+from calib.config_types import Plots
 from calib.data.csv_table import read_table
 from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, refuse_option
 from calib.parallel.design_goal import read_model
@@ -110,13 +111,13 @@ class ParallelPlan(MotionPlan):
     robot: ParallelMechanism
     coordinates: np.ndarray
 
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the result folder of `calib plan`."""
-        from calib.procedure.report import motion_figures
+        from calib.procedure.report.outputs import write_plan
 
         def write_figures(target: Path) -> None:
             if plots:
-                motion_figures.write_plan(self, target)
+                write_plan(self, target, plots)
 
         metrics = self.to_dict()
         return write_motion(self.robot, Path(out), self.track, self.coordinates, self.bounds, metrics, write_figures)

@@ -9,6 +9,7 @@ from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
+from calib.config_types import Plots
 from calib.errors import UsageError
 from calib.extensions import Point
 
@@ -118,7 +119,7 @@ class MechanismResult(Protocol):
     @property
     def verdict(self) -> Verdict: ...
 
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write a result folder with the same files as `calib fit` or `calib identify`, and return its path.
 
         Args:

@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from calib.config_types import Plots
 from calib.errors import RobotError, UsageError, command_line, refused_as, require
 from calib.folders import COVARIANCE, SESSION
 from calib.procedure.answers import CertificateSection
@@ -25,7 +26,7 @@ from calib.robot.library import resolve
 if TYPE_CHECKING:
     from calib.data.csv_table import Table
     from calib.procedure.report.certificate.record import Certificate, Page
-    from calib.procedure.report.page import Picture
+    from calib.procedure.report.page import ChartPicture
 
 
 class CalibratedRobot(Viewed):
@@ -110,7 +111,7 @@ class StoredFit(CalibratedRobot):
     def fit(self) -> FitFolder:
         return FitFolder(self.path)
 
-    def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
+    def pages(self, details: CertificateSection, plots: Plots = True) -> tuple[Certificate, Page]:
         """Return certificate and report of the fit.
 
         Args:
@@ -145,7 +146,7 @@ class StoredIdentification(CalibratedRobot):
     def _export_sources(self, settings: ExportSettings) -> delivery.Export:
         return delivery.Export(settings.urdf, identified=self.path, prior=settings.prior)
 
-    def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
+    def pages(self, details: CertificateSection, plots: Plots = True) -> tuple[Certificate, Page]:
         """Return certificate and report of the identification.
 
         Args:
@@ -204,7 +205,7 @@ class StoredSession(Viewed):
         judged = folder.numbers.exists() and folder.unseen.report.exists()
         return folder if self.session.dynamic and judged else None
 
-    def figures(self) -> dict[str, Picture]:
+    def figures(self) -> dict[str, ChartPicture]:
         """Return the figures of fit and identification by name, such as ``4-fit/map``."""
         figures = {}
         for step in self._calibrations():
@@ -229,7 +230,7 @@ class StoredSession(Viewed):
             results.append(StoredIdentification(self.identification.path, BY_NAME["identification"]))
         return results
 
-    def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
+    def pages(self, details: CertificateSection, plots: Plots = True) -> tuple[Certificate, Page]:
         """Return certificate and report of a finished session.
 
         Args:
@@ -240,7 +241,7 @@ class StoredSession(Viewed):
 
         return certificate.pages(replace(self.session, plots=plots))
 
-    def certify(self, details: CertificateSection, plots: bool, svg: Path | None) -> list[str]:
+    def certify(self, details: CertificateSection, plots: Plots, svg: Path | None) -> list[str]:
         """Write the report's figures as SVG; the certificate itself is written by the last step of the session.
 
         Args:

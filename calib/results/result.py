@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, NoReturn, Protocol, runtime_checkable
 
-from calib.config_types import ParsedTable
+from calib.config_types import ParsedTable, Plots
 from calib.data.csv_table import Table, read_table
 from calib.errors import CalibError, SessionError, UsageError
-from calib.folders import METRICS, write_staged
+from calib.folders import METRICS, figure_files, write_staged
 from calib.procedure.answers import CertificateSection
 from calib.procedure.findings import NOT_JUDGED, Verdict, Verdicts
-from calib.procedure.report.page import Picture
+from calib.procedure.report.page import ChartPicture, chart_pictures
 from calib.records import read_json
 from calib.result_kinds import ResultKind, refusal
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from calib.procedure.session.folder import Session
     from calib.results.scene import Scene
 
-PICTURES = "plot_*.png"
+DRAWINGS = figure_files("*")
 
 
 @runtime_checkable
@@ -50,7 +50,7 @@ class Result(Protocol):
         """The verdict; the level is `NOT_JUDGED` for results without a verdict, such as motions."""
         ...
 
-    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, /, *, plots: Plots = True) -> Path:
         """Write the result into a folder (a list of poses: into files), and return the path.
 
         Args:
@@ -59,7 +59,7 @@ class Result(Protocol):
         """
         ...
 
-    def figures(self) -> Mapping[str, Picture]:
+    def figures(self) -> Mapping[str, ChartPicture]:
         """Return the figures: name -> figure."""
         ...
 
@@ -171,17 +171,17 @@ class StoredResult:
             return {}
         return read_json(metrics, "make it again")
 
-    def figures(self) -> dict[str, Picture]:
-        """Return the figures that were drawn when the result was written: name -> figure."""
-        start = PICTURES.partition("*")[0]
-        paths = sorted(self.path.glob(PICTURES))
-        return {path.stem.removeprefix(start): Picture(path.read_bytes(), "") for path in paths}
+    def figures(self) -> dict[str, ChartPicture]:
+        """Return the figures that were written with the result: name -> figure."""
+        from calib.procedure.report.figures import figure_data
+
+        return chart_pictures(figure_data.of_folder(self.path))
 
     def tables(self) -> dict[str, Table]:
         """Return the tables in the folder by name; tables without rows are left out."""
         return {path.stem: read_table(path) for path in sorted(self.path.glob("*.csv")) if _has_rows(path)}
 
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Copy the folder, and return the path of the copy.
 
         Args:
@@ -194,7 +194,7 @@ class StoredResult:
         out = Path(out)
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
             raise UsageError(f"{out} is not empty; give a new folder")
-        ignored = shutil.ignore_patterns(*(() if plots else (PICTURES,)))
+        ignored = shutil.ignore_patterns(*(() if plots else DRAWINGS))
         return write_staged(
             out, (), lambda staging: shutil.copytree(self.path, staging, ignore=ignored, dirs_exist_ok=True)
         )
@@ -216,7 +216,7 @@ class StoredResult:
         """
         self.refuse("export")
 
-    def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
+    def pages(self, details: CertificateSection, plots: Plots = True) -> tuple[Certificate, Page]:
         """Raise an error, since the result has neither certificate nor report; subclasses return both.
 
         Args:
@@ -225,7 +225,7 @@ class StoredResult:
         """
         self.refuse("certificate")
 
-    def certify(self, details: CertificateSection, plots: bool, svg: Path | None) -> list[str]:
+    def certify(self, details: CertificateSection, plots: Plots, svg: Path | None) -> list[str]:
         """Write certificate and report again, and the report's figures as SVG.
 
         Args:

@@ -6,10 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from calib import files
+from calib.config_types import Plots
 from calib.data.csv_table import Table, read_table
 from calib.errors import UsageError, require
+from calib.folders import GRAVITY_SUMMARY
 from calib.procedure.excitation.coefficients import PLANNED, RUN, SAMPLES
-from calib.procedure.report.page import Picture
+from calib.procedure.findings import Verdict
+from calib.procedure.kinematic_stage.selection import FIGURES_PAGE
+from calib.procedure.report.page import ChartPicture, chart_pictures
 from calib.result_kinds import kind_of, refusal
 from calib.results.calibrations import CalibratedRobot, StoredFit, StoredIdentification, StoredSession
 from calib.results.result import StoredResult, Viewed
@@ -17,7 +21,9 @@ from calib.results.result import StoredResult, Viewed
 if TYPE_CHECKING:
     from calib.results.scene import Scene
 
-PICTURE_SUFFIX = ".png"
+FIGURE_SUFFIXES = (".html", ".png", ".svg")
+# Beginning of the line with a verdict.
+VERDICT = "verdict "
 
 
 class StoredMotion(Viewed):
@@ -46,7 +52,7 @@ class StoredFile(StoredResult):
         """Return the table in a CSV file, by the file's name; empty for other files."""
         return {self.path.stem: read_table(self.path)} if self.path.suffix == ".csv" else {}
 
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Copy the file and the files that accompany it, and return the path of the copy.
 
         Accompanying files are renamed after the copy.
@@ -61,7 +67,7 @@ class StoredFile(StoredResult):
         out = Path(out)
         copies = {self.path: out}
         for path in self.beside():
-            if plots or path.suffix != PICTURE_SUFFIX:
+            if plots or path.suffix not in FIGURE_SUFFIXES:
                 copies[path] = out.with_name(out.stem + path.name.removeprefix(self.path.stem))
         for copy in copies.values():
             require(not copy.exists(), f"{copy} is there already; give another name", UsageError)
@@ -76,13 +82,16 @@ class StoredSelection(StoredFile):
     def beside(self) -> list[Path]:
         """Return the paths of prediction and figures, which are next to the CSV."""
         start = self.path.with_suffix("")
-        return [Path(f"{start}{self.kind.companion}"), *sorted(start.parent.glob(f"{start.name}_*{PICTURE_SUFFIX}"))]
+        paths = [Path(f"{start}{self.kind.companion}")]
+        for suffix in FIGURE_SUFFIXES:
+            paths += sorted(start.parent.glob(f"{start.name}_*{suffix}"))
+        return paths
 
-    def figures(self) -> dict[str, Picture]:
-        """Return the figures next to the CSV, by name."""
-        start = f"{self.path.stem}_"
-        paths = [path for path in self.beside() if path.suffix == PICTURE_SUFFIX]
-        return {path.stem.removeprefix(start): Picture(path.read_bytes(), "") for path in paths}
+    def figures(self) -> dict[str, ChartPicture]:
+        """Return the figures on the page next to the CSV, by name."""
+        from calib.procedure.report.figures import figure_data
+
+        return chart_pictures(figure_data.read(self.path.with_name(f"{self.path.stem}{FIGURES_PAGE}")))
 
     def scene(self, robot: str | None = None) -> Scene:
         """Return the scene with the selected poses for the viewer.
@@ -98,10 +107,24 @@ class StoredSelection(StoredFile):
         return scene_files.read(self.path, robot)
 
 
+class StoredGravity(StoredResult):
+    """Folder of the gravity that standing poses identify."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict in the summary."""
+        for line in (self.path / GRAVITY_SUMMARY).read_text(encoding="utf-8").splitlines():
+            if line.startswith(VERDICT):
+                level, _, reason = line.removeprefix(VERDICT).partition(": ")
+                return Verdict(level, reason)
+        return super().verdict
+
+
 # classes of the kinds that have functions of their own, by name; the others are plain `StoredResult`
 CLASSES: dict[str, type[StoredResult]] = {
     "fit": StoredFit,
     "identification": StoredIdentification,
+    "gravity": StoredGravity,
     "excitation": StoredMotion,
     "plan": StoredMotion,
     "selection": StoredSelection,

@@ -12,7 +12,7 @@
                                      # single parameters are not
     [[deflection.term]]
     element = "q3.offset"            # the element it moves
-    basis = "sin"                    # torque, lever, joint, cos, sin
+    basis = "sin"                    # torque, moment, lever, joint, cos, sin
     joint = "q4"                     # the joint (or the body behind it) it comes from
     order = 2                        # k of sin and cos; axis of a lever (0 x, 1 y, 2 z)
     coefficient = 1.2e-5
@@ -27,6 +27,8 @@ Every effect is linear in its coefficients and adds to the displacement of one e
     δ_e(q) = Σ_terms c · b(q),    b one of
 
     torque        τ_j(q), gravity torque at joint j [N m]: c is the compliance [rad/N m]
+    moment        moment about the element's own axis that balances the weight of all that it carries [N m]: c is the
+                  compliance of a bearing or link across the joint's axis
     lever         (z_e × R_i e_a) · ĝ, the moment about the element's axis z_e of a first moment of link i along its
                   axis a (0 x, 1 y, 2 z), gravity being a unit vector: sag where the masses are not known
     joint         q_i: gear ratio error (i = j) or coupling of another axis (i ≠ j)
@@ -49,13 +51,15 @@ from calib.folders import read_covariance, write_covariance
 from calib.records import Floats, as_numbers, frozen, shaped
 from calib.robot import description
 from calib.robot.chain import Chain
-from calib.robot.kinematics import forward, gravity_torques, joint_frames, sweep, tip_jacobian
+from calib.robot.kinematics import forward, gravity_moments, joint_frames, sweep, tip_jacobian
 from calib.robot.tables import check_keys, number, vector
 
 LOG = logging.getLogger(__name__)
 ROBOT = "robot.toml"
 COVARIANCE = "chain_covariance.csv"
-BASES = ("torque", "lever", "joint", "cos", "sin")
+# those that need masses or torques, and scale with the load
+BY_TORQUE = ("torque", "moment")
+BASES = (*BY_TORQUE, "lever", "joint", "cos", "sin")
 
 
 @dataclass(frozen=True)
@@ -64,7 +68,7 @@ class Term:
 
     Attributes:
         element: name of the moved element.
-        basis: name of the basis function: torque, lever, joint, cos or sin.
+        basis: name of the basis function: torque, moment, lever, joint, cos or sin.
         source: index of the joint or link on which the basis function depends.
         order: order k of sin and cos; axis of a lever (0 x, 1 y, 2 z).
     """
@@ -107,7 +111,7 @@ class Deflection:
 
 def _name(term: Term, chain: Chain) -> str:
     source = chain.joint_names[term.source]
-    if term.basis == "torque":
+    if term.basis in BY_TORQUE:
         return f"{term.element} compliance"
     if term.basis == "lever":
         return f"{term.element} sag of {source} {'xyz'[term.order]}"
@@ -116,20 +120,28 @@ def _name(term: Term, chain: Chain) -> str:
     return f"{term.element} {term.basis} {term.order} {source}"
 
 
-def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = None) -> np.ndarray:
+def evaluate(
+    deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = None, load: np.ndarray | None = None
+) -> np.ndarray:
     """Return the values (E, m) of the terms' basis functions at joint values q (m, n).
 
     Args:
         deflection: the terms, with their reference chain.
         q: (m, n) joint values [rad or m].
         torque: (m, n) gravity torques [N m], for terms with the basis ``torque``; None: computed from the reference
-            chain's masses.
+            chain's masses and the load.
+        load: (m, 4) first moments [kg m] and mass [kg] that the last body carries beyond the reference chain's masses,
+            in its frame; None for no load.
 
     Raises:
         CalibError: a term needs gravity torques, and the reference chain has no masses.
     """
-    if torque is None and any(term.basis == "torque" for term in deflection.terms):
-        torque = _reference_torques(deflection, q)
+    bases = {term.basis for term in deflection.terms}
+    moments = np.zeros((0, len(q)))
+    if "moment" in bases or (torque is None and "torque" in bases):
+        moments = _reference_moments(deflection, q, load)
+    if torque is None and "torque" in bases and deflection.reference is not None:
+        torque = moments[deflection.reference.driven].T @ deflection.reference.rates
     result = np.empty((len(deflection.terms), len(q)))
     highest: dict[int, int] = {}
     for term in deflection.terms:
@@ -143,6 +155,8 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
     for e, term in enumerate(deflection.terms):
         if term.basis == "torque" and torque is not None:
             result[e] = torque[:, term.source]
+        elif term.basis == "moment" and deflection.reference is not None:
+            result[e] = moments[deflection.reference.names.index(term.element)]
         elif term.basis == "joint":
             result[e] = q[:, term.source]
         elif term.basis in ("cos", "sin"):
@@ -165,12 +179,18 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
     return result
 
 
-def _reference_torques(deflection: Deflection, q: np.ndarray) -> np.ndarray:
-    """Return the gravity torques (m, n) [N m] of the deflection's reference chain at joint values q (m, n)."""
+def _reference_moments(deflection: Deflection, q: np.ndarray, load: np.ndarray | None) -> np.ndarray:
+    """Return the gravity moments (K, m) [N m] about the elements of the deflection's reference chain.
+
+    Args:
+        deflection: the terms, with their reference chain.
+        q: (m, n) joint values [rad or m].
+        load: (m, 4) load of the last body, as of `evaluate`; None for no load.
+    """
     chain = deflection.reference
     if chain is None or chain.inertias is None:
         raise CalibError("a compliance needs gravity torques: state the robot's masses, or have them fitted")
-    return gravity_torques(chain, q)
+    return gravity_moments(chain, q, load)
 
 
 def extra_displacements(
@@ -286,7 +306,7 @@ class CalibratedChain:
         """Whether the nominal arm is known and the calibration changed one of its element values."""
         return self.nominal is not None and not np.array_equal(self.nominal.values, self.chain.values)
 
-    def forward(self, q: ArrayLike, torque: np.ndarray | None = None) -> Floats:
+    def forward(self, q: ArrayLike, torque: np.ndarray | None = None, load: np.ndarray | None = None) -> Floats:
         """Return the tip's poses in the base frame [m]: (m, 4, 4) at joint values (m, n), (4, 4) at (n,).
 
         If the robot has joint corrections, they are applied to the geometry that was fitted with them.
@@ -295,6 +315,8 @@ class CalibratedChain:
             q: joint values (m, n) [rad or m], or (n,) for one pose.
             torque: gravity torques [N m] in the shape of `q`, for corrections by compliance; None: computed from the
                 masses that the fit used.
+            load: (m, 4) first moments [kg m] and mass [kg] that the last body carries beyond those masses, in its
+                frame; None for no load.
 
         Raises:
             CalibError: an array of a wrong shape, or corrections by compliance without torques or masses.
@@ -303,7 +325,7 @@ class CalibratedChain:
         bases = None
         if self.deflection.terms:
             torques = None if torque is None else shaped(np.atleast_2d(torque), values.shape, "torque")
-            bases = evaluate(self.deflection, values, torques)
+            bases = evaluate(self.deflection, values, torques, load)
         poses = forward(self.complete, values, extra_displacements(self.complete, self.deflection, values, bases))
         return like_joints(q, poses)
 

@@ -258,7 +258,7 @@ def joint_frames(chain: Chain, q: np.ndarray) -> np.ndarray:
     return frames[np.searchsorted(chain.driven, chain.moving)]
 
 
-def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
+def gravity_torques(chain: Chain, q: np.ndarray, load: np.ndarray | None = None) -> np.ndarray:
     """Return the torques g(q) = ∂U/∂q (m, n) [N m or N] that balance gravity in an arm of known masses.
 
     With m_j and s_j the mass and the first moment of all bodies from joint j on, o_j the joint's origin and z_j its
@@ -267,6 +267,26 @@ def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
     Args:
         chain: the arm, with `inertias` and without mimic joints.
         q: (m, n) joint values [rad or m].
+        load: (m, 4) first moments [kg m] and mass [kg] that the last body carries in each pose, in its frame; None for
+            no load.
+
+    Raises:
+        RobotError: masses are unknown, or one joint moves several elements.
+    """
+    return gravity_moments(chain, q, load)[chain.driven].T @ chain.rates
+
+
+def gravity_moments(chain: Chain, q: np.ndarray, load: np.ndarray | None = None) -> np.ndarray:
+    """Return the moments (K, m) [N m or N] about (along) the axes of all elements that balance gravity.
+
+    Each element carries the bodies from its joint on, as in `gravity_torques`; elements behind the last joint carry
+    none.
+
+    Args:
+        chain: the arm, with `inertias` and without mimic joints.
+        q: (m, n) joint values [rad or m].
+        load: (m, 4) first moments [kg m] and mass [kg] that the last body carries in each pose, in its frame; None for
+            no load.
 
     Raises:
         RobotError: masses are unknown, or one joint moves several elements.
@@ -276,22 +296,29 @@ def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
     if chain.inertias is None:
         refuse_robot(f"robot '{chain.name}'", "has no masses; add 'inertia' to its joints")
     joints = [chain.elements[k].joint for k in chain.driven]
-    turning = np.array([chain.elements[k].axis[0] == "r" for k in chain.driven])
-    masses = chain.inertias[joints, 9]
-    moments = chain.inertias[joints, 6:9]
+    masses = np.tile(chain.inertias[joints, 9, None], len(q))
+    moments = np.tile(chain.inertias[joints, 6:9, None], len(q))
+    if load is not None:
+        masses[-1] += load[:, 3]
+        moments[-1] += load[:, :3].T
     frames = moving_frames(chain, q)
     walk = sweep(chain, q)
-    axes = walk.directions[chain.driven]
-    origins = walk.origins[chain.driven]
     # First moments (n, 3, m) of each body about the base, then those of all bodies from each joint on.
-    moment = np.einsum("jmik,jk->jim", frames[..., :3, :3], moments)
-    moment += masses[:, None, None] * frames[..., :3, 3].swapaxes(1, 2)
+    moment = np.einsum("jmik,jkm->jim", frames[..., :3, :3], moments)
+    moment += masses[:, None] * frames[..., :3, 3].swapaxes(1, 2)
     carried_moment = np.cumsum(moment[::-1], axis=0)[::-1]
-    carried_mass = np.cumsum(masses[::-1])[::-1][:, None, None]
-    by_rotation = _cross(axes, carried_moment - carried_mass * origins)
-    by_translation = carried_mass * axes
+    carried_mass = np.cumsum(masses[::-1], axis=0)[::-1][:, None]
+    carrying = np.searchsorted(chain.driven, np.arange(len(chain.elements)))
+    carries = carrying < chain.n
+    body = carrying[carries]
+    axes = walk.directions[carries]
+    by_rotation = _cross(axes, carried_moment[body] - carried_mass[body] * walk.origins[carries])
+    by_translation = carried_mass[body] * axes
+    turning = np.array([element.axis[0] == "r" for element in chain.elements])[carries]
     moment_rates = np.where(turning[:, None, None], by_rotation, by_translation)
-    return -np.einsum("i,jim->mj", chain.gravity, moment_rates) @ chain.rates
+    result = np.zeros((len(chain.elements), len(q)))
+    result[carries] = -np.einsum("i,kim->km", chain.gravity, moment_rates)
+    return result
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

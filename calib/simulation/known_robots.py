@@ -209,7 +209,7 @@ def plant(name: str, coupled: bool = False, offset: np.ndarray | None = None) ->
     rows = {**drive_rows, "off": offset}
     amounts = []
     for joint in range(chain.n):
-        amounts += [rows[shape][joint] for shape in shapes]
+        amounts += [rows[shape][joint] for shape in shapes]  # ty: ignore[not-subscriptable]
     joint_terms = " ".join(shapes)
     terms = list(drives.standard([joint_terms] * chain.n, drive_rows["v0"]))
     if coupled:

@@ -27,10 +27,10 @@ from calib.data.poses.measurements import PoseMeasurements, Poses
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
 from calib.geometry.installation import Installation, see
+from calib.geometry.static_torques.sources import gravity_of
 from calib.identification.closed_loop.controllers import Reference
 from calib.identification.friction.friction_terms import FrictionTerm
 from calib.procedure.kinematic_stage.fit import Outcome
-from calib.procedure.kinematic_stage.inputs import gravity_of
 from calib.records import Floats, shaped
 from calib.robot.calibrated import CalibratedChain, CorrectedChain, Deflection, as_calibrated, evaluate
 from calib.robot.chain import random_joints

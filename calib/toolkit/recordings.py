@@ -4,7 +4,8 @@ from calib.data.joint_columns import words_of
 from calib.data.recordings.bags import bag_table, is_bag
 from calib.data.recordings.datasets import dataset_table, is_dataset
 from calib.data.recordings.log_columns import families, series_of, time_column
-from calib.data.recordings.recording import Recording
+from calib.data.recordings.recording import Recording, parse_cut
+from calib.data.recordings.recording_files import read_recording
 from calib.data.recordings.recording_options import SYNONYMS
 from calib.data.recordings.stamps import likely_unit
 from calib.data.recordings.topics import at_times
@@ -39,6 +40,8 @@ __all__ = [
     "is_dataset",
     "likely_unit",
     "make_motion",
+    "parse_cut",
+    "read_recording",
     "read_trajectory",
     "series_of",
     "time_column",

@@ -1,20 +1,10 @@
-"""Charts for reports: lines, box plots and maps in a common style."""
+"""Charts for reports as values: lines, box plots and maps in common colours."""
 
-from calib.procedure.report.charts import Chart, Layer, Panel, box, line, picture, text
+from calib.procedure.report.figures.charts import Box, Captioned, Chart, Label, Layer, Line, Panel
+from calib.procedure.report.figures.figure_files import drawn as drawn_chart
+from calib.procedure.report.figures.figure_files import write as write_figures
+from calib.procedure.report.figures.style import AFTER, BEFORE, BROWN, INK, MARK, PAGE_WIDTH, QUIET
 from calib.procedure.report.geometry_figures import error_histogram, error_map, parameter_changes
-from calib.procedure.report.style import (
-    AFTER,
-    BEFORE,
-    BROWN,
-    INK,
-    MARK,
-    PAGE_WIDTH,
-    QUIET,
-    log_axis,
-    save,
-    sheet,
-    styled,
-)
 
 __all__ = [
     "AFTER",
@@ -24,18 +14,16 @@ __all__ = [
     "MARK",
     "PAGE_WIDTH",
     "QUIET",
+    "Box",
+    "Captioned",
     "Chart",
+    "Label",
     "Layer",
+    "Line",
     "Panel",
-    "box",
+    "drawn_chart",
     "error_histogram",
     "error_map",
-    "line",
-    "log_axis",
     "parameter_changes",
-    "picture",
-    "save",
-    "sheet",
-    "styled",
-    "text",
+    "write_figures",
 ]

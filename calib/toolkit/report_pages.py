@@ -6,10 +6,13 @@ from calib.procedure.report.certificate.record import report as report_page
 from calib.procedure.report.certificate.rendering import html as as_html
 from calib.procedure.report.certificate.rendering import write as write_certificate
 from calib.procedure.report.certificate.rendering import write_figures
+from calib.procedure.report.figures.figure_data import read as read_figures
 from calib.procedure.report.fit_report import FittedParameter
 from calib.procedure.report.fit_report import read as read_fit_report
+from calib.procedure.report.outputs import figures_page
 from calib.procedure.report.page import (
     Block,
+    ChartPicture,
     KeyFigure,
     Picture,
     Pictures,
@@ -22,12 +25,13 @@ from calib.procedure.report.page import (
     table,
 )
 from calib.procedure.report.page import section as printed_section
-from calib.procedure.report.templates import filled, issued
+from calib.procedure.report.templates import filled, interactive, issued, script_sources
 from calib.procedure.report.templates import read as read_template
 
 __all__ = [
     "Block",
     "CertificateSection",
+    "ChartPicture",
     "Entry",
     "FittedParameter",
     "KeyFigure",
@@ -38,14 +42,18 @@ __all__ = [
     "Section",
     "Text",
     "as_html",
+    "figures_page",
     "filled",
+    "interactive",
     "issued",
     "met",
     "printed_section",
+    "read_figures",
     "read_fit_report",
     "read_template",
     "rendered",
     "report_page",
+    "script_sources",
     "table",
     "write_certificate",
     "write_figures",

@@ -3,12 +3,23 @@
 from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit, Several, fit_geometry
 from calib.api.rendering import ChartedResult, Progress, ReportedResult, Shown, WithoutVerdict, saved
-from calib.procedure.dynamic_stage.folder import IdentificationFolder
-from calib.procedure.dynamic_stage.metrics import UnseenReport
+from calib.procedure.dynamic_stage.folder import INSTRUMENTAL, IdentificationFolder
+from calib.procedure.dynamic_stage.metrics import TorqueCurves, UnseenReport
 from calib.procedure.export.delivery import prediction
 from calib.procedure.export.geometry import read as read_exported
 from calib.procedure.export.geometry import results as geometry_results
-from calib.procedure.findings import LEVELS, Note, Verdict, as_notes, limit, lines_of, notes_of, sentence, settle
+from calib.procedure.findings import (
+    LEVELS,
+    NOT_JUDGED,
+    Note,
+    Verdict,
+    as_notes,
+    limit,
+    lines_of,
+    notes_of,
+    sentence,
+    settle,
+)
 from calib.procedure.kinematic_stage.fit_tables import read_covariance
 from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.inputs import load_robot
@@ -24,8 +35,10 @@ from calib.results.scene import Drawn as DrawnRobot
 from calib.results.scene import ErrorSizes, Measured, Played, Scene, Torques, TradeOffs, skeleton, strips, thinned
 
 __all__ = [
+    "INSTRUMENTAL",
     "IN_SESSION",
     "LEVELS",
+    "NOT_JUDGED",
     "URDF",
     "VALIDATED",
     "ChartedResult",
@@ -49,6 +62,7 @@ __all__ = [
     "Several",
     "Shown",
     "StoredResult",
+    "TorqueCurves",
     "Torques",
     "TradeOffs",
     "UnseenReport",

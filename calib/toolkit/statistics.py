@@ -1,6 +1,6 @@
 """Statistics on plain arrays: robust weights, relevance of columns, whiteness of residuals."""
 
-from calib.estimation.estimate import Estimate
+from calib.estimation.estimate import Estimate, whitened
 from calib.estimation.linear import LinearFit, settled_std, wls
 from calib.estimation.relevance import gram, relevance
 from calib.estimation.robust import spread
@@ -17,5 +17,6 @@ __all__ = [
     "robust_weights",
     "settled_std",
     "spread",
+    "whitened",
     "wls",
 ]

@@ -12,7 +12,8 @@ from calib.identification.methods.constraint_settings import ConstraintSettings
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate
 from calib.identification.model_file import MODEL, read_dynamics
 from calib.identification.model_file import read_table as read_model_table
-from calib.identification.prediction import Dynamics, predict
+from calib.identification.physical_consistency.information import INFORMATION
+from calib.identification.prediction import Dynamics, predict, score
 from calib.identification.registry import METHODS, VERSIONS, method_named
 from calib.identification.rows import Case, make_case, observe
 from calib.identification.settings import IdentificationSettings, make_model
@@ -20,6 +21,7 @@ from calib.identification.uncertainty.torque_errors import estimated_columns, pa
 
 __all__ = [
     "BOTH",
+    "INFORMATION",
     "LINK",
     "METHODS",
     "MODEL",
@@ -55,6 +57,7 @@ __all__ = [
     "read_dynamics",
     "read_model_table",
     "regroup",
+    "score",
     "standard_name",
     "standard_parameters",
     "with_payload",

@@ -16,7 +16,7 @@ from calib.workers.extras import needing
 from calib.workers.processes import Answer, Died, run_call
 
 if TYPE_CHECKING:
-    from distributed import Future  # pyright: ignore[reportMissingImports]
+    from distributed import Future
 
 T = TypeVar("T")
 ANSWER = 10.0  # [s] that a Dask scheduler has to answer (our choice)
@@ -110,7 +110,7 @@ class _Cluster:
         Args:
             error: exception that Dask raised.
         """
-        from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
+        from distributed import KilledWorker
 
         if isinstance(error, KilledWorker):
             return Died(f"it ended {error.allowed_failures + 1} of the cluster's workers, the largest number allowed")
@@ -150,7 +150,7 @@ async def _answers(address: str) -> None:
     Raises:
         OSError: without an answer.
     """
-    from distributed.comm.core import connect  # pyright: ignore[reportMissingImports]
+    from distributed.comm.core import connect
 
     try:
         comm = await asyncio.wait_for(connect(address, timeout=ANSWER), ANSWER + 1.0)
@@ -162,7 +162,7 @@ async def _answers(address: str) -> None:
 @contextmanager
 def dask(address: str) -> Iterator[_Cluster]:
     with needing("distributed"):
-        from distributed import Client  # pyright: ignore[reportMissingImports]
+        from distributed import Client
     with refused_as(UsageError, (OSError, ValueError), f"no Dask scheduler answers at {address}: {{}}; is it running?"):
         with ThreadPoolExecutor(1) as executor:  # a notebook has a loop of its own
             executor.submit(asyncio.run, _answers(address)).result()

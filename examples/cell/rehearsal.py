@@ -204,10 +204,10 @@ def played(name: str, folder: Path) -> tuple[str, ...]:
 
 def urdf_poses(path: Path, q: np.ndarray) -> np.ndarray:
     """Return the last joint's poses (m, 4, 4) [m] of a URDF, by Pinocchio."""
-    model = pinocchio.buildModelFromUrdf(str(path))  # pyright: ignore[reportAttributeAccessIssue]
+    model = pinocchio.buildModelFromUrdf(str(path))
     data, found = model.createData(), []
     for row in q:
-        pinocchio.forwardKinematics(model, data, row)  # pyright: ignore[reportAttributeAccessIssue]
+        pinocchio.forwardKinematics(model, data, row)
         found.append(data.oMi[model.njoints - 1].homogeneous)
     return np.array(found)
 

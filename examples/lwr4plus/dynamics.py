@@ -32,9 +32,10 @@ from calib.dynamics import base as bases
 from calib.dynamics.torque_rows import MODELS
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.procedure.excitation import coefficients
+from calib.procedure.report.figures.sheets import save, sheet, styled
 from calib.simulation import lwr4plus
 from calib.toolkit.chains import Chain
-from calib.toolkit.report_charts import AFTER, INK, PAGE_WIDTH, QUIET, save, sheet, styled
+from calib.toolkit.report_charts import AFTER, INK, PAGE_WIDTH, QUIET
 from calib.toolkit.simulations import Plant, Reference, feed_forward, random_fourier, tracking_error
 from calib.toolkit.statistics import LinearFit, settled_std, wls
 from calib.toolkit.torque_models import BOTH, MOTOR, Base, IdentificationModel, TorqueRows, observe

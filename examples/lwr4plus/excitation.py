@@ -49,12 +49,12 @@ from calib.procedure.excitation.excited_model import excited_model
 from calib.procedure.excitation.inputs import ExcitationInputs, IdentifiableColumns
 from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
+from calib.procedure.report.figures.sheets import save
 from calib.robot.tables import dumps
 from calib.simulation import lwr4plus
 from calib.toolkit.chains import Chain, random_joints
 from calib.toolkit.installations import calibrated_chain, install
 from calib.toolkit.installations import fit_installation as fit
-from calib.toolkit.report_charts import save
 from calib.toolkit.simulations import Reference, lwr4plus_cell, measure
 from calib.toolkit.statistics import settled_std, wls
 from calib.toolkit.torque_models import BOTH, MOTOR, Base, IdentificationModel, LoadCases

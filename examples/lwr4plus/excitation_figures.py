@@ -8,8 +8,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from simulated_arm import TABLE_4
 
+from calib.procedure.report.figures.sheets import log_axis, sheet, styled
 from calib.toolkit.chains import Chain, forward
-from calib.toolkit.report_charts import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, log_axis, sheet, styled
+from calib.toolkit.report_charts import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET
 from calib.toolkit.simulations import Reference
 
 

@@ -43,8 +43,9 @@ from calib import files
 from calib.dynamics import base, drives
 from calib.procedure.excitation.limits import Points
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS
+from calib.procedure.report.figures.sheets import save, sheet, styled
 from calib.toolkit.chains import Chain, load
-from calib.toolkit.report_charts import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET, save, sheet, styled
+from calib.toolkit.report_charts import AFTER, BEFORE, INK, MARK, PAGE_WIDTH, QUIET
 from calib.toolkit.torque_models import BaseModel, IdentificationModel, bodies_of, standard_parameters
 from calib.trajectories.constraints import TorqueLimit, box_limits
 from calib.trajectories.design import search

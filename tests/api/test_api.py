@@ -290,6 +290,7 @@ def test_residuals_are_columns_without_pandas(fitted, model, tmp_path, monkeypat
     assert residuals.to_dataframe()[0] == head
 
 
+@pytest.mark.slow
 def test_designed_motion_is_sampled_exactly(tmp_path):
     """A designed motion is sampled at any rate without interpolation."""
     settings = calib.ExcitationSettings(period=4.0, starts=1, evaluations=20, outlook=False, rate=100.0)
@@ -383,6 +384,7 @@ def test_session_in_python_is_the_commands(logs, tmp_path, monkeypatch, capsys):
         calib.run_sessions(["script", "script/session.toml"])
 
 
+@pytest.mark.slow
 def test_poses_without_constraints_say_so():
     """Poses chosen without constraints say what they keep and what is not checked."""
     chosen = calib.select_poses("ur5", 8, calib.SelectionSettings(method="detmax", candidates=200))

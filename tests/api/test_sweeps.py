@@ -31,6 +31,7 @@ def interrupted(rms: float) -> FewFigures:
     raise KeyboardInterrupt
 
 
+@pytest.mark.slow
 def test_a_grid_gives_a_row_for_each_combination():
     """Settings by name, and arguments of the function such as a loss; figures are those of a call by hand."""
     over = {"model": ["frames", "offsets"], "loss": ["none", soft_l1]}

@@ -31,7 +31,7 @@ TOP = Path(__file__).parents[2]
 STAGES = {
     "reading": ("kinematic_stage.inputs:gather", "dynamic_stage.inputs:gather"),
     "calculation": ("kinematic_stage.fit:run", "dynamic_stage.identify:run"),
-    "figures": ("report.charts:figure", "report.style:png", "report.style:svg"),
+    "figures": ("report.figures.drawing:png", "report.figures.svg:svg", "report.figures.figure_data:text"),
     "writing": ("kinematic_stage.folder:write_folder", "dynamic_stage.folder:write_folder"),
 }
 COLUMNS = ("imports", *STAGES, "other", "all", "MB")

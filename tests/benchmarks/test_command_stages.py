@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-import command_stages  # pyright: ignore[reportMissingImports]
+import command_stages
 
 
 def test_time_counts_for_innermost_stage(monkeypatch):

@@ -7,7 +7,7 @@ import pytest
 from scripts import run_here
 
 sys.path.insert(0, str(Path(__file__).parent))
-import growth  # pyright: ignore[reportMissingImports]
+import growth
 
 HERE = Path(__file__).parent
 DOCS = HERE.parents[1] / "docs"

@@ -115,6 +115,7 @@ def by_session(session: Session) -> Judgement:
     return Judgement(found["verdict"], reason, numbers, frozenset(found["warnings"]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "verdict"),
     [

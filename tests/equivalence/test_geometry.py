@@ -112,6 +112,7 @@ def spoiled(files: Path, place: Path) -> tuple[Path, Path, Path]:
     return files / "robot.toml", place / "measured.csv", files / "validation.csv"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case",
     [copied, swapped, *(pytest.param(case, marks=pytest.mark.slow) for case in (clean, moved, named_oddly, spoiled))],
@@ -135,6 +136,7 @@ def test_command_and_session_agree(files: Path, tmp_path: Path, case: Callable[[
         assert "rigid-misfit" not in noticed
 
 
+@pytest.mark.slow
 def test_corrections_stay_as_the_nominal(files: Path, tmp_path: Path) -> None:
     """A robot that comes with corrections keeps them as its nominal."""
     first = files / "bent_first.csv"
@@ -171,6 +173,7 @@ def planned(session: Session) -> None:
     go_on(session)
 
 
+@pytest.mark.slow
 def test_promise_of_poses_is_checked(fitted: Path, tmp_path: Path) -> None:
     """What the poses promised is held against the same figures."""
     session = open_session(shutil.copytree(fitted, tmp_path / "cell"))

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
-import demo_picture  # pyright: ignore[reportMissingImports]
+import demo_picture
 
 # relative: where linear algebra rounds otherwise the short search for motions ends elsewhere
 BOUNDS = {"nominal_mm": 0.01, "calibrated_mm": 0.01, "unexplained_percent": 0.05, "within_two_sigma_percent": 0.12}

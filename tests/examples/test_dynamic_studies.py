@@ -35,7 +35,7 @@ def test_tx40_readme_holds_fresh_results(tmp_path):
     subprocess.run(command, check=True, capture_output=True, text=True)
     sys.path.insert(0, str(place))
     try:
-        import identification  # pyright: ignore[reportMissingImports]
+        import identification
     finally:
         sys.path.remove(str(place))
     metrics = json.loads((tmp_path / "metrics.json").read_text())

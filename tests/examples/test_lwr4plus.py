@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import blocks
 import numpy as np
 import pytest
 
@@ -12,15 +13,29 @@ from calib.simulation import lwr4plus
 
 pytestmark = pytest.mark.slow
 ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs/tutorials/lwr_study.md"
 
 
 @pytest.fixture(scope="module")
-def metrics(tmp_path_factory: pytest.TempPathFactory) -> dict:
+def study(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """What the study prints, and its folder."""
     out = tmp_path_factory.mktemp("study")
     script = ROOT / "examples/lwr4plus/geometry.py"
     done = subprocess.run([sys.executable, script, "--out", out, "--quick"], capture_output=True, text=True, check=True)
-    assert "paper, calibrated" in done.stdout
-    return json.loads((out / "metrics.json").read_text())
+    return done.stdout, out
+
+
+@pytest.fixture(scope="module")
+def metrics(study: tuple[str, Path]) -> dict:
+    return json.loads((study[1] / "metrics.json").read_text())
+
+
+def test_page_shows_what_it_prints(study: tuple[str, Path]) -> None:
+    """The tutorial's slow block is this command, and shows what it prints."""
+    (block,) = [block for block in blocks.read(PAGE.read_text(encoding="utf-8")) if "geometry.py" in block.code]
+    assert block.code.split() == ["python", "examples/lwr4plus/geometry.py", "--quick", "--out", "geometry"]
+    assert len(block.shown) == 2
+    assert blocks.compare(block.shown, study[0].splitlines(), block.tolerance)[1] == ""
 
 
 def test_parameters_and_poses_are_the_papers(metrics: dict) -> None:

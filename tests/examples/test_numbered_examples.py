@@ -39,6 +39,7 @@ def test_they_show_the_api_alone():
         assert set(used) <= {"calib", "practice", "pathlib"}, path.name
 
 
+@pytest.mark.slow
 def test_01_fit_geometry(tmp_path, capsys):
     said = run_here(EXAMPLES / "01_fit_geometry.py", tmp_path, capsys=capsys)
     judged = next(line for line in said.splitlines() if line.startswith("unseen: "))

@@ -22,6 +22,7 @@ from calib.simulation.virtual_cells import virtual_cell
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
+ARM = "rv2sq"  # six joints, whose motion is designed in half the time of seven
 BLOCKS = re.findall(r"```sh\n(.*?)```", README, flags=re.DOTALL)
 SCRIPTS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 TABLES = re.findall(r"```csv\n(.*?)```", README, flags=re.DOTALL)
@@ -36,7 +37,7 @@ def commands(block: str) -> list[list[str]]:
 @pytest.fixture
 def at_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the files the README speaks of, but logs."""
-    cell, arm = virtual_cell("lwr4plus", 1), load("lwr4plus")
+    cell, arm = virtual_cell(ARM, 1), load(ARM)
     (tmp_path / "robot.urdf").write_text(urdf_write.write_new(arm))
     write_measured(measure(cell, random_joints(arm, 60, 1), 2), tmp_path / "measured.csv")
     joints = ",".join(f"{name} [rad]" for name in arm.joint_names)
@@ -48,8 +49,8 @@ def at_a_cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def with_logs(at_a_cell: Path) -> Path:
     """All files the README speaks of."""
-    cell, arm = virtual_cell("lwr4plus", 1), load("lwr4plus")
-    moves, speed = moving_arm(cell, "lwr4plus", 1), np.array([joint.velocity for joint in arm.joints])
+    cell, arm = virtual_cell(ARM, 1), load(ARM)
+    moves, speed = moving_arm(cell, ARM, 1), np.array([joint.velocity for joint in arm.joints])
     for seed, name in enumerate(("log", "other")):
         motion = random_fourier(0.6 * arm.lower, 0.6 * arm.upper, 0.6 * speed, 15.0, 1000.0, seed=seed)
         write_log(record(moves, motion, seed), at_a_cell / f"{name}.csv")

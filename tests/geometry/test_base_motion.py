@@ -65,6 +65,7 @@ def true_error(block: Positions) -> float:
     return float(1e3 * np.sqrt(np.mean(np.sum((turn.apply(points) - truth) ** 2, axis=1))))
 
 
+@pytest.mark.slow
 def test_base_frame_removes_the_drift(tmp_path):
     """With 1 mm of drift a fit by base frames is as accurate as without drift; one without them is not."""
     errors = {}

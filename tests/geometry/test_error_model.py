@@ -77,6 +77,7 @@ def test_uneven_error_of_joint_is_expected():
     assert 0.9 < np.mean(size[end] < radius[end]) < 0.98 and np.mean(size[~end] < radius[~end]) > 0.95
 
 
+@pytest.mark.slow
 def test_few_poses_give_valid_intervals():
     """16 times 24 poses: 95 ± 2 % are inside; 89 were where the quantile was that of the rows left out."""
 

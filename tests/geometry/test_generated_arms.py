@@ -29,6 +29,7 @@ def measured(text: str, count: int, seed: int) -> tuple[Arm, np.ndarray, Targets
     return nominal, q, Targets((points + rng.normal(0.0, CONDITIONS.noise, points.shape))[:, None]), truth
 
 
+@pytest.mark.slow
 @given(text=arms())
 @settings(max_examples=10)
 def test_plain_reference_recovers_arms(text: str):

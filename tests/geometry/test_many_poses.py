@@ -36,6 +36,7 @@ def climbed(measured, loss: str) -> ModelSelection:
     return select_model(install(load("lwr4plus"), [measured]), [measured], "stiffness", settings=Settings(loss=loss))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind, loss, sigmas", [("position", "none", 0.02), ("pose", "cauchy", 0.2)])
 def test_pieces_and_warm_start_agree(kind, loss, sigmas, monkeypatch):
     """Pieces and a warm start change nothing."""

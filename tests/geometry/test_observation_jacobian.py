@@ -84,6 +84,26 @@ def test_every_effect_of_the_ladder(effect, known):
     assert np.abs(jacobian).max() > 0
 
 
+def test_compliance_across_the_axes():
+    """Moments of masses and of a load of each row tilt the elements that no joint turns."""
+    chain = load("ur5")
+    chain = replace(chain, inertias=np.tile([0.0] * 6 + [0.1, 0.2, 0.3, 2.0], (6, 1)))
+    terms = EFFECTS["stiffness"](chain, True)
+    values = 1e-5 * np.random.default_rng(0).normal(size=len(terms))
+    truth = replace(cell(perturb(chain, 2), 1), deflection=Deflection(tuple(terms), values, chain))
+    loads = np.random.default_rng(1).normal(size=(5, 4))
+    measured = replace(measure(truth, "pose", 5, torque=torques), load=loads)
+    block = prepare(truth, [measured])[0]
+    free = layout(truth).index("deflection")
+    seen = predict(truth, block)
+    jacobian = target_jacobian(truth, seen, free, block.station, block.tool, block.bases)
+    check(lambda x: predict(step(truth, free, x), block).point, jacobian[:, :3].transpose(1, 2, 0), np.zeros(len(free)),
+          step=1e-6, tolerance=1e-7)  # fmt: skip
+    assert {term.basis for term in terms} == {"torque", "moment"}
+    bare = prepare(truth, [replace(measured, load=None)])[0]
+    assert np.abs(block.bases - bare.bases)[[term.basis == "moment" for term in terms]].max() > 1.0
+
+
 def residuals(truth, block, x, free):
     return np.concatenate([p.value.ravel() for p in observe(step(truth, free, x), block, NONE)])
 

@@ -33,6 +33,6 @@ def test_only_the_runaway_gain_is_withheld(monkeypatch):
 
     monkeypatch.setattr(gains, "identify_gains", identify)
     monkeypatch.setattr(gains, "pool", lambda data, joints, blocks: data)
-    told = gains.identify_relative_gains(Pieces(), 3, np.ones(3), 1)  # pyright: ignore[reportArgumentType]
+    told = gains.identify_relative_gains(Pieces(), 3, np.ones(3), 1)
     assert told.own == (2,) and told.told == ("told", "reference", "not told")
     np.testing.assert_allclose(told.sigma, [0.01 * gains.LEFT, 0.0, 0.0])

@@ -23,6 +23,7 @@ from calib.identification.identify import identify
 from calib.identification.settings import IdentificationSettings
 from calib.identification.uncertainty import geometry_uncertainty
 from calib.procedure.dynamic_stage import geometry_tables
+from calib.procedure.report.figures import figure_data
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, Joint
@@ -173,6 +174,7 @@ def run(folder: Path, tmp_path: Path, *more: str) -> tuple[dict, list[dict], Pat
     return json.loads((out / "metrics.json").read_text())["geometry"], rows, out
 
 
+@pytest.mark.slow
 def test_command_carries_covariance_of_fit(tmp_path, capsys):
     """The command carries the fit's covariance."""
     found, rows, out = run(fitted_folder(tmp_path, 1e-6), tmp_path, "-v")
@@ -185,7 +187,7 @@ def test_command_carries_covariance_of_fit(tmp_path, capsys):
     ranked = list(csv.DictReader((out / "geometry_effects.csv").open()))
     assert [row["element"] for row in ranked if row["sigma"]] == ["shoulder", "up"]
     assert {row["element"] for row in ranked} > {"gravity.rx", "turn", "fore"}
-    assert (out / "plot_geometries.png").is_file() and (out / "geometries.csv").is_file()
+    assert "geometries" in figure_data.of_folder(out) and (out / "geometries.csv").is_file()
     torques = read_table(out / "torques_1.csv")
     measured, predicted, nominal = (torques.block(name) for name in ("measured", "predicted", "nominal"))
     errors = [np.sqrt(np.mean((measured - torque) ** 2)) for torque in (predicted, nominal)]

@@ -99,6 +99,7 @@ def test_vertical_axes_tell_nothing():
     assert not gravity_of([MotionSamples(np.arange(len(q)), q, v, a, torques, v, bodies)], chain).refuted
 
 
+@pytest.mark.slow
 def test_exchanged_columns_need_no_masses():
     """Exchanged torque columns are named without masses."""
     chain = load("lwr4plus")

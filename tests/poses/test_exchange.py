@@ -113,6 +113,7 @@ def test_exchange_ends_at_local_optimum():
     assert best <= design.logdet + 1e-8
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "index", [*(pytest.param(index, marks=pytest.mark.slow) for index in ("O2", "O3", "O4", "O5")), "cond"]
 )

@@ -22,9 +22,9 @@ note("geometry")
 import calib.data.poses.fit_options as f, calib.identification.identify_options as i
 f.read_options(), i.read_options()
 note("no options file")
-words = ["fit", "ur5", "measured.csv", "--model", "geometry", "--out", "o", "--no-plots"]
+words = ["fit", "ur5", "measured.csv", "--model", "geometry", "--out", "o"]
 assert calib.cli.run(words) == 0
-note("fit without plots")
+note("fit")
 f.parse_options({})
 note("options file")
 print(json.dumps(loaded))

@@ -11,6 +11,7 @@ instants alone are not those of the motion in between.
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numba import njit
@@ -35,43 +36,74 @@ class PlanarLog:
 
 
 @njit(cache=True)
-def rigid(q, v, arm):
-    """Return the links' inertia matrix (3, 3), and the torques (3,) of their speeds and weights, by joints."""
-    lengths, centres, masses, inertias = arm
-    angle, rate = np.cumsum(q), np.cumsum(v)
+def lever_products(arm):
+    """Return μ (3, 3) and the weights Σ_i m_i a_ij (3,)."""
+    lengths, centres, masses, _ = arm
     reach = np.zeros((3, 3))
     for i in range(3):
         reach[i, :i], reach[i, i] = lengths[:i], centres[i]
-    matrix, torque = np.diag(inertias), np.zeros(3)
+    products, weights = np.zeros((3, 3)), np.zeros(3)
     for j in range(3):
-        torque[j] = GRAVITY * np.cos(angle[j]) * np.sum(masses * reach[:, j])
+        weights[j] = np.sum(masses * reach[:, j])
         for k in range(3):
-            product = np.sum(masses * reach[:, j] * reach[:, k])
-            matrix[j, k] += product * np.cos(angle[j] - angle[k])
-            torque[j] += product * np.sin(angle[j] - angle[k]) * rate[k] ** 2
-    turn = np.tril(np.ones((3, 3)))
-    return turn.T @ matrix @ turn, turn.T @ torque
+            products[j, k] = np.sum(masses * reach[:, j] * reach[:, k])
+    return products, weights
 
 
 @njit(cache=True)
-def accelerations(q, v, tau, arm, drives):
-    """Return the joints' accelerations (3,) under motor torques."""
-    matrix, torque = rigid(q, v, arm)
+def rigid(q, v, levers, inertias):
+    """Return the links' inertia matrix (3, 3), and the torques (3,) of their speeds and weights, by joints."""
+    products, weights = levers
+    angle, rate = np.cumsum(q), np.cumsum(v)
+    matrix, torque = np.zeros((3, 3)), np.zeros(3)
+    for j in range(3):
+        matrix[j, j] = inertias[j]
+        torque[j] = GRAVITY * np.cos(angle[j]) * weights[j]
+        for k in range(3):
+            matrix[j, k] += products[j, k] * np.cos(angle[j] - angle[k])
+            torque[j] += products[j, k] * np.sin(angle[j] - angle[k]) * rate[k] ** 2
+    # a joint turns its link and all behind it
+    for j in (1, 0):
+        torque[j] += torque[j + 1]
+        for k in range(3):
+            matrix[j, k] += matrix[j + 1, k]
+    for k in (1, 0):
+        for j in range(3):
+            matrix[j, k] += matrix[j, k + 1]
+    return matrix, torque
+
+
+@njit(cache=True)
+def solve(matrix, right):
+    """Return the solution (3,) of a symmetric system by Cramer's rule."""
+    a, b, c = matrix
+    minors = np.zeros((3, 3))
+    for k, (one, two) in enumerate(((b, c), (c, a), (a, b))):
+        minors[k, 0] = one[1] * two[2] - one[2] * two[1]
+        minors[k, 1] = one[2] * two[0] - one[0] * two[2]
+        minors[k, 2] = one[0] * two[1] - one[1] * two[0]
+    determinant = a[0] * minors[0, 0] + a[1] * minors[0, 1] + a[2] * minors[0, 2]
+    out = np.zeros(3)
+    for j in range(3):
+        for k in range(3):
+            out[j] += minors[k, j] * right[k] / determinant
+    return out
+
+
+@njit(cache=True)
+def accelerations(q, v, tau, levers, inertias, drives):
+    """Return the joints' accelerations (3,) under motor torques, and the torques (3,) that the links take."""
+    matrix, torque = rigid(q, v, levers, inertias)
     motors, viscous, coulomb = drives
-    return np.linalg.solve(matrix + np.diag(motors), tau - torque - viscous * v - coulomb * np.tanh(v / WIDTH))
-
-
-@njit(cache=True)
-def behind_drives(q, v, tau, arm, drives):
-    """Return the torques (3,) that the links take from the drives."""
-    matrix, torque = rigid(q, v, arm)
-    return matrix @ accelerations(q, v, tau, arm, drives) + torque
+    left = tau - torque - viscous * v - coulomb * np.tanh(v / WIDTH)
+    a = solve(matrix + np.diag(motors), left)
+    return a, matrix @ a + torque
 
 
 @njit(cache=True)
 def run(q_ref, v_ref, kp, kd, noise, arm, drives):
     """Return true positions, commanded torques and torques behind the drives, each (N, 3)."""
-    period = 1.0 / RATE
+    period, levers, inertias = 1.0 / RATE, lever_products(arm), arm[3]
     q, v, step = q_ref[0].copy(), v_ref[0].copy(), period / STEPS
     before = q + noise[0] - period * v
     out = np.zeros((3, len(q_ref), 3))
@@ -82,17 +114,16 @@ def run(q_ref, v_ref, kp, kd, noise, arm, drives):
         before = seen
         out[0, k], out[1, k] = q, tau
         for part in range(STEPS):
-            behind[part] = behind_drives(q, v, tau, arm, drives)
-            a1 = accelerations(q, v, tau, arm, drives)
+            a1, behind[part] = accelerations(q, v, tau, levers, inertias, drives)
             v2 = v + 0.5 * step * a1
-            a2 = accelerations(q + 0.5 * step * v, v2, tau, arm, drives)
+            a2, _ = accelerations(q + 0.5 * step * v, v2, tau, levers, inertias, drives)
             v3 = v + 0.5 * step * a2
-            a3 = accelerations(q + 0.5 * step * v2, v3, tau, arm, drives)
+            a3, _ = accelerations(q + 0.5 * step * v2, v3, tau, levers, inertias, drives)
             v4 = v + step * a3
-            a4 = accelerations(q + step * v3, v4, tau, arm, drives)
+            a4, _ = accelerations(q + step * v3, v4, tau, levers, inertias, drives)
             q = q + step / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
             v = v + step / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-        behind[STEPS] = behind_drives(q, v, tau, arm, drives)
+        _, behind[STEPS] = accelerations(q, v, tau, levers, inertias, drives)
         # the mean from half a period before an instant to half a period after it
         out[2, k] += (behind[0] + 4.0 * behind[1] + behind[2]) / 12.0
         if k + 1 < len(q_ref):
@@ -100,6 +131,7 @@ def run(q_ref, v_ref, kp, kd, noise, arm, drives):
     return out
 
 
+@cache
 def reference() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return t (N,), positions and velocities (N, 3): twenty harmonics, from rest, at most 1.5, 2 and 2.5 rad/s."""
     rng = np.random.default_rng(3)
@@ -117,20 +149,31 @@ def reference() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def gains() -> tuple[np.ndarray, np.ndarray]:
     """Return kp and kd (3,) by the mean inertia of the joints."""
     postures = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 3))
-    arm = np.array([LENGTHS, CENTRES, MASSES, INERTIAS])
-    matrices = np.array([rigid(q, np.zeros(3), arm)[0] for q in postures])
+    levers = lever_products(np.array([LENGTHS, CENTRES, MASSES, INERTIAS]))
+    matrices = np.array([rigid(q, np.zeros(3), levers, INERTIAS)[0] for q in postures])
     inertia = np.einsum("kjj->j", matrices) / len(matrices) + MOTORS
     omega = 2.0 * np.pi * FREQUENCY
     return omega**2 * inertia, 1.4 * omega * inertia
 
 
+def _moved(noise: np.ndarray) -> np.ndarray:
+    """Return what `run` returns for noise (N, 3) of the positions that the controller sees."""
+    _, q_ref, v_ref = reference()
+    arm, drives = np.array([LENGTHS, CENTRES, MASSES, INERTIAS]), np.array([MOTORS, VISCOUS, COULOMB])
+    return run(q_ref, v_ref, *gains(), noise, arm, drives)
+
+
+@cache
+def _undisturbed() -> np.ndarray:
+    return _moved(np.zeros_like(reference()[1]))
+
+
 def planar_log(noise: float, in_loop: bool, seed: int) -> PlanarLog:
     """Return a log with white noise of the positions [rad], which the controller sees or the log alone has."""
     rng = np.random.default_rng([seed, 7])
-    t, q_ref, v_ref = reference()
+    t, q_ref, _ = reference()
     error = noise * rng.normal(size=q_ref.shape)
-    arm, drives = np.array([LENGTHS, CENTRES, MASSES, INERTIAS]), np.array([MOTORS, VISCOUS, COULOMB])
-    q, tau, tau_link = run(q_ref, v_ref, *gains(), in_loop * error, arm, drives)
+    q, tau, tau_link = _moved(error) if in_loop else _undisturbed()
     tau = tau + TORQUE_NOISE * rng.normal(size=tau.shape)
     tau_link = tau_link + SENSOR_NOISE * rng.normal(size=tau.shape)
     return PlanarLog(t, q_ref, q + error, tau, tau_link)

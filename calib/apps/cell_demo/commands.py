@@ -7,6 +7,7 @@ import typer
 
 from calib.cli.completion import robots
 from calib.cli.shared import Seed, command, exit_failed, reporting
+from calib.config_types import Plots
 from calib.errors import UsageError
 
 app = typer.Typer()
@@ -23,7 +24,7 @@ def demo(
     bring: Path | None = None,
     payload: Annotated[list[str] | None, typer.Option()] = None,
     seed: Seed = 0,
-    plots: bool = True,
+    plots: Plots = True,
     verbose: bool = False,
 ) -> None:
     """Calibrate a simulated robot; compare with the hidden truth.

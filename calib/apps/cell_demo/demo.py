@@ -12,6 +12,7 @@ import numpy as np
 
 from calib import files
 from calib.apps.cell_demo.step_lines import Telling, row
+from calib.config_types import Plots
 from calib.errors import SessionError, UsageError, command_line
 from calib.folders import read_estimate
 from calib.records import read_lines
@@ -119,7 +120,7 @@ def run(
     *,
     dynamics: bool = True,
     guided: bool = False,
-    plots: bool = True,
+    plots: Plots = True,
     instrument: str = "cmm",
     payloads: Sequence[str] = (),
     verbose: bool = False,
@@ -180,10 +181,10 @@ def run(
         return DemoResult(session, "", time.perf_counter() - started, _stopped(session, waiting))
 
     before, after = _compare_with_truth(session, cell, say)
-    if session.plots:
+    if isinstance(session.plots, str):
         from calib.apps.cell_demo.picture import draw
 
-        draw(session)
+        draw(session, session.plots)
     memory = _peak_memory()
     seconds = time.perf_counter() - started
     verdict = session.verdicts().level

@@ -13,11 +13,11 @@ from calib.toolkit.report_charts import (
     INK,
     QUIET,
     Chart,
+    Label,
+    Line,
     Panel,
+    drawn_chart,
     error_histogram,
-    line,
-    picture,
-    text,
 )
 from calib.toolkit.report_pages import read_fit_report
 from calib.toolkit.result_folders import drawn, prediction, skeleton
@@ -29,12 +29,13 @@ AZIMUTH, ELEVATION = np.deg2rad([-60.0, 20.0])
 HEIGHT = 2.5
 
 
-def draw(session: Session) -> None:
-    """Draw the picture of a finished session into its folder."""
+def draw(session: Session, form: str) -> None:
+    """Draw the picture of a finished session into its folder, as ``png`` or ``svg`` (`form`)."""
     panels = [_cell(session), _errors(session)]
     if session.dynamic:
         panels.append(_torque(session))
-    files.write(session.path(PICTURE), picture(Chart(panels, HEIGHT, len(panels)), "").image)
+    chart = Chart(panels, HEIGHT, len(panels))
+    files.write(session.path(PICTURE).with_suffix(f".{form}"), drawn_chart(chart, form))
 
 
 def _seen_from(points: np.ndarray) -> np.ndarray:
@@ -59,14 +60,14 @@ def _cell(session: Session) -> Panel:
     tips = arms[:, -1]
     farthest = int(np.argmax(tips[:, 1] + np.abs(tips[:, 0])))
     x, y = arms[farthest].T
-    layers = [line(x, y, colour=QUIET, width=5.0), line(x, y, "o", colour=INK, size=4.0)]
+    layers = [Line(x, y, colour=QUIET, width=5.0), Line(x, y, "o", colour=INK, size=4.0)]
     for points, colour in ((measured.nominal, BEFORE), (measured.calibrated, AFTER)):
         # strokes from the measured points, with a gap behind each
         ends = measured.seen + scale * (points - measured.seen)
         gaps = np.full((len(ends), 2), np.nan)
         strokes = np.stack([_seen_from(measured.seen), _seen_from(ends), gaps], axis=1)
         x, y = strokes.reshape(-1, 2).T
-        layers.append(line(x, y, colour=colour, width=1.4))
+        layers.append(Line(x, y, colour=colour, width=1.4))
     return Panel(layers, f"{len(measured.q)} poses, errors × {scale:g}", "[m]", "[m]", equal=True, ticks=5)
 
 
@@ -106,8 +107,8 @@ def _torque(session: Session) -> Panel:
         ("residual", 0.7, measured - predicted, QUIET, 0.6),
     ):
         label_time = t[0] + share * (t[-1] - t[0])
-        layers.append(line(t, values, colour=colour, width=width))
-        layers.append(text(name, label_time, label_height, (0, 0), colour))
+        layers.append(Line(t, values, colour=colour, width=width))
+        layers.append(Label(name, label_time, label_height, (0, 0), colour))
 
     error = torque_error(session)
     title = f"{error:.1f} % of torque unexplained"

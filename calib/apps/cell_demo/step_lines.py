@@ -11,7 +11,7 @@ from shutil import get_terminal_size
 
 from calib.apps.viewer import viewer
 from calib.errors import command_line
-from calib.folders import CERTIFICATE, read_estimate
+from calib.folders import CERTIFICATE, PAGES, read_estimate
 from calib.toolkit.pose_data import read_table
 from calib.toolkit.result_folders import URDF, UnseenReport, ValidationMetrics, prediction
 from calib.toolkit.sessions import SETTINGS, WAYS, Say, Session, chain_of, position_errors, steps_of, torque_error
@@ -155,7 +155,7 @@ def paths(session: Session) -> list[str]:
         "session": SETTINGS,
         "certificate": CERTIFICATE,
         "robot": f"{session.export}/{URDF}",
-        "picture": PICTURE,
+        "report": PAGES[-1],
         "replay": viewer.FILE,
         "truth": "truth.txt",
         "fit": "4-fit",

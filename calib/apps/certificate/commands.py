@@ -5,13 +5,14 @@ from pathlib import Path
 import typer
 
 from calib.cli.shared import command, say
+from calib.config_types import Plots
 from calib.toolkit import CertificateSection
 
 app = typer.Typer()
 
 
 @command(app, "Files and studies")
-def certificate(folder: Path, details: CertificateSection, svg: Path | None = None, plots: bool = True) -> None:
+def certificate(folder: Path, details: CertificateSection, svg: Path | None = None, plots: Plots = True) -> None:
     """Write a result's certificate and report again.
 
     For a fit or an identification, stating serial numbers, operator …. Of a session, session.toml has these details,

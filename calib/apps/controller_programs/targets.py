@@ -419,7 +419,7 @@ def _external_units(
     entries = list(statements) or [(f"E{number_}", "") for number_ in range(1, used + 1)]
     count = len(entries)
     result = []
-    for (name, stated_unit), unit in zip_longest(entries, written[:count], fillvalue=""):
+    for (name, stated_unit), unit in zip_longest(entries, written[:count], fillvalue=""):  # ty: ignore[invalid-assignment]
         unit = stated_unit or unit
         if unit not in (*ANGLES, *LENGTHS):
             raise UsageError(

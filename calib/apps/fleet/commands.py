@@ -5,12 +5,13 @@ from pathlib import Path
 import typer
 
 from calib.cli.shared import command, exit_failed, reporting, say
+from calib.config_types import Plots
 
 app = typer.Typer()
 
 
 @command(app, "Files and studies")
-def run(sessions: list[str], workers: str = "1", plots: bool = True) -> None:
+def run(sessions: list[str], workers: str = "1", plots: Plots = True) -> None:
     """Run many SESSIONS, one folder per robot, as far as possible. A table at the end shows their states.
 
     A robot that fails does not stop the others; see its folder's run.log. The exit code is the worst of all. The same

@@ -17,6 +17,7 @@ from calib.apps.fleet import stores
 from calib.apps.fleet.stores import LEASE
 from calib.apps.fleet.throughput import Throughput
 from calib.arguments import checked
+from calib.config_types import Plots
 from calib.errors import Busy, CalibError, TaskLost, complaint
 from calib.toolkit.result_folders import LEVELS
 from calib.toolkit.sessions import COLOURS, DONE, SETTINGS, Say, folders_of, go_on, position_errors, torque_error
@@ -79,7 +80,7 @@ def run_sessions(
     folders: str | Path | Sequence[str | Path],
     *,
     workers: str | int = 1,
-    plots: bool = True,
+    plots: Plots = True,
     command: str = "calib.run_sessions",
 ) -> Iterator[FleetRow]:
     """Run each session until it is complete or waits for files, and yield the outcome of each.
@@ -107,7 +108,7 @@ def run(
     folders: Sequence[Path | str],
     workers: AbstractContextManager[Workers],
     command: str,
-    plots: bool = True,
+    plots: Plots = True,
     pace: Throughput | None = None,
 ) -> Iterator[FleetRow]:
     """Run every session and yield each outcome as the session ends.
@@ -134,7 +135,7 @@ def run(
                 yield replace(outcome, folder=name)
 
 
-def run_session(folder: Path | str, command: str = "calib run", plots: bool = True, lease: float = LEASE) -> FleetRow:
+def run_session(folder: Path | str, command: str = "calib run", plots: Plots = True, lease: float = LEASE) -> FleetRow:
     """Run one session until it is complete or waits for files, and return the outcome.
 
     Its output is written to ``run.log``. Errors become part of the outcome; only KeyboardInterrupt (Ctrl-C) is raised.
@@ -157,7 +158,7 @@ def run_session(folder: Path | str, command: str = "calib run", plots: bool = Tr
     return replace(outcome, folder=folder, seconds=time.perf_counter() - started)
 
 
-def _run_here(folder: Path, command: str, plots: bool) -> FleetRow:
+def _run_here(folder: Path, command: str, plots: Plots) -> FleetRow:
     started = time.perf_counter()
     messages: list[str] = []
     try:
@@ -185,7 +186,7 @@ def _state_of(error: Exception) -> str:
     return FAILED
 
 
-def _go_on(folder: Path, say: Say, command: str, plots: bool) -> FleetRow:
+def _go_on(folder: Path, say: Say, command: str, plots: Plots) -> FleetRow:
     stop = go_on(folder, say, _no_progress, command, plots=plots)
     if stop.waiting is not None:
         instructions = stop.lines[1:]

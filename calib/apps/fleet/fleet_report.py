@@ -20,6 +20,7 @@ from calib.apps.monitoring.comparison.geometry_calibration import Calibration
 from calib.apps.monitoring.comparison.geometry_change import ToolMotion
 from calib.apps.monitoring.comparison.robot_change import RobotChange, diff
 from calib.arguments import checked
+from calib.config_types import Plots
 from calib.errors import Finding, RobotError, counted, finding
 from calib.records import plain
 from calib.result_kinds import BY_NAME
@@ -100,7 +101,7 @@ class FleetReport(ReportedResult):
         return Section("Fleet", blocks, self.verdict.level, self.verdict.reason)
 
     @checked
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the report into a folder and return its path.
 
         The folder contains report.html, fleet.csv (a row per arm) and metrics.json, and for each type a prior for the

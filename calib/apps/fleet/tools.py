@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import fdtrc, ndtri
 
 from calib.errors import Finding, finding
 
@@ -121,5 +121,5 @@ def _sigmas(step: np.ndarray, groups: Sequence[np.ndarray]) -> float:
     limited = np.minimum(np.concatenate(distances), MAX_DISTANCE * typical)
     variance = np.sum(limited**2) / freedom
     square = float(step @ step) / max(variance, MIN_SCATTER**2) / variance_of_medians
-    probability = max(stats.f.sf(square, 1, FREEDOM_SHARE * freedom), 1e-300)
-    return float(stats.norm.isf(probability / 2.0))
+    probability = max(fdtrc(1, FREEDOM_SHARE * freedom, square), 1e-300)
+    return -float(ndtri(probability / 2.0))

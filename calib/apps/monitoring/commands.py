@@ -8,6 +8,7 @@ import typer
 from calib.apps.monitoring.settings import DiffSettings, DriftSettings
 from calib.cli.completion import Robot
 from calib.cli.shared import command, exit_failed, say
+from calib.config_types import Plots
 
 app = typer.Typer()
 Folder = Annotated[
@@ -16,7 +17,7 @@ Folder = Annotated[
 
 
 @command(app, "Geometry")
-def diff(before: str, after: str, settings: DiffSettings, out: Folder = None, plots: bool = True) -> None:
+def diff(before: str, after: str, settings: DiffSettings, out: Folder = None, plots: Plots = True) -> None:
     """Compare two calibrations of one robot: what changed, in σ, mm and N m. Is it still within tolerance?
 
     Exit codes: 0 the earlier parameters are still within tolerance, or none is given; 1 they are not.
@@ -39,7 +40,7 @@ def drift(
     measured: list[Path],
     settings: DriftSettings,
     out: Folder = None,
-    plots: bool = True,
+    plots: Plots = True,
     options: Annotated[Path | None, typer.Option(help="TOML, see calib formats options")] = None,
     base: str | None = None,
     tip: str | None = None,
@@ -57,7 +58,7 @@ def drift(
 
 
 @command(app, "Files and studies")
-def log(sessions: list[Path], out: Folder = None, plots: bool = True, mixed: bool = False) -> None:
+def log(sessions: list[Path], out: Folder = None, plots: Plots = True, mixed: bool = False) -> None:
     """List the calibrations of one robot: date, verdict, errors, and what changed since the one before.
 
     Example: calib log cell2025 cell2026 --out history
@@ -71,7 +72,40 @@ def log(sessions: list[Path], out: Folder = None, plots: bool = True, mixed: boo
     _shown(robot_log.log(sessions, mixed=mixed), out, plots, result=True)
 
 
-def _shown(outcome: Any, out: Path | None, plots: bool, result: bool = False) -> None:
+@command(app, "Dynamics")
+def update(
+    folder: Path,
+    logs: list[str],
+    out: Annotated[Path, typer.Option(help="folder for the updated model, its report and its state")],
+    options: Annotated[Path | None, typer.Option(help="TOML of the identification: gains, columns, payloads")] = None,
+    enough: Annotated[float | None, typer.Option(min=0.0, metavar="PERCENT")] = None,
+    plots: Plots = True,
+) -> None:
+    """Update identified dynamics by LOGS of production, one after another; friction and gains drift with date.
+
+    Each log is predicted before it is learnt from. One that is not as predicted (a load that was not stated, other
+    friction, another unit, another arm) is named with its cause, and not averaged in.
+
+    Example: calib update dynamics log.csv --out today
+
+    Args:
+        folder: folder of calib identify, or of an earlier update
+        logs: recordings of q and torque or current, with their dates in their names
+        enough: stop when one sigma of no parameter moves more than this share of the torque
+    """
+    from calib.apps.monitoring.learning.update import update_dynamics
+    from calib.cli.shared import progress
+
+    with progress() as show:
+        updated = update_dynamics(folder, logs, options=options, enough=enough, progress=show)
+        show("writing")
+        updated.save(out, plots=plots)
+    say(*updated.renderables())
+    say(f"written to {out}")
+    exit_failed(updated.verdict.level)
+
+
+def _shown(outcome: Any, out: Path | None, plots: Plots, result: bool = False) -> None:
     """Print a result, write it to the folder `out` if one is given, and exit with code 1 if its verdict is fail.
 
     Args:

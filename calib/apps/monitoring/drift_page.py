@@ -12,6 +12,7 @@ import numpy as np
 from calib.apps.monitoring import report_folder
 from calib.apps.monitoring.settings import DEFAULT_DRIFT, DriftSettings
 from calib.arguments import checked
+from calib.config_types import Plots
 from calib.errors import Finding, UsageError, require
 from calib.records import plain
 from calib.result_kinds import BY_NAME
@@ -82,21 +83,21 @@ class DriftFound(ChartedResult, ReportedResult):
 
         The mapping is empty if there are no trends.
         """
-        from calib.toolkit.report_charts import AFTER, QUIET, Chart, Panel, line
+        from calib.toolkit.report_charts import AFTER, QUIET, Chart, Line, Panel
 
         panels = []
         for trend in self.trends:
             ends = np.array([trend.x.min(), trend.x.max()])
             for k, axis in enumerate("xyz"):
-                motion = line(trend.x, 1e3 * trend.moved[:, k], "o", AFTER)
-                slope = line(ends, 1e3 * trend.slope[k] * (ends - trend.x.mean()), "-", QUIET)
+                motion = Line(trend.x, 1e3 * trend.moved[:, k], "o", AFTER)
+                slope = Line(ends, 1e3 * trend.slope[k] * (ends - trend.x.mean()), "-", QUIET)
                 panels.append(Panel([motion, slope], f"{axis} [mm]", f"{trend.what} [{trend.unit}]"))
         if not panels:
             return {}
         return {"drift": Chart(panels, 2.2 * len(self.trends), 3)}
 
     @checked
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the result into a folder and return its path.
 
         The folder contains report.html, trends.csv, metrics.json, and the figure as PNG.
@@ -128,7 +129,9 @@ class DriftFound(ChartedResult, ReportedResult):
                 "total": trend.total,
             }
         title = f"Drift of {self.robot}"
-        return report_folder.save(Path(out), "drift", title, {"robot": self.robot}, [part], plain(numbers), [TABLE])
+        return report_folder.save(
+            Path(out), "drift", title, {"robot": self.robot}, [part], plain(numbers), [TABLE], plots
+        )
 
 
 def _rate(trend: Trend) -> str:

@@ -14,6 +14,7 @@ from calib.apps.monitoring.comparison.change_part import plus_minus
 from calib.apps.monitoring.comparison.change_test import ParameterChange
 from calib.apps.monitoring.comparison.geometry_change import GeometryChange
 from calib.apps.monitoring.comparison.robot_change import diff
+from calib.config_types import Plots
 from calib.errors import SessionError, UsageError, command_line, require
 from calib.records import plain
 from calib.result_kinds import BY_NAME
@@ -136,7 +137,7 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
 
     def charts(self) -> dict[str, Chart]:
         """Return the figure by name: errors of each calibration, and motion of the tool between calibrations."""
-        from calib.toolkit.report_charts import AFTER, BEFORE, Chart, Panel, line
+        from calib.toolkit.report_charts import AFTER, BEFORE, Chart, Line, Panel
 
         errors = []
         motions = []
@@ -148,10 +149,10 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
             expected.append(motion[1])
         dates = [log_line.date for log_line in self.lines]
         numbers = range(len(dates))
-        errors_drawn = [line(numbers, errors, "o-", AFTER, label="measured")]
+        errors_drawn = [Line(numbers, errors, "o-", AFTER, label="measured")]
         motion_drawn = [
-            line(numbers, motions, "o-", AFTER, label="measured"),
-            line(numbers, expected, "+", BEFORE, label="expected from σ"),
+            Line(numbers, motions, "o-", AFTER, label="measured"),
+            Line(numbers, expected, "+", BEFORE, label="expected from σ"),
         ]
         panels = [
             Panel(errors_drawn, "error on unseen poses [mm]", xnames=dates),
@@ -159,7 +160,7 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         ]
         return {"log": Chart(panels, 2.6, 2)}
 
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the log into a folder and return its path.
 
         The folder contains report.html, log.csv, metrics.json, and the figure as PNG.
@@ -178,7 +179,7 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         lines = [dict(zip(HEADER, row)) for row in rows]
         numbers = plain({"robot": self.robot, "lines": lines})
         title = f"Calibrations of {self.robot}"
-        return report_folder.save(Path(out), "log", title, {"robot": self.robot}, [part], numbers, [TABLE])
+        return report_folder.save(Path(out), "log", title, {"robot": self.robot}, [part], numbers, [TABLE], plots)
 
 
 def _nominal_error(log_line: LogLine) -> str:

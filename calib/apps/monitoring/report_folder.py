@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from calib import files, folders
-from calib.toolkit.report_pages import Pictures, Section
+from calib.config_types import Plots
+from calib.toolkit.report_pages import ChartPicture, Pictures, Section
 
 if TYPE_CHECKING:
-    from calib.toolkit.report_charts import Chart
+    from calib.toolkit.report_charts import Captioned, Chart
 
 PAGE = "report.html"
-PICTURE = "plot_{}.png"
 
 
 class ResultPart(NamedTuple):
@@ -41,6 +41,7 @@ def save(
     parts: Sequence[ResultPart],
     numbers: object,
     tables: Sequence[str],
+    plots: Plots = True,
 ) -> Path:
     """Write a result into the folder `out` and return its path.
 
@@ -52,27 +53,29 @@ def save(
         parts: sections of the page.
         numbers: content of ``metrics.json``.
         tables: names of all tables that this kind of result may write.
+        plots: a format writes the figures as files, too.
 
     Raises:
         UsageError: the folder contains files that are not of such a result.
     """
-    file_names = (*tables, PAGE, folders.METRICS, PICTURE.format("*"))
+    file_names = (*tables, PAGE, folders.METRICS, *folders.figure_files("*"))
     folders.check_target(out, file_names, (folders.METRICS, PAGE), kind)
-    return folders.write_staged(out, file_names, lambda folder: _write(folder, title, setup, parts, numbers))
+    return folders.write_staged(out, file_names, lambda folder: _write(folder, title, setup, parts, numbers, plots))
 
 
-def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[ResultPart], numbers: object) -> None:
+def _write(
+    folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[ResultPart], numbers: object, plots: Plots
+) -> None:
+    from calib.toolkit.report_charts import write_figures
     from calib.toolkit.report_pages import Entry, as_html, report_page
 
     sections = []
+    charts: dict[str, Captioned] = {}
     for part in parts:
         drawings = []
         for (name, chart), caption in zip(part.charts.items(), part.captions):
-            from calib.toolkit.report_charts import picture
-
-            drawing = picture(chart, caption)
-            files.write(folder / PICTURE.format(name), drawing.image)
-            drawings.append(drawing)
+            drawings.append(ChartPicture(chart, caption, name))
+            charts[name] = chart, caption
         blocks = [*part.section.blocks, Pictures("", drawings)]
         sections.append(replace(part.section, blocks=blocks))
         name, header, rows = part.table
@@ -80,4 +83,5 @@ def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[R
     entries = [Entry(*fields) for fields in setup.items()]
     page = report_page(title, " to ".join(setup.values()), entries, sections)
     files.write(folder / PAGE, as_html(page))
+    write_figures(folder, charts, plots, paged=True)
     files.write_json(folder / folders.METRICS, numbers)

@@ -150,6 +150,18 @@ class HandEye(Placements):
         return any(bool(np.isnan(frame.sigma).any()) for frame in self.transforms)
 
     @property
+    def defect(self) -> str:
+        """Why the frames are not for use; empty where they are."""
+        if self.verdict.level == "fail":
+            return "the verdict is fail"
+        if self.is_open:
+            return (
+                "the poses turn about one axis only: positions of camera and board along it are not identifiable, only "
+                "their sum; turn the wrist by 90° and more about a second axis"
+            )
+        return ""
+
+    @property
     def is_of_pairs(self) -> bool:
         """Whether it was fitted to pairs of poses, whose robot's joints are coordinates of its poses."""
         return self.inputs.chain.is_free_flyer
@@ -164,7 +176,11 @@ class HandEye(Placements):
             source: the robot's description, for pairs of poses; None: that of the fit.
             world, flange: poses of the controller's base in the arm's base, and of its flange in the arm's tip, as in
                 `calib deliver`; None where the description says them.
+
+        Raises:
+            UsageError: the frames are not for use.
         """
+        self._check_use()
         arm = None
         if not self.is_of_pairs:
             arm = description_of(source or self.inputs.source, self.robot.chain)
@@ -180,38 +196,36 @@ class HandEye(Placements):
             source: the robot's description, for pairs of poses; None: that of the fit.
 
         Raises:
-            UsageError: it is not known what the arm carries, or the robot has no URDF.
+            UsageError: the frames are not for use, it is not known what the arm carries, or the robot has no URDF.
         """
+        self._check_use()
         if "or" in self.carried.split():
             raise UsageError(
                 "it is not known whether the arm carries the camera or the board: state [camera] mounting = "
                 f"'{IN_HAND}' (camera) or '{TO_HAND}' (board) in the options, then write the URDF"
             )
-        if self.is_open:
-            raise UsageError("a placement is not identifiable: turn the wrist about a second axis, then write the URDF")
         if self.is_of_pairs and source is None:
             raise UsageError("pairs of poses have no URDF: give the robot's before the file")
         return urdf_with(resolve(source or self.inputs.source), self.transforms)
+
+    def _check_use(self) -> None:
+        """Raise UsageError if the frames are not for use."""
+        if self.defect:
+            raise UsageError(f"no frames for use: {self.defect}")
 
     def _title(self, frame: str, name: str, names: tuple[str, ...]) -> str:
         return frame if len(names) == 1 else f"{frame} '{name}'"
 
     def lines(self, *first: str) -> Iterator[str]:
         """Yield the console lines: verdict, both transforms in the words of their users, residual, remarks."""
-        failed = self.verdict.level == "fail"
         yield str(self.verdict)
         for frame in self.transforms:
             yield str(frame)
-            if not self.is_open and not failed:
+            if not self.defect:
                 yield f"URDF: {frame.urdf_origin}"
                 yield f"ROS: {frame.ros_command}"
-        if failed:
-            yield "the verdict is fail: no frames are printed for use"
-        if self.is_open:
-            yield (
-                "the poses turn about one axis only: positions of camera and board along it are not identifiable, only "
-                "their sum, so no frames are printed for use; turn the wrist by 90° and more about a second axis"
-            )
+        if self.defect:
+            yield f"no frames are printed or written for use: {self.defect}"
         if "or" in self.carried.split():
             tip = self.robot.chain.tip
             yield (

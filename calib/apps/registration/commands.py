@@ -1,14 +1,20 @@
 """Quick commands, each of which calibrates and prints some frames: tool, base, hand-eye."""
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
 from calib.apps.registration.settings import PlacementSettings
 from calib.cli.completion import Robot
 from calib.cli.shared import check_destination, command, exit_failed, progress, say
+from calib.errors import NO_RESULT_CODE
 
+if TYPE_CHECKING:
+    from calib.apps.registration.api import Placements
+
+Fit = TypeVar("Fit", bound="Placements")
 app = typer.Typer()
 Measured = Annotated[
     list[Path],
@@ -20,6 +26,31 @@ _HAND_EYE_FILES = (
     "OpenCV (calib formats pairs)"
 )
 Options = Annotated[Path | None, typer.Option("--options", help="TOML, see calib formats options")]
+
+
+def _fitted(
+    place: Callable[..., Fit],
+    robot: str,
+    measured: list[Path],
+    settings: PlacementSettings,
+    arguments: Mapping[str, str | Path | None],
+    out: Path | None,
+) -> Fit:
+    """Return placements, saved if a folder is given.
+
+    Args:
+        place: function of `calib.apps.registration.api`.
+        robot, measured, settings: its arguments.
+        arguments: its arguments by name: ``options``, ``base``, ``tip``.
+        out: folder of the fit; None: not saved.
+    """
+    if out is not None:
+        check_destination("fit", robot, out, [arguments["options"], *measured])
+    with progress() as show:
+        fit = place(robot, measured, settings, **arguments, progress=show)
+        if out is not None:
+            fit.save(out)
+    return fit
 
 
 def _add(name: str, frames: tuple[str, ...], help_text: str) -> None:
@@ -42,12 +73,8 @@ def _add(name: str, frames: tuple[str, ...], help_text: str) -> None:
     ) -> None:
         from calib.apps.registration import api
 
-        if out is not None:
-            check_destination("fit", robot, out, [options, *measured])
-        with progress() as show:
-            fit = api.tool(robot, measured, settings, options=options, base=base, tip=tip, progress=show)
-            if out is not None:
-                fit.save(out)
+        arguments = {"options": options, "base": base, "tip": tip}
+        fit = _fitted(api.tool, robot, measured, settings, arguments, out)
         say(*fit.lines(*frames))
         if out is not None:
             say(f"written to {out}")
@@ -102,20 +129,18 @@ def hand_eye(
     from calib.apps.registration import api
 
     sources = measured or []
-    if out is not None:
-        check_destination("fit", robot, out, [options, *sources])
-    with progress() as show:
-        fit = api.hand_eye(robot, sources, settings, options=options, base=base, tip=tip, progress=show)
-        if out is not None:
-            fit.save(out)
+    arguments = {"options": options, "base": base, "tip": tip}
+    fit = _fitted(api.hand_eye, robot, sources, settings, arguments, out)
     say(*fit.lines(), result=True)
     source = Path(robot) if sources else None
-    if controller is not None:
-        say(*fit.for_controller(controller, source, world, flange), result=True)
     if out is not None:
         say(f"written to {out}")
+    exit_failed(fit.verdict.level)
+    if fit.is_open:
+        raise typer.Exit(NO_RESULT_CODE)
+    if controller is not None:
+        say(*fit.for_controller(controller, source, world, flange), result=True)
     if urdf is not None:
         text, links = fit.urdf(source)
         with files.results([(urdf, (".urdf", ".xml"))], [Path(robot), *sources], overwrite):
             say(f"written to {files.write(urdf, text)}: links {', '.join(links)}")
-    exit_failed(fit.verdict.level)

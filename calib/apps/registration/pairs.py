@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.apps.registration.agreement import Reading, agreed
-from calib.errors import refuse_data
+from calib.errors import counted, refuse_data
 from calib.toolkit.chains import POSE_JOINTS, CalibratedChain, Chain, Element, Joint
 from calib.toolkit.installations import chordal_turns, direction
 from calib.toolkit.pose_pairs import (
@@ -49,8 +49,8 @@ def measured_pairs(pairs: PosePairs, mounting: str, robot: Chain | None) -> tupl
     if count < MIN_PAIRS:
         refuse_data(
             pairs.file,
-            f"{count} pairs of poses: two placements need at least {MIN_PAIRS}, a calibration about 12, with the wrist "
-            "turned by 90° and more about two axes between them",
+            f"{counted(count, 'pair')} of poses: two placements need at least {MIN_PAIRS}, a calibration about 12, "
+            "with the wrist turned by 90° and more about two axes between them",
         )
     reading, notes = agreed(pairs)
     if not mounting and pairs.in_hand is not None:

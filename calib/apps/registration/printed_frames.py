@@ -84,7 +84,7 @@ def _stated(values: np.ndarray, sigmas: np.ndarray) -> str:
     texts = []
     for value, sigma in zip(values, sigmas):
         if np.isnan(sigma):
-            texts.append(f"{value:.3f} (not identifiable)")
+            texts.append("not identifiable")
         else:
             texts.append(f"{value:.3f} ± {sigma:.2g}")
     return ", ".join(texts)

@@ -129,7 +129,12 @@ def _made(folder: Path, values: dict[str, str], uploaded: dict[str, Path]) -> No
         raise UsageError(f"holdout: expected a share from 0 to 0.99, found '{holdout}'") from None
     links = {name: values.get(name, "") for name in ("base", "tip")}
     new_session(
-        folder, plan=values.get("plan", "yes") == "yes", holdout=share, **counts, **links, **checked_answers(answers)
+        folder,
+        plan=values.get("plan", "yes") == "yes",
+        holdout=share,
+        **counts,  # ty: ignore[invalid-argument-type]
+        **links,
+        **checked_answers(answers),
     )
 
 

@@ -4,14 +4,14 @@ import atexit
 import io
 import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from starlette.routing import Route
 
 from calib.apps.joining.joining import METHODS
@@ -32,9 +32,10 @@ from calib.apps.serve.web_viewer import LOCAL, WebViewer
 from calib.apps.serve.work import NEXT, REDO, Work
 from calib.apps.viewer.viewer import FILE as RECORDING
 from calib.errors import CalibError
-from calib.folders import PAGES
+from calib.folders import FIGURES, PAGES
 from calib.toolkit.chains import controllers
 from calib.toolkit.pose_data import EULER
+from calib.toolkit.report_pages import figures_page, read_figures, script_sources
 from calib.toolkit.sessions import (
     DONE,
     KEPT,
@@ -52,8 +53,8 @@ from calib.toolkit.sessions import (
 from calib.units import ANGLES, LENGTHS
 
 PICTURES = (".png", ".svg")
-# of files, whoever wrote them
-SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
+# of files, whoever wrote them; of scripts those of reports alone run
+SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; script-src {}; sandbox allow-scripts"
 # folders to take along as a whole: what they hold
 BUNDLES = {"2-poses": "planned poses and their programs", "6-excitation": "motions to play"}
 RESULTS = "the calibrated robot, for other programs"
@@ -73,6 +74,7 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
         Route("/", page),
         Route("/page.js", script),
         Route("/files/{name:path}", file),
+        Route("/figures/{name:path}", figures),
         Route("/view", view),
         Route("/next", go_on, methods=["POST"]),
         Route("/redo/{step}", go_on, methods=["POST"]),
@@ -146,9 +148,35 @@ def page(request: Request) -> Response:
         pages=_pages(session),
         bundles=_bundles(session),
         recording=recording,
+        figures=_figures(file_names),
         pictures=pictures,
         files=file_names,
     )
+
+
+def _figures(file_names: Sequence[str]) -> dict[str, str]:
+    """Return the addresses of pages with figures, by the file that has them.
+
+    Args:
+        file_names: names of the session's files.
+    """
+    addresses = {}
+    for name in file_names:
+        if name.endswith(f"/{FIGURES}"):
+            addresses[name] = f"/figures/{name}"
+        elif name.endswith(".html") and name not in PAGES and received.FOLDER not in name:
+            addresses[name] = f"/files/{name}"
+    return addresses
+
+
+def figures(request: Request) -> Response:
+    """Return the page with the figures of the session's file that the request's path names."""
+    session = session_of(request)
+    path = session.folder / request.path_params["name"]
+    if path.name != FIGURES or path not in _files(session) or not _is_inside(session, path):
+        return PlainTextResponse("no figures of this session", 404)
+    headers = {"Content-Security-Policy": SANDBOX.format(script_sources()), "Cache-Control": "no-cache"}
+    return HTMLResponse(figures_page(f"Figures of {path.parent.name}", [], read_figures(path)), headers=headers)
 
 
 def _pages(session: Session) -> list[str]:
@@ -230,7 +258,7 @@ def file(request: Request) -> Response:
     headers = {"X-Content-Type-Options": "nosniff", "Cache-Control": "no-cache"}
     # Viewers of PDF are scripts, which a sandbox would stop; what was received may be of anybody.
     if path.suffix != ".pdf" or received.FOLDER in path.parts:
-        headers["Content-Security-Policy"] = SANDBOX
+        headers["Content-Security-Policy"] = SANDBOX.format(script_sources())
     return FileResponse(path, headers=headers)
 
 

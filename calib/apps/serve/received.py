@@ -233,7 +233,7 @@ def state_columns(session: Session, kind: str, name: str, answers: Mapping[str, 
         section, _, entry = key.partition(".")
         require(section != "columns" or text in headings, f"{name}: has no column '{text}'", UsageError)
         if entry and section in ("columns", "units"):
-            keys[section] = {**dict(keys.get(section, {})), entry: text}  # type: ignore[call-overload]
+            keys[section] = {**dict(keys.get(section, {})), entry: text}  # ty: ignore[no-matching-overload]
         elif key in ("controller", "euler"):
             keys[key] = text
     parse_fit_options({"files": {name: keys}}, name)

@@ -8,6 +8,7 @@ import typer
 
 from calib.cli.completion import Robot
 from calib.cli.shared import Seed, command, exit_failed, reporting, say
+from calib.config_types import Plots
 from calib.errors import UsageError, one_of, require
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def study(
     report_only: bool = False,
     list_methods: bool = False,
     list_studies: Annotated[bool, typer.Option("--list")] = False,
-    plots: bool = True,
+    plots: Plots = True,
 ) -> None:
     """Compare identification methods on simulated robots. Runs STUDIES, or what of them is missing (Monte Carlo).
 

@@ -252,7 +252,7 @@ def _judged(
     """
     warnings: tuple[Note, ...] = ()
     try:
-        outcome = judged(inputs, model, partial(_say_of, say, method.name))
+        outcome = judged(inputs, model, progress=partial(_say_of, say, method.name))
         verdict = outcome.verdict
         warnings = tuple(as_notes(outcome.warnings, outcome.noticed))
     except CalibError as error:

@@ -33,9 +33,10 @@ from calib.apps.studies.summary import (
     summarise,
 )
 from calib.apps.studies.trial import TrialRow
+from calib.config_types import Plots
 from calib.errors import UsageError, require
-from calib.toolkit.report_charts import AFTER, BEFORE, MARK, Chart, Layer, Panel, box, line, picture, text
-from calib.toolkit.report_pages import Block, Picture, Pictures, RecordColumn, ReportTable, Section, Text, table
+from calib.toolkit.report_charts import AFTER, BEFORE, MARK, Box, Chart, Label, Layer, Line, Panel
+from calib.toolkit.report_pages import Block, ChartPicture, Pictures, RecordColumn, ReportTable, Section, Text, table
 from calib.workers import workers
 
 # Height of one method in a box plot [in].
@@ -64,7 +65,7 @@ REPORT = "report.html"
 OURS = (ROWS, LOCK, SUMMARY, REPORT)
 
 
-def boxes(condition: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
+def boxes(condition: ConditionSummary, rows: Sequence[TrialRow]) -> ChartPicture:
     """Return the box plot of a condition: torque errors of each method over its runs.
 
     Args:
@@ -81,15 +82,15 @@ def boxes(condition: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
         if method.as_good:
             colour = AFTER
         if len(errors) < MIN_DATA_SETS:
-            layers.append(line(errors, [height] * len(errors), "o", colour, size=4.0))
+            layers.append(Line(errors, [height] * len(errors), "o", colour, size=4.0))
         else:
-            layers.append(box(errors, height, colour))
+            layers.append(Box(errors, height, colour))
     low = 0.8 * max(min(all_errors, default=0.1), 1e-6)
     high = 1.25 * max(max(all_errors, default=1.0), 1.1e-6)
     for height, method in enumerate(condition.methods):
         failed = sum(method.failures.values())
         if failed:
-            layers.append(text(f"{failed} failed", high, height, (3, 0), MARK, along="center"))
+            layers.append(Label(f"{failed} failed", high, height, (3, 0), MARK, along="center"))
     names = [method.method for method in condition.methods]
     panel = Panel(layers, x="torque error [%]", xlim=(low, high), log="x", ynames=names, grid="x")
     caption = (
@@ -97,7 +98,7 @@ def boxes(condition: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
         f"and 95th percentile, points beyond; fewer than {MIN_DATA_SETS} as points. Dark: as good as the best. Trials "
         "without an estimate are counted at the right."
     )
-    return picture(Chart([panel], 0.75 + METHOD_HEIGHT * len(names)), caption)
+    return ChartPicture(Chart([panel], 0.75 + METHOD_HEIGHT * len(names)), caption, "errors")
 
 
 def _short(value: float) -> str:
@@ -312,7 +313,7 @@ def make_page(
     conditions: Sequence[ConditionSummary],
     rows: Sequence[TrialRow],
     notes: Sequence[str],
-    plots: bool = True,
+    plots: Plots = True,
 ) -> str:
     """Return the report of a study as HTML.
 
@@ -323,7 +324,7 @@ def make_page(
         notes: notes for the reader.
         plots: whether box plots are included.
     """
-    from calib.toolkit.report_pages import filled, issued
+    from calib.toolkit.report_pages import filled, interactive, issued
 
     blocks: list[Block] = [overview(conditions)]
     if len(conditions) > 1:
@@ -340,12 +341,14 @@ def make_page(
             blocks.append(Pictures("", [boxes(summary, condition_rows)]))
         blocks += failures(summary)
         sections.append(Section(summary.condition.name, blocks))
+    sections, figures = interactive(sections)
     return filled(
         "calib.apps.studies",
         "study.html",
         title=study.name,
         about=study.about,
         sections=sections,
+        figures=figures,
         notes=notes,
         issued=f"{issued()}, {len(rows)} trials",
     )
@@ -392,7 +395,7 @@ def run_study(
     runs: int | None = None,
     where: str | int | None = None,
     report_only: bool = False,
-    plots: bool = True,
+    plots: Plots = True,
     say: Callable[[str], None] = _silent,
 ) -> StudyOutcome:
     """Run the missing trials of a study, write its report, and return its result.

@@ -31,7 +31,7 @@ from calib.data.poses.name_shapes import (
 from calib.data.schema import BOUNDS, Column, Joints
 from calib.errors import MeasurementError, listing, one_of, suggestion
 from calib.units import ANGLES as ANGLE_UNITS
-from calib.units import COUNT_WORDS, encoder_counts
+from calib.units import COUNT_WORDS, EFFORTS, encoder_counts
 
 SUFFIXES = ("", "_meas", "_measured")
 POSITION = Column(("x", "y", "z"), "length", "position", BOUNDS.max_length, "mm")
@@ -52,8 +52,10 @@ DISTANCE = Column(("distance",), "length", "distance", BOUNDS.max_length, "mm", 
 SIGMA_DISTANCE = Column(("sigma_distance",), "length", "sigma", positive=SIGMA.positive)
 LATE = Column(("late_x", "late_y", "late_z"), "speed", "late")
 TIME = Column(("time",), "time", "time")
+TORQUE = Column((), "torque", "torque")
+PAYLOAD = Column(("payload",), "mass", "payload")
 LABELS = ("distance", "pair", "bar", "socket", "plane", "tool")
-UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation")
+UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation", "torque")
 BASE_TIME = "base_time"
 _OF_FRAME = (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION)
 _FAMILIES = (*_OF_FRAME, SIGMA_DISTANCE, LATE)
@@ -62,6 +64,7 @@ OURS = (
     *(f"base_{name}" for column in _OF_FRAME for name in column.names),
     BASE_TIME,
     *LABELS,
+    *PAYLOAD.names,
 )
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
@@ -164,7 +167,8 @@ class Sheet:
         Args:
             joints: names of the robot's joints, which the options may map, too.
         """
-        names = (*OURS, *joints, *(f"q{i + 1}" for i in range(len(joints))))
+        numbers = range(1, len(joints) + 1)
+        names = (*OURS, *joints, *(f"q{number}" for number in numbers), *(f"tau{number}" for number in numbers))
         for name, heading in self.options.columns.items():
             if name not in names and not _TARGET.fullmatch(name):
                 near = suggestion(name, names)
@@ -354,6 +358,8 @@ class Layout:
         base: three names for the position of a frame on the robot's base, then those of its orientation; or none.
         base_sigma, base_sigma_rotation: three names each for the sigmas of the base frame, or none.
         late: four names for the target's velocity and the time, or none.
+        torques: n names of the joints' torques at rest, or none.
+        payload: name of the column with the mass that the tip carries; "" without one.
         notes: remarks for the user on how the columns were chosen.
     """
 
@@ -370,13 +376,17 @@ class Layout:
     base_sigma: tuple[str, ...] = ()
     base_sigma_rotation: tuple[str, ...] = ()
     late: tuple[str, ...] = ()
+    torques: tuple[str, ...] = ()
+    payload: str = ""
     notes: tuple[str, ...] = ()
 
     @property
     def used(self) -> frozenset[str]:
         """The file's names of all columns that are read."""
         families = (*self.positions, *self.sigmas, self.orientation, self.sigma_rotation, self.distance, self.group)
-        return frozenset().union(*families, self.joints, *self.of_base, self.late, (self.tool,))
+        return frozenset().union(
+            *families, self.joints, *self.of_base, self.late, self.torques, (self.tool, self.payload)
+        )
 
     @property
     def of_base(self) -> tuple[tuple[str, ...], ...]:
@@ -397,7 +407,7 @@ def find_layout(sheet: Sheet, joints: Joints | Sequence[str]) -> Layout:
     """
     robot = Joints.of(joints)
     sheet.check_names(robot.names)
-    layout = _layout(sheet, robot)
+    layout = replace(_layout(sheet, robot), torques=_find_torques(sheet, robot), payload=sheet.find("payload"))
     if not sheet.has_our_names(layout.joints, robot.names):
         note = f"the joints are read from {', '.join(layout.joints)}"
         layout = replace(layout, notes=(note, *layout.notes))
@@ -418,6 +428,24 @@ def find_layout(sheet: Sheet, joints: Joints | Sequence[str]) -> Layout:
                 heading,
             )
     return layout
+
+
+def _find_torques(sheet: Sheet, robot: Joints) -> tuple[str, ...]:
+    """Return the names of the joints' torques, ``tau1`` … or ``tau_<joint name>``; () where not all are there.
+
+    Columns in a unit of currents are none: gravity at rest is compared with torques.
+
+    Args:
+        sheet: the table with its options.
+        robot: the robot's joints.
+    """
+    numbers = range(1, len(robot.names) + 1)
+    for form in ([f"tau{number}" for number in numbers], [f"tau_{name}" for name in robot.names]):
+        columns = tuple(filter(None, map(sheet.find, form)))
+        if len(columns) == len(form):
+            units = {sheet.unit(column, "torque").lower() for column in columns}
+            return columns if units <= {"", *EFFORTS} else ()
+    return ()
 
 
 def _layout(sheet: Sheet, robot: Joints) -> Layout:

@@ -17,6 +17,7 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
     planned = "poses.csv"            # of a file without joints: the poses driven, in this order or found by geometry
     base_frame = "auto"              # a frame on the base in columns base_x …: used where it is there; "measured": it
                                      # must be there; "ignored": the target is seen from the instrument
+    payload = { mass = 2.5, centre = [0, 0, 0.1] } # that the tip carries [kg], [m] in the tip's frame; mass 0: none
     socket_distance = 0.05           # between two sockets of the same fixture position
     socket_pairs = [["0", "1"]]      # which sockets that joins, where there are more than two
     model = "auto"                   # or the largest model of the ladder to fit; all names: below
@@ -127,6 +128,20 @@ class CameraOptions:
 
 @strict
 @dataclass(frozen=True)
+class Carried:
+    """What the tip carries, beyond the masses of the robot's description; None for what is not stated.
+
+    Attributes:
+        mass: its mass [kg]; 0 for nothing.
+        centre: its centre of mass in the tip's frame [m].
+    """
+
+    mass: Annotated[float, Real(above=0, most=1e4, unit="kg", zero=True)] | None = None
+    centre: Annotated[tuple[float, float, float], Expect("three numbers [m]")] | None = None
+
+
+@strict
+@dataclass(frozen=True)
 class FileOptions:
     """Options for reading one measurement file; by default its header determines everything. Keys as in the file.
 
@@ -137,6 +152,7 @@ class FileOptions:
         external: names of joints that are external axes of the controller, where names and kinds do not tell.
         planned: CSV of the poses that were to be measured, for a file without joints.
         base_frame: whether the target is seen from the base frame that the file's columns ``base_`` contain.
+        payload: what the tip carries; a column ``payload`` replaces its mass.
     """
 
     kind: Annotated[str, OneOf(tuple(KINDS))] = ""
@@ -158,6 +174,7 @@ class FileOptions:
     check_limits: Flag = True
     planned: Name = ""
     base_frame: Annotated[str, OneOf(("auto", MEASURED, IGNORED))] = "auto"
+    payload: Carried = field(default_factory=Carried)
     camera: CameraOptions = field(default_factory=CameraOptions)
 
 

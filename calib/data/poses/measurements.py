@@ -29,6 +29,12 @@ class PoseMeasurements:
         station: name of the instrument placement, common to all rows (unused by kinds without an instrument).
         file, rows: path of the file, and number (m,) of each row in it, data rows counted from 1.
         torque: (m, n) gravity torques of the arm at these rows [N m], for compliance terms; None if not known.
+        load: (m, 4) first moments [kg m] and mass [kg] of what the arm carries beyond its masses, in the last body's
+            frame; None if not known.
+        measured_torque: (m, n) joint torques that the arm measured at rest [N m]; NaN where none was read; None without
+            columns of torques.
+        payload: (m, 4) stated mass [kg] and centre of mass [m] of what the tip carries, in the tip's frame; NaN where
+            not stated; None if the file states none.
         ignored: names of columns that were not read, for messages.
         notes: remarks on unusual values that were accepted, for messages.
 
@@ -41,12 +47,15 @@ class PoseMeasurements:
     q: np.ndarray
     joint_names: tuple[str, ...]
     _: KW_ONLY
-    tool: np.ndarray = None  # type: ignore[assignment]  # set below
+    tool: np.ndarray = None  # ty: ignore[invalid-assignment]  # set below
     tool_names: tuple[str, ...] = ("tool",)
     station: str = "station"
     file: str = ""
-    rows: np.ndarray = None  # type: ignore[assignment]  # set below
+    rows: np.ndarray = None  # ty: ignore[invalid-assignment]  # set below
     torque: np.ndarray | None = None
+    load: np.ndarray | None = None
+    measured_torque: np.ndarray | None = None
+    payload: np.ndarray | None = None
     ignored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -240,7 +249,7 @@ class GroupedMeasurements(PoseMeasurements):
     """
 
     _: KW_ONLY
-    group: np.ndarray = None  # type: ignore[assignment]  # set in the base class
+    group: np.ndarray = None  # ty: ignore[invalid-assignment]  # set in the base class
     group_names: tuple[str, ...] = ()
     sigma: np.ndarray | None = None
 

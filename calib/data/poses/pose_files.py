@@ -23,6 +23,9 @@ distance            ``distance`` with ``pair`` (two rows share a label), or with
                     ``sigma_distance``
 sockets, plane      ``socket`` (grouped together with ``tool_position``), ``plane``
 tool                ``tool``: label of the reflector that a row saw
+torques             ``tau1`` to ``taun`` [N m] (or ``tau_<joint name>``): what the joints' sensors read at rest; empty
+                    where they read nothing. They drive the compliance, and tell a payload that nobody stated
+payload             ``payload`` [kg]: mass that the tip carries; its centre: options, ``payload``
 ==================  ===================================================================================================
 
 All other columns are ignored and listed. Files of RoboDK: `calib formats robodk`. Units may stand behind a slash
@@ -51,12 +54,14 @@ from calib.data.poses.columns import (
     DISTANCE,
     LATE,
     OURS,
+    PAYLOAD,
     POSITION,
     SIGMA,
     SIGMA_DISTANCE,
     SIGMA_ROTATION,
     SUFFIXES,
     TIME,
+    TORQUE,
     TURNS,
     Layout,
     Sheet,
@@ -268,7 +273,7 @@ def read_measurements(
     sheet, unit_notes = with_silent_units(sheet, layout, robot)
     sheet, unseen_notes = without_placeholders(sheet, layout)
     sheet, base_notes = rows_with_base(sheet, layout)
-    number_columns = layout.used.difference(layout.group, [layout.tool])
+    number_columns = layout.used.difference(layout.group, layout.torques, [layout.tool])
     # Where a file has several targets, one that was not seen is a gap.
     columns_with_gaps: set[str] = set()
     if len(layout.positions) > 1:
@@ -284,6 +289,7 @@ def read_measurements(
         block: PoseMeasurements = _read_targets(sheet, layout, q)
     else:
         block = read_groups(sheet, layout, q)
+    block = _with_loads(sheet, layout, block)
     ignored = tuple(name for name in sheet.table.header if name not in layout.used)
     rivals = unread_rivals(sheet, layout, robot)
     notes += rivals
@@ -291,6 +297,32 @@ def read_measurements(
         notes += _unread_angles(sheet.table, ignored)
     station = options.station or Path(path).stem
     return [replace(block, station=station, ignored=ignored, notes=(*notes, *block.notes))]
+
+
+def _with_loads(sheet: Sheet, layout: Layout, block: PoseMeasurements) -> PoseMeasurements:
+    """Return the block with the torques that the joints measured at rest, and with the stated payload.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns to read.
+        block: the measurements, one or several per row of the table.
+    """
+    rows = np.searchsorted(sheet.table.rows, block.rows)
+    if layout.torques:
+        torque = sheet.numbers(layout.torques, TORQUE, gaps=True)
+        block = replace(block, measured_torque=torque[rows])
+    stated = sheet.options.payload
+    if not layout.payload and stated.mass is None:
+        return block
+    mass = np.full(len(sheet.table), np.nan if stated.mass is None else stated.mass)
+    if layout.payload:
+        mass = sheet.numbers((layout.payload,), PAYLOAD)[:, 0]
+        refuse(
+            sheet.table, mass < 0.0, [layout.payload], lambda row, k: f"found {mass[row]:g} kg: a payload has a mass"
+        )
+    centre = np.full(3, np.nan) if stated.centre is None else np.array(stated.centre)
+    payload = np.column_stack([mass, np.tile(centre, (len(mass), 1))])
+    return replace(block, payload=payload[rows])
 
 
 def _unread_angles(table: Table, ignored: Sequence[str]) -> tuple[str, ...]:

@@ -317,7 +317,7 @@ class Targets:
         return Targets(targets, file="the array")
 
     def __len__(self) -> int:
-        return len(self.q if self.q is not None else self.position)  # type: ignore[arg-type]  # one of them is there
+        return len(self.q if self.q is not None else self.position)  # ty: ignore[invalid-argument-type]  # one of them is there
 
 
 def read_targets(path: str | Path, joints: Joints | Sequence[str]) -> Targets:

@@ -226,7 +226,7 @@ def _recording(archive: _Archive, joints: Joints | None, options: RecordingOptio
         file=str(path),
         rows=rows + 1,
         notes=tuple(notes),
-        **series,
+        **series,  # ty: ignore[invalid-argument-type]
     )
 
 

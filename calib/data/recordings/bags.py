@@ -127,7 +127,7 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
         parts["effort"],
         options.kind or stated_kind,
         names,
-        **optional,
+        **optional,  # ty: ignore[invalid-argument-type]
         file=str(path),
         notes=tuple(notes),
     )

@@ -72,7 +72,7 @@ class Recording:
     drive_gain: np.ndarray | None = None
     effort_variance: np.ndarray | None = None
     file: str = ""
-    rows: np.ndarray = None  # type: ignore[assignment]  # set below
+    rows: np.ndarray = None  # ty: ignore[invalid-assignment]  # set below
     notes: tuple[str, ...] = ()
     jumps: tuple[str, ...] = ()
     faults: tuple[ColumnFault, ...] = ()

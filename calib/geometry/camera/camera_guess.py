@@ -275,6 +275,7 @@ def pnp_poses(block: Pixels) -> Poses:
         file=block.file,
         rows=block.rows,
         torque=block.torque,
+        load=block.load,
     )
 
 

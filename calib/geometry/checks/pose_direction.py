@@ -9,22 +9,15 @@ or a shift of rows does not hide the direction.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
 from calib.errors import Finding, finding
-from calib.geometry.first_guess import (
-    LEVER,
-    Placements,
-    checked_rows,
-    chordal_turns,
-    misfit,
-    place_pose,
-    place_position,
-)
+from calib.geometry.checks import pose_steps, row_lags
+from calib.geometry.first_guess import LEVER, checked_rows, chordal_turns, misfit, place_pose, place_position
 from calib.records import evenly
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
@@ -44,6 +37,12 @@ MIN_PART_OF_POSITIONS = 8
 # Smallest misfit of positions, as a share of the arm's motion, at which a change is searched for: smaller ones are for
 # `calib.geometry.checks.row_changes`.
 MIN_SHARE_OF_POSITIONS = 0.01
+# What changed, by the part of the set-up.
+CHANGED = {"tool": "what the arm carries", "station": "what stands beside the arm"}
+# Numbers of parts into which rows are divided: after two changes, one of five parts is of one set-up.
+PARTS = (2, 3, 5)
+# Shares of the rows, from the first on, in which a change is searched for where several may be.
+BEGINNINGS = (0.8, 0.65, 0.5)
 # Largest number of rows in which a change is searched for.
 MAX_ROWS = 150
 # Largest misfit of two parts, as a share of the misfit of all rows.
@@ -51,8 +50,6 @@ MAX_LEFT = 0.2
 # Smallest changes that are named: angle [rad] and distance [m].
 MIN_TURN = 0.5 * DEG
 MIN_SHIFT = 1e-3
-
-Placing = Callable[[np.ndarray, np.ndarray], Placements]
 
 
 @dataclass(frozen=True)
@@ -111,15 +108,24 @@ def median_misfit(arm: np.ndarray, measured: np.ndarray) -> float:
 
 
 def _misfits_of_parts(arm: np.ndarray, measured: np.ndarray) -> Iterator[float]:
-    """Yield the median misfits of both halves of the rows, and of rows paired with the next and the previous pose."""
+    """Yield the median misfits of parts of the rows, and of rows that lag behind the arm's or lead them."""
     m = len(arm)
     if m < 2 * MIN_PART:
         return
-    half = m // 2
-    yield median_misfit(arm[:half], measured[:half])
-    yield median_misfit(arm[half:], measured[half:])
-    yield median_misfit(arm[1:], measured[:-1])
-    yield median_misfit(arm[:-1], measured[1:])
+    for count in PARTS:
+        size = m // count
+        if size < MIN_PART:
+            continue
+        for start in range(0, size * count, size):
+            stop = start + size
+            yield median_misfit(arm[start:stop], measured[start:stop])
+    lag = row_lags.last_lag(arm, measured)
+    if lag:
+        first = row_lags.first_of_lag(arm, measured, lag)
+        partners = np.arange(first, m) + lag
+        present = (partners >= 0) & (partners < m)
+        if present.sum() >= MIN_PART:
+            yield median_misfit(arm[partners[present]], measured[first:][present])
 
 
 def _motion(poses: np.ndarray) -> float:
@@ -149,8 +155,11 @@ def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurem
     agreement = direction(arm, from_quaternion(block.position[rows], block.quaternion[rows]))
     if not agreement.is_inverse:
         return block
+    subject = "the poses agree"
+    if agreement.inverse > MAX_SHARE * _motion(arm):
+        subject = "the poses do not agree with the arm; some of their rows, or shifted rows, do"
     note = (
-        f"the poses agree as their inverse ({1e3 * agreement.inverse:.3g} mm, as they are "
+        f"{subject} as their inverse ({1e3 * agreement.inverse:.3g} mm, as they are "
         f"{1e3 * agreement.direct:.3g} mm, median misfit): read as what stands (board) seen from what the arm carries "
         "(camera)"
     )
@@ -162,75 +171,152 @@ def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurem
 def parted_set_up(chain: Chain, block: PoseMeasurements) -> list[Finding]:
     """Return a finding if the rows before and after some row agree with the arm each by themselves, not together.
 
-    This finds large changes, in small sets too; `calib.geometry.checks.row_changes` finds small ones.
+    Large changes are found by placing both parts, small ones of full poses by `calib.geometry.checks.pose_steps`.
 
     Args:
         chain: the nominal arm.
         block: measurements of any kind; only positions and full poses are tested.
     """
-    min_part = MIN_PART if isinstance(block, Poses) else MIN_PART_OF_POSITIONS
-    if not isinstance(block, Positions) or not 2 * min_part <= len(block) <= MAX_ROWS or np.ptp(block.tool) > 0:
+    if not isinstance(block, Positions) or not 2 * MIN_PART <= len(block) <= MAX_ROWS or np.ptp(block.tool) > 0:
         return []
     arm = forward(chain, block.q)
     if isinstance(block, Poses):
-        solve: Placing = place_pose
-        measured = from_quaternion(block.position, block.quaternion)
-    else:
-        solve = _place_positions
-        measured = from_quaternion(block.position, np.tile([0.0, 0.0, 0.0, 1.0], (len(block), 1)))
-    together = _rms_misfit(arm, measured, solve)
-    if solve is not place_pose and together < MIN_SHARE_OF_POSITIONS * _motion(arm):
+        return _parted_poses(block, arm)
+    return _parted_positions(block, arm)
+
+
+def _parted_poses(block: Poses, arm: np.ndarray) -> list[Finding]:
+    """Return a finding if the set-up was another after some row of full poses.
+
+    Args:
+        block: the poses.
+        arm: (m, 4, 4) poses of the tip in the base.
+    """
+    if len(block) < 2 * MIN_PART:
         return []
+    measured = from_quaternion(block.position, block.quaternion)
+    end = len(arm)
+    step = pose_steps.small_step(arm, measured, place_pose(arm, measured)) or _large_step(arm, measured)
+    if step is None and _rms_misfit(arm, measured) > MAX_SHARE * _motion(arm):
+        # the first of several changes
+        for share in BEGINNINGS:
+            end = round(share * len(arm))
+            step = _large_step(arm[:end], measured[:end])
+            if step is not None:
+                break
+    if step is None:
+        return []
+    turned = f"{step.angle / DEG:.3g}° (σ {step.angle_sigma / DEG:.1g}°)"
+    moved = f"{1e3 * step.shift:.3g} mm (σ {1e3 * step.shift_sigma:.1g} mm)"
+    sizes = step.misfit, _rms_misfit(arm[:end], measured[:end])
+    return [_parted(block, step.cut, end, sizes, CHANGED[step.part], turned, moved)]
 
-    def squares(cut: int) -> float:
-        before = _rms_misfit(arm[:cut], measured[:cut], solve)
-        after = _rms_misfit(arm[cut:], measured[cut:], solve)
-        return cut * before**2 + (len(arm) - cut) * after**2
 
-    cut = min(range(min_part, len(arm) - min_part + 1), key=squares)
-    parted = float(np.sqrt(squares(cut) / len(arm)))
+def _parted_positions(block: Positions, arm: np.ndarray) -> list[Finding]:
+    """Return a finding if the set-up was another after some row of positions, by placing both parts.
+
+    Args:
+        block: the positions.
+        arm: (m, 4, 4) poses of the tip in the base.
+    """
+    if len(block) < 2 * MIN_PART_OF_POSITIONS:
+        return []
+    together = _rms_of_positions(arm, block.position)
+    if together < MIN_SHARE_OF_POSITIONS * _motion(arm):
+        return []
+    cuts = range(MIN_PART_OF_POSITIONS, len(arm) - MIN_PART_OF_POSITIONS + 1)
+    squares = []
+    for cut in cuts:
+        before = _rms_of_positions(arm[:cut], block.position[:cut])
+        after = _rms_of_positions(arm[cut:], block.position[cut:])
+        squares.append(cut * before**2 + (len(arm) - cut) * after**2)
+    best = int(np.argmin(squares))
+    parted = float(np.sqrt(squares[best] / len(arm)))
     if parted > MAX_LEFT * together or parted > MAX_SHARE * _motion(arm):
         return []
-    station, tool = solve(arm[:cut], measured[:cut])
-    later_station, later_tool = solve(arm[cut:], measured[cut:])
-    carried = invert(tool) @ later_tool
+    cut = cuts[best]
+    station, tool = place_position(arm[:cut], block.position[:cut], None, None)
+    later_station, later_tool = place_position(arm[cut:], block.position[cut:], None, None)
+    part, change = "tool", invert(tool) @ later_tool
     standing = station @ invert(later_station)
-    changed, change = ("what the arm carries", carried)
-    if _size(standing) > _size(carried):
-        changed, change = ("what stands beside the arm", standing)
+    if _size(standing) > _size(change):
+        part, change = "station", standing
     angle = _angle(change)
     shift = float(np.linalg.norm(change[:3, 3]))
     if angle < MIN_TURN and shift < MIN_SHIFT:
         return []
+    turned, moved = f"{angle / DEG:.3g}°", f"{1e3 * shift:.3g} mm"
+    return [_parted(block, cut, len(arm), (parted, together), CHANGED[part], turned, moved)]
+
+
+def _parted(
+    block: PoseMeasurements, cut: int, end: int, sizes: tuple[float, float], changed: str, turned: str, moved: str
+) -> Finding:
+    """Return the finding of a changed set-up.
+
+    Args:
+        block: the measurements.
+        cut, end: index of the first row after the change, and of the first one that was not considered.
+        sizes: rms misfits [m] of both parts by themselves, and of all rows.
+        changed: what changed.
+        turned, moved: by what angle and what distance.
+    """
     rows = block.rows
-    return [
-        finding(
-            "set-up-parted",
-            file=block.file.rsplit("/", 1)[-1] or "measurements",
-            first=rows[0],
-            last=rows[cut - 1],
-            next=rows[cut],
-            end=rows[-1],
-            apart=parted,
-            together=together,
-            changed=changed,
-            angle=angle,
-            shift=shift,
-        )
-    ]
+    return finding(
+        "set-up-parted",
+        file=block.file.rsplit("/", 1)[-1] or "measurements",
+        first=rows[0],
+        last=rows[cut - 1],
+        next=rows[cut],
+        end=rows[end - 1],
+        apart=sizes[0],
+        together=sizes[1],
+        changed=changed,
+        turned=turned,
+        moved=moved,
+    )
 
 
-def _place_positions(arm: np.ndarray, measured: np.ndarray) -> Placements:
-    """Return the placements S and X for measured positions; the rotations of `measured` (m, 4, 4) are not used."""
-    return place_position(arm, measured[:, :3, 3], None, None)
+def _large_step(arm: np.ndarray, measured: np.ndarray) -> pose_steps.Step | None:
+    """Return the row after which the set-up was another, by placing the rows before and after it by themselves.
+
+    Args:
+        arm: (m, 4, 4) poses of the tip in the base.
+        measured: (m, 4, 4) poses of the target in the instrument's frame.
+    """
+    if len(arm) < 2 * MIN_PART:
+        return None
+    together = _rms_misfit(arm, measured)
+    cuts = range(MIN_PART, len(arm) - MIN_PART + 1)
+    squares = []
+    for cut in cuts:
+        before = _rms_misfit(arm[:cut], measured[:cut])
+        after = _rms_misfit(arm[cut:], measured[cut:])
+        squares.append(cut * before**2 + (len(arm) - cut) * after**2)
+    best = int(np.argmin(squares))
+    parted = float(np.sqrt(squares[best] / len(arm)))
+    if parted > MAX_LEFT * together or parted > MAX_SHARE * _motion(arm):
+        return None
+    cut = cuts[best]
+    first = place_pose(arm[:cut], measured[:cut])
+    step = pose_steps.step_at(arm, measured, cut, first)
+    if step.angle < MIN_TURN and step.shift < MIN_SHIFT:
+        return None
+    return step
 
 
-def _rms_misfit(arm: np.ndarray, measured: np.ndarray, solve: Placing) -> float:
-    """Return the rms misfit [m] of poses with the best placements; angles are included where they were measured."""
+def _rms_misfit(arm: np.ndarray, measured: np.ndarray) -> float:
+    """Return the rms misfit [m] of poses with the best placements, angles included."""
     rows = evenly(len(arm), MAX_ROWS)
-    lever = LEVER if solve is place_pose else 0.0
-    values = misfit(arm[rows], measured[rows], *solve(arm[rows], measured[rows]), lever)
+    values = misfit(arm[rows], measured[rows], *place_pose(arm[rows], measured[rows]), LEVER)
     return float(np.sqrt(np.mean(values**2)))
+
+
+def _rms_of_positions(arm: np.ndarray, measured: np.ndarray) -> float:
+    """Return the rms misfit [m] of positions (m, 3) with the best placements."""
+    station, tool = place_position(arm, measured, None, None)
+    predicted = (station @ arm @ tool)[:, :3, 3]
+    return float(np.sqrt(np.mean(np.sum((measured - predicted) ** 2, axis=1))))
 
 
 def _angle(change: np.ndarray) -> float:

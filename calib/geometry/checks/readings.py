@@ -109,7 +109,7 @@ def without_unseen(chain: Chain, block: Block, copies_accepted: bool = False) ->
             unseen[index[list(entry.index)]] = True
     if not unseen.any():
         return block, []
-    return _seen(block, ~unseen), findings
+    return _seen(block, ~unseen), findings  # ty: ignore[invalid-explicit-return]
 
 
 def _seen(block: Positions, visible: np.ndarray) -> Positions:

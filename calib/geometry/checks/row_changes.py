@@ -24,6 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
+from scipy.special import fdtrc
 
 from calib.data.poses.measurements import Positions, take
 from calib.errors import Finding, finding
@@ -328,14 +329,12 @@ def significant(change: RowChange, cost: float, dof: float, hypotheses: int) -> 
         dof: degrees of freedom of `cost`.
         hypotheses: number of changes tried (Bonferroni).
     """
-    # slow to load
-    from scipy.stats import f
-
     count = change.subject.count
     remaining = max(cost - change.gain, 1e-300)
     dof = max(dof, count + 1.0)
     variance = remaining / (dof - count)
-    chance = float(f.sf(change.gain / count / variance, count, dof - count))
+    statistic = max(change.gain / count / variance, 0.0)
+    chance = float(fdtrc(count, dof - count, statistic))
     return chance * hypotheses < MAX_CHANCE and variance < MAX_LEFT**2 * cost / dof
 
 

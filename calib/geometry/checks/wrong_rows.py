@@ -5,17 +5,19 @@ Both hypotheses are tested by the least error of the arm over all placements of 
 on the tool. They are linear in B ⊗ p, B and b: 13 numbers per axis of y.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from calib.column_changes import Change
-from calib.data.poses.measurements import PoseMeasurements, Positions, take
+from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, take
+from calib.geometry.checks import row_lags
 from calib.geometry.installation import Installation
 from calib.records import evenly
 from calib.robot.kinematics import forward
+from calib.transforms import from_quaternion
 
 # shifts in rows between measurements and joint values that are tried, as by a lost point or a header line
 SHIFTS = (1, -1, 2, -2)
@@ -78,7 +80,7 @@ def _unexplained(columns: np.ndarray, position: np.ndarray) -> np.ndarray:
 def row_shifts(nominal: Installation, blocks: Blocks, max_left: float) -> list[Change]:
     """Return possible changes to the blocks: from some row on, measurements are paired with joint values of other rows.
 
-    The other rows are a fixed number of rows further down or up.
+    The other rows are a fixed number of rows further down or up: any number for poses, up to two for positions.
 
     Args:
         nominal: the nominal arm.
@@ -89,15 +91,47 @@ def row_shifts(nominal: Installation, blocks: Blocks, max_left: float) -> list[C
     for number, block in enumerate(blocks):
         if not isinstance(block, Positions) or nominal.known.terms:
             continue
-        for shift in SHIFTS:
-            first = _best_first(nominal, block, shift)
-            if first is None:
-                continue
+        values: dict[str, object] = {"file": block.file, "what": "joints", "remedy": "calib join --by geometry"}
+        if nominal.chain.is_free_flyer:
+            values |= {"what": "the robot's poses", "remedy": None}
+        for shift, first in _shifts(nominal, block):
             direction = "down" if shift > 0 else "up"
-            values = {"first": first, "by": abs(shift), "way": direction, "file": block.file}
+            values = values | {"first": first, "by": abs(shift), "way": direction}
+            values["rows"] = "row" if abs(shift) == 1 else "rows"
             make = partial(_shifted_block, number, first, shift)
             changes.append(Change("rows-shifted", make, (), values, max_left))
     return changes
+
+
+def _shifts(nominal: Installation, block: Positions) -> Iterator[tuple[int, int]]:
+    """Yield likely shifts, each with the row from which on it explains the measurements best.
+
+    Args:
+        nominal: the nominal arm.
+        block: measured positions, or poses.
+    """
+    if isinstance(block, Poses) and len(np.unique(block.tool)) == 1 and len(np.unique(block.rows)) == len(block):
+        arm, measured = (
+            _by_row(forward(nominal.chain, block.q), block),
+            _by_row(from_quaternion(block.position, block.quaternion), block),
+        )
+        shift = row_lags.last_lag(arm, measured)
+        if shift:
+            first = row_lags.first_of_lag(arm, measured, shift)
+            yield shift, int(block.rows.min()) + first
+        return
+    for shift in SHIFTS:
+        first = _best_first(nominal, block, shift)
+        if first is not None:
+            yield shift, first
+
+
+def _by_row(poses: np.ndarray, block: Positions) -> np.ndarray:
+    """Return poses (m, 4, 4) of a block's rows by their numbers in the file; NaN for absent numbers."""
+    first = int(block.rows.min())
+    result = np.full((int(block.rows.max()) - first + 1, 4, 4), np.nan)
+    result[block.rows - first] = poses
+    return result
 
 
 def _best_first(nominal: Installation, block: Positions, shift: int) -> int | None:
@@ -146,7 +180,9 @@ def _shifted(block: Positions, first: int, shift: int) -> Positions:
     numbers, index = np.unique(block.rows, return_index=True)
     source = np.where(block.rows >= first, block.rows + shift, block.rows)
     position = np.minimum(np.searchsorted(numbers, source), len(numbers) - 1)
-    present = np.flatnonzero(numbers[position] == source)
+    # further up, the first rows have the joint values of none
+    is_unpaired = (block.rows >= first) & (source < first) & (numbers[0] < first)
+    present = np.flatnonzero((numbers[position] == source) & ~is_unpaired)
     return replace(take(block, present), q=block.q[index[position[present]]])
 
 

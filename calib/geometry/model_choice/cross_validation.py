@@ -22,7 +22,7 @@ from calib.geometry.model_choice.folds import Folds
 from calib.geometry.observation import layout, observe, prepare, sampled
 from calib.geometry.residuals import CommonNoise
 from calib.geometry.weighing import GeometricFit
-from calib.robot.calibrated import Deflection, Term
+from calib.robot.calibrated import BY_TORQUE, Deflection, Term
 from calib.robot.chain import Chain
 
 # largest number of poses by which models are compared (our choice)
@@ -48,8 +48,9 @@ CHUNK = 1000
 def term_groups(terms: tuple[Term, ...]) -> np.ndarray:
     """Return the ridge group of each term (E,): terms of one group have prior standard deviations in a fixed ratio.
 
-    Harmonics of one joint on one element are one group; every other term is a group of its own. With a ridge for each
-    order, the evidence would switch most orders off and make the others too large, which is seen only on distant rows.
+    Harmonics of one joint on one element are one group, so are the compliances of all joints about their axes, and
+    those across the axes; every other term is a group of its own. With a ridge for each order, the evidence would
+    switch most orders off and make the others too large, which is seen only on distant rows.
     `term_sizes` gives the decrease of the prior with the order.
     """
     numbers: dict[tuple, int] = {}
@@ -58,6 +59,8 @@ def term_groups(terms: tuple[Term, ...]) -> np.ndarray:
         key = (term.element, term.basis, term.source, term.order)
         if term.basis in HARMONIC:
             key = (term.element, "turn", term.source, 0)
+        if term.basis in BY_TORQUE:
+            key = (term.basis,)
         result.append(numbers.setdefault(key, len(numbers)))
     return np.array(result, dtype=int)
 

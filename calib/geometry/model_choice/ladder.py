@@ -49,9 +49,10 @@ Progress = Callable[[int, int, str], None]
 
 
 def _stiffness(chain: Chain, torques_known: bool) -> list[Term]:
-    """Return the terms for deflection of each joint about its axis under gravity.
+    """Return the terms for deflection of each joint under gravity.
 
-    They use the gravity torques if these are known, else fitted moments.
+    With gravity torques, of each joint about its axis by its torque, and of links and bearings across it by the moment
+    of all that they carry; else about its axis by fitted moments.
 
     Args:
         chain: the arm.
@@ -63,6 +64,11 @@ def _stiffness(chain: Chain, torques_known: bool) -> list[Term]:
             terms.append(Term(chain.names[element], "torque", joint))
         elif not torques_known and chain.elements[element].axis[0] == "r":
             terms += _sag(chain, int(element))
+    if torques_known and chain.inertias is not None:
+        for number in _fixed_elements(chain):
+            element = chain.elements[number]
+            if element.axis[0] == "r":
+                terms.append(Term(element.name, "moment", element.owner))
     return terms
 
 
@@ -157,6 +163,8 @@ def _turning(chain: Chain, name: str, joint: int, max_order: int) -> list[Term]:
 
 MODELS = CHOICES[1:]
 FAMILIES = (_stiffness, _bending, _coupling, _harmonics, _wobble)
+# the effect that scales with the load
+BY_LOAD = MODELS[3]
 # effects by name: functions that return the terms for a chain, and for known or unknown gravity torques
 EFFECTS: dict[str, Callable[[Chain, bool], list[Term]]] = dict(zip(MODELS[3:], FAMILIES, strict=True))
 
@@ -204,6 +212,7 @@ class ModelSelection:
         offered: all terms of the chosen effects; ``fit`` contains those of them that the data did not switch off.
         rigid_cross_validated: rms error of the best model without effects on held-out rows [m]; None if it is not
             known.
+        reference: chain, with masses, on which the terms' basis functions are evaluated; None for the nominal arm.
     """
 
     fit: GeometricFit
@@ -216,6 +225,7 @@ class ModelSelection:
     loss: str = "none"
     offered: tuple[Term, ...] = ()
     rigid_cross_validated: float | None = None
+    reference: Chain | None = None
 
     @property
     def cross_validated(self) -> float:
@@ -256,6 +266,7 @@ def select_model(
     seed: int = 0,
     folds: Folds | None = None,
     progress: Progress | None = None,
+    masses: np.ndarray | None = None,
 ) -> ModelSelection:
     """Return the model that the data support, or the model of a given name, fitted to all rows.
 
@@ -272,6 +283,8 @@ def select_model(
         folds: partition by which rows are held out; None for the most demanding one
             (`calib.geometry.model_choice.folds`).
         progress: called with (done, total, task): steps done, steps in all, name of the next step; None for no report.
+        masses: (n, 10) standard parameters of the bodies, by which the blocks' torques were computed; None for those of
+            the arm.
 
     Raises:
         UsageError: the model does not exist.
@@ -286,6 +299,7 @@ def select_model(
         transfer=folds or transfer_folds(measured, seed),
         progress=progress or _no_progress,
         seed=seed,
+        masses=masses,
     )
     climber.rigid(model)
     if climber.settings.loss == "auto" and climber.best.outliers(MAX_RESIDUAL):
@@ -305,7 +319,7 @@ class _Climber:
     """State of a model selection: the best model so far, and the steps tried.
 
     Attributes:
-        cell, measured, settings, fixed, prior, progress, seed: arguments of `select_model`.
+        cell, measured, settings, fixed, prior, progress, seed, masses: arguments of `select_model`.
         transfer: the partition of the rows that was requested.
         folds: that partition, with those folds split that the other rows do not determine.
         nominal: the nominal arm with its placements fitted.
@@ -327,6 +341,7 @@ class _Climber:
     transfer: Folds
     progress: Progress
     seed: int
+    masses: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         self.ticks = 0
@@ -334,6 +349,9 @@ class _Climber:
         self._tick("frames")
         self.nominal = polish_frames(self.cell, self.measured, self.settings)
         self.best = self.stiff = self.nominal
+        self.reference = self.nominal.cell.chain
+        if self.masses is not None:
+            self.reference = replace(self.reference, inertias=self.masses)
         self.full: GeometricFit | None = None
         self.chosen = "frames"
         self.offered: tuple[Term, ...] = ()
@@ -430,6 +448,9 @@ class _Climber:
     def _greedy(self, statistics: FoldStatistics, columns: dict[str, np.ndarray]) -> list[str]:
         """Return the names of the effects that reduce the cross-validation error, best first (greedy selection).
 
+        Compliance by torques is first where torques or loads are at hand: sag by fitted moments may explain one load as
+        well, but it does not scale with the load.
+
         Args:
             statistics: statistics of every fold.
             columns: for each effect, the numbers of its terms among those of the statistics.
@@ -446,8 +467,9 @@ class _Climber:
                 indices[name] = np.concatenate([index, columns[name]])
                 errors[name] = statistics.error(indices[name])
             best = min(candidates, key=lambda name: errors[name].rms)
-            pays = errors[best].rms < error.rms * (1.0 - MIN_GAIN) and errors[best].wins(error)
-            if not pays:
+            if self._by_load and BY_LOAD in candidates and _pays(errors[BY_LOAD], error):
+                best = BY_LOAD
+            if not _pays(errors[best], error):
                 for name in candidates:
                     note = _declined(errors[name], error)
                     self.rungs.append(_rung(statistics, name, indices[name], errors[name].rms, note))
@@ -469,7 +491,7 @@ class _Climber:
             terms: all terms to which the statistics refer.
             index: numbers of the terms to fit; terms that the data switch off are omitted.
         """
-        reference = self.nominal.cell.chain
+        reference = self.reference
         ridges = statistics.ridges(index)
         alive = ridges > 0.0
         alive_terms = tuple(terms[k] for k in index[alive])
@@ -480,20 +502,25 @@ class _Climber:
         blocks = prepare(cell, self.measured)
         free = np.concatenate([rigid.free, layout(cell).index("deflection")])
         prior = np.concatenate([geometry_prior, ridges[alive]])
-        nominal = replace(cell, chain=reference)
+        nominal = replace(cell, chain=self.nominal.cell.chain)
         result = fit_with_prior(cell, blocks, free, prior, settings=self.settings, nominal=nominal)
         return replace(result, start=rigid.start, split=rigid.split, candidates=rigid.candidates)
+
+    @property
+    def _by_load(self) -> bool:
+        """Whether torques or loads were measured or stated: what scales with them is then preferred, if it pays."""
+        return any(block.measured_torque is not None or block.payload is not None for block in self.measured)
 
     def _terms(self, effect: str) -> list[Term]:
         """Return the terms of an effect; harmonics only up to the order that the number of poses can identify."""
         torques_known = all(block.torque is not None for block in self.measured)
         poses = sum(len(block) for block in self.measured)
-        terms = EFFECTS[effect](self.nominal.cell.chain, torques_known)
+        terms = EFFECTS[effect](self.reference, torques_known)
         max_order = poses // POSES_PER_ORDER
         return [term for term in terms if term.basis not in HARMONIC or term.order <= max_order]
 
     def _statistics(self, fit: GeometricFit, terms: tuple[Term, ...]) -> FoldStatistics:
-        return fold_statistics(fit, self.measured, terms, self.nominal.cell.chain, self.folds)
+        return fold_statistics(fit, self.measured, terms, self.reference, self.folds)
 
     def _tick(self, task: str) -> None:
         self.progress(self.ticks, 2 * len(MODELS), task)
@@ -518,8 +545,19 @@ class _Climber:
             folds=self.folds,
             loss=loss,
             offered=self.offered,
+            reference=self.reference,
             rigid_cross_validated=rigid_error,
         )
+
+
+def _pays(effect: UnseenErrors, error: UnseenErrors) -> bool:
+    """Return whether an effect reduces the errors on held-out rows enough to be added.
+
+    Args:
+        effect: errors with the effect.
+        error: errors without it.
+    """
+    return effect.rms < error.rms * (1.0 - MIN_GAIN) and effect.wins(error)
 
 
 def _declined(effect: UnseenErrors, error: UnseenErrors) -> str:

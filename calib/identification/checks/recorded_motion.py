@@ -157,7 +157,7 @@ def another_motion(
         sign_text = "-" if direction < 0.0 else "+"
         changes.append(Change("motion-coupled", with_columns(matrix), (joint, motor), {"way": sign_text}))
     explanation = best_changes((q, reference), changes, _unlike)
-    return explanation and explanation.changes[0]
+    return None if explanation is None else explanation.changes[0]
 
 
 def _on_grid(recording: Recording) -> tuple[np.ndarray, np.ndarray]:

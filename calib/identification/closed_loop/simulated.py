@@ -150,7 +150,7 @@ class _Simulated(Method):
             )
             # `plain` may be the estimate of another loop, whose results are replaced.
             values = field_values(result) | {"loops": loops, "instrumental": identification}
-            return LoopEstimate(**values)
+            return LoopEstimate(**values)  # ty: ignore[invalid-argument-type]
 
         return attempted_in_loop(self.name, problem, loops, estimate)
 
@@ -384,7 +384,7 @@ def loop_results(problem: IdentificationProblem, estimate: MethodEstimate) -> Lo
         table = _table(test.found)
     metrics = _metrics(test, not is_estimate)
     findings = tuple(test.findings(is_estimate))
-    controller = test.loops and test.loops.controller
+    controller = None if test.loops is None else test.loops.controller
     return LoopResults(metrics, findings, table, controller, disagreement(problem, estimate, test))
 
 
@@ -418,7 +418,7 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
     rounds = len(identification.rounds)
     largest_shift_sigma = float(identification.shift.max())
     least_partial_r2 = float(strength.partial_r2.min())
-    controller_explains_percent = identified and identified.explained
+    controller_explains_percent = None if identified is None else identified.explained
     return LoopMetrics(
         "",
         notes,

@@ -11,8 +11,6 @@ equality in the covariance (Gouriéroux & Monfort 1995; our choice, as sets are 
 constraint for each entry.
 """
 
-# pyright: reportMissingTypeStubs=false
-
 import importlib.util
 import traceback
 from collections.abc import Callable, Mapping, Sequence

@@ -158,7 +158,7 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
     tree, names = _parsed(text, location)
 
     def value(u: np.ndarray) -> float:
-        return evaluated(tree, _KNOWN | dict(zip(names, u)), _OPERATIONS)
+        return evaluated(tree, _KNOWN | dict(zip(names, u)), _OPERATIONS)  # ty: ignore[invalid-argument-type]
 
     # by complex steps, without rounding (Squire & Trapp 1998)
     def derivatives(u: np.ndarray) -> np.ndarray:
@@ -213,7 +213,7 @@ def _parsed(text: str, location: str) -> tuple[ast.expr, tuple[str, ...]]:
         tree = ast.BinOp(larger, ast.Sub(), less)
     try:
         with np.errstate(all="ignore"):
-            evaluated(tree, _KNOWN | dict.fromkeys(names, 1.0), _OPERATIONS)
+            evaluated(tree, _KNOWN | dict.fromkeys(names, 1.0), _OPERATIONS)  # ty: ignore[invalid-argument-type]
     except ArithmeticError:
         pass
     except ValueError as wrong:

@@ -321,7 +321,7 @@ def _advance_tangent(
                 if not accelerate(tree, body, linear, kinds, acts, memory, loads, *state):
                     return SINGULAR
             where = (at, rate, slopes[stage], work, bodies_own, extended, by_q, by_v, columns)
-            _linearise(tree, body, linear, kinds, acts, *layout, memory, *where)  # pyright: ignore[reportCallIssue]
+            _linearise(tree, body, linear, kinds, acts, *layout, memory, *where)
             _solve(matrix, by_q, by_v, columns, dat, drate, dtau, dslopes[stage])
         for j in range(n):
             first, inner, last = slopes[0, j], slopes[1, j] + slopes[2, j], slopes[3, j]

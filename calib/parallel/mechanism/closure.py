@@ -253,7 +253,7 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
             f"home is singular (type 2): locked actuators do not hold the platform (rcond {rcond:.1g}); state "
             "another home"
         )
-    signs = frozen(_determinants(opened, links)[0])
+    signs = frozen(_determinants(opened, links, rows)[0])
     return ClosedRobot(robot, start, minors, signs, fixed)
 
 
@@ -317,24 +317,30 @@ def twists(
         freedoms = np.eye(6)[:, robot.selected]
         D = np.broadcast_to(freedoms, (count, 6, robot.r))
         return D, np.zeros((count, 6))
+    from calib.parallel.mechanism import closure_kernels
+
+    # least squares in the components that are no freedoms, in which the constraints have full rank
+    bound = [k for k in range(6) if k not in robot.selected]
     rows = []
     right_sides = []
     for k, link in enumerate(links):
         across = _across(link)
-        rows.append(across @ link.carried)
-        if shifts is None:
-            right_sides.append(np.zeros_like(link.gap))
-        else:
-            right_sides.append(times(across, shifts[k]))
+        constraints = across @ link.carried
+        rows.append(constraints[:, :, bound])
+        known = np.zeros((*link.gap.shape, robot.r + 1))
+        known[:, :, :-1] = -constraints[:, :, robot.selected]
+        if shifts is not None:
+            known[:, :, -1] = times(across, shifts[k])
+        right_sides.append(known)
     matrix = np.concatenate(rows, axis=1)
     right = np.concatenate(right_sides, axis=1)
-    U, s, Vt = np.linalg.svd(matrix, full_matrices=False)
-    rank = 6 - robot.r
-    free = Vt[:, rank:].transpose(0, 2, 1)
-    D = free @ np.linalg.inv(free[:, robot.selected])
-    along = np.einsum("nkr,nk->nr", U[:, :, :rank], right) / s[:, :rank]
-    minimum = np.einsum("nrk,nr->nk", Vt[:, :rank], along)
-    t_0 = minimum - times(D, minimum[:, robot.selected])
+    solution = np.empty((count, len(bound), robot.r + 1))
+    closure_kernels.least_squares(matrix, right, solution)
+    D = np.zeros((count, 6, robot.r))
+    D[:, robot.selected] = np.eye(robot.r)
+    D[:, bound] = solution[:, :, :-1]
+    t_0 = np.zeros((count, 6))
+    t_0[:, bound] = solution[:, :, -1]
     return D, t_0
 
 
@@ -368,13 +374,13 @@ def _check_postures(mechanism: ClosedRobot, posture: Posture) -> None:
     """
     links = leg_links(mechanism.robot, posture)
     home = leg_links(mechanism.robot, mechanism.home)
-    signs = _determinants(mechanism, links)
+    rows = _reading_rows(mechanism, links)
+    signs = _determinants(mechanism, links, rows)
     other_branch = signs * mechanism.signs < 0
     for k, (leg, link, home_link) in enumerate(zip(mechanism.robot.legs, links, home)):
         weak = _leg_rcond(link, home_link) < SINGULAR
         _refuse(mechanism, posture, weak, f"{leg.name} is singular (type 1: stretched or folded)")
         _refuse(mechanism, posture, other_branch[:, k], f"{leg.name} is on another branch than at home")
-    rows = _reading_rows(mechanism, links)
     home_rows = _reading_rows(mechanism, home)
     weak = _platform_rcond(mechanism, rows, home_rows) < SINGULAR
     _refuse(mechanism, posture, weak, "the platform is singular (type 2: locked actuators do not hold it)")
@@ -594,15 +600,20 @@ def _rcond(J: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(condition), reciprocal, 0.0)
 
 
-def _determinants(mechanism: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
-    """Return signs (N, L + 1) of determinants: of a minor of each leg's Jacobian, and of J_p^inv (0 if not square)."""
+def _determinants(mechanism: ClosedRobot, links: Sequence[LegLinks], rows: np.ndarray) -> np.ndarray:
+    """Return signs (N, L + 1) of determinants: of a minor of each leg's Jacobian, and of J_p^inv (0 if not square).
+
+    Args:
+        mechanism: the robot.
+        links: Jacobians of the legs.
+        rows: (N, n, r) J_p^inv.
+    """
     signs = []
     for link, minor in zip(links, mechanism.minors):
         determinant = np.linalg.det(link.jacobian[:, minor])
         signs.append(np.sign(determinant))
     last = np.zeros(len(links[0].gap))
     if not mechanism.robot.redundant:
-        rows = _reading_rows(mechanism, links)
         last = np.sign(np.linalg.det(rows))
     return np.column_stack([*signs, last])
 

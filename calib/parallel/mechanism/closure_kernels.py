@@ -1,4 +1,4 @@
-"""Compiled kernels (numba) of closed loops: Jacobians and gaps of the legs at given postures.
+"""Compiled kernels (numba) of closed loops: Jacobians and gaps of the legs at given postures, least squares.
 
 A leg is given by the arrays ``links`` and ``constants`` of its `Bodies`, whose frames are turned so that the joint's
 axis is z; ``tail`` (4, 4) is the pose of the leg's end in its last frame. ``pose`` (4, 4) is the platform's pose; c of
@@ -6,6 +6,8 @@ a leg's six closure equations are used. The kernels loop over elements, because 
 compile array expressions. All arrays have one memory layout (C order, size of the largest leg), so that each kernel is
 compiled once.
 """
+
+from math import copysign, sqrt
 
 import numpy as np
 from numba import njit
@@ -179,3 +181,47 @@ def legs(links, constants, tail, attachment, q, pose, full, inverse, carried, ga
             lever[s],
             frame,
         )
+
+
+@njit(**OPTIONS)
+def least_squares(A, B, out):
+    """Write the solutions (N, k, l) of A x = B in the sense of least squares to `out`, sample by sample.
+
+    Householder reflections without pivots; infinite or not numbers where columns of A depend on one another.
+
+    Args:
+        A: (N, m, k) matrices, m >= k, overwritten by their triangles.
+        B: (N, m, l) right-hand sides, overwritten.
+        out: (N, k, l) array to write.
+    """
+    m, k, right = A.shape[1], A.shape[2], B.shape[2]
+    for s in range(A.shape[0]):
+        for c in range(k):
+            square = 0.0
+            for i in range(c, m):
+                square += A[s, i, c] ** 2
+            corner = -copysign(sqrt(square), A[s, c, c])
+            # the reflection is 1 - v vᵀ / half, with v in column c
+            A[s, c, c] -= corner
+            half = -corner * A[s, c, c]
+            for j in range(c + 1, k):
+                along = 0.0
+                for i in range(c, m):
+                    along += A[s, i, c] * A[s, i, j]
+                along /= half
+                for i in range(c, m):
+                    A[s, i, j] -= along * A[s, i, c]
+            for j in range(right):
+                along = 0.0
+                for i in range(c, m):
+                    along += A[s, i, c] * B[s, i, j]
+                along /= half
+                for i in range(c, m):
+                    B[s, i, j] -= along * A[s, i, c]
+            A[s, c, c] = corner
+        for j in range(right):
+            for c in range(k - 1, -1, -1):
+                total = B[s, c, j]
+                for i in range(c + 1, k):
+                    total -= A[s, c, i] * out[s, i, j]
+                out[s, c, j] = total / A[s, c, c]

@@ -34,14 +34,8 @@ from calib.errors import CalibError, UsageError, require
 from calib.parallel.mechanism.closure import ClosedRobot, Posture
 from calib.parallel.mechanism.parallel_robot import COORDINATES, FORCES
 from calib.parallel.mechanism.platform_columns import energy_columns, wrench_regressor
-from calib.parallel.mechanism.velocities import (
-    LoopJacobians,
-    LoopMotion,
-    distributed,
-    loop_jacobians,
-    of_platform,
-    of_readings,
-)
+from calib.parallel.mechanism.velocities import LoopMotion, distributed, loop_jacobians, of_platform, of_readings
+from calib.records import shaped
 
 # Largest speed [m/s or rad/s] and acceleration [m/s² or rad/s²] of random states (as `IdentificationModel.sample`).
 RATE = 3.0
@@ -254,7 +248,12 @@ class ParallelModel:
 
         `start`: postures near those at q, for a faster solution; None: home.
         """
-        posture = self.mechanism.locate(q, start)
+        if start is None:
+            robot = self.mechanism.robot
+            readings = shaped(q, (None, robot.n), f"readings of '{robot.name}'")
+            posture = _located(self.mechanism, readings.tobytes())
+        else:
+            posture = self.mechanism.locate(q, start)
         v = np.asarray(v, dtype=float)
         a = np.asarray(a, dtype=float)
         return of_readings(self.mechanism, posture, v, a)
@@ -557,6 +556,14 @@ def _renamed(term: DriveTerm, labels: Sequence[str]) -> str:
     return term.name.removesuffix(str(joint + 1)) + labels[joint]
 
 
+# Instrumental variables ask for several speeds at the same readings, block after block of a record.
+@lru_cache(maxsize=32)
+def _located(mechanism: ClosedRobot, readings: bytes) -> Posture:
+    """Return the postures at readings (N, n) of the actuated joints."""
+    values = np.frombuffer(readings)
+    return mechanism.locate(values.reshape(-1, mechanism.robot.n))
+
+
 def _to_platform(mechanism: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return J_p^invᵀ (N, r, n), which maps actuator torques to platform coordinates."""
     posture = mechanism.locate(q)
@@ -620,31 +627,27 @@ def _series(mechanism: ClosedRobot, motion: Sequence[bytes]) -> list[np.ndarray]
 
 
 @lru_cache(maxsize=4)
-def _beside(mechanism: ClosedRobot, *motion: bytes) -> list[tuple[LoopMotion, LoopMotion]]:
-    """Return pairs of motions near x, v, a (N, r), for central differences.
+def _beside(mechanism: ClosedRobot, *motion: bytes) -> LoopMotion:
+    """Return the motions near x, v, a (N, r), one behind the other (6 r N samples), for central differences.
 
-    In a pair one coordinate of x, v or a is increased and decreased by its step: first those of x, then of v and a.
+    In each one coordinate of x, v or a is increased, or decreased, by its step: first those of x, then of v and a.
     """
-    states = _series(mechanism, motion)
-    result = []
-    start = _moving(mechanism, *motion).posture
-    still = loop_jacobians(mechanism, start)
+    states = np.array(_series(mechanism, motion))
+    r = mechanism.robot.r
+    shifts = np.zeros((3, r, 2, 3, 1, r))
     for order, step in enumerate(STEPS):
-        for shift in step * np.eye(mechanism.robot.r):
-            ends = []
-            for displacement in (shift, -shift):
-                shifted = [*states]
-                shifted[order] = shifted[order] + displacement
-                posture = start
-                jacobians: LoopJacobians | None = still
-                if order == 0:
-                    posture = mechanism.place(shifted[0], start)
-                    jacobians = None
-                rate, change = _twist_of(mechanism, *shifted)
-                ends.append(of_platform(mechanism, posture, rate, change, jacobians))
-            raised, lowered = ends
-            result.append((raised, lowered))
-    return result
+        for j in range(r):
+            shifts[order, j, :, order, 0, j] = step, -step
+    neighbours = states + shifts.reshape(-1, 3, 1, r)
+    x, v, a = neighbours.transpose(1, 0, 2, 3).reshape(3, -1, r)
+    start = _moving(mechanism, *motion).posture
+    repeated = start[np.tile(np.arange(len(start)), 6 * r)]
+    displaced = 2 * r * len(start)
+    placed = mechanism.place(x[:displaced], repeated[:displaced])
+    q = np.concatenate([placed.q, repeated.q[displaced:]])
+    pose = np.concatenate([placed.pose, repeated.pose[displaced:]])
+    rate, change = _twist_of(mechanism, x, v, a)
+    return of_platform(mechanism, Posture(q, pose), rate, change)
 
 
 @dataclass(frozen=True, eq=False)
@@ -712,13 +715,13 @@ class PlatformRegressor:
             of: maps a motion of N samples to values (N, ...); weights: array of the shape of these values.
         """
         within = self._reachable(x)
-        result = np.empty((3, *x.shape))
-        pairs = _beside(self.model.mechanism, within.tobytes(), v.tobytes(), a.tobytes())
-        for k, (raised, lowered) in enumerate(pairs):
-            order, j = divmod(k, x.shape[1])
-            change = (of(raised) - of(lowered)) * weights
-            by_sample = change.reshape(len(x), -1)
-            result[order, :, j] = by_sample.sum(axis=1) / (2.0 * STEPS[order])
+        samples, r = x.shape
+        motions = _beside(self.model.mechanism, within.tobytes(), v.tobytes(), a.tobytes())
+        values = of(motions).reshape(3, r, 2, samples, -1)
+        change = values[:, :, 0] - values[:, :, 1]
+        by_value = weights.reshape(samples, -1)
+        steps = 2.0 * np.array(STEPS)[:, None, None]
+        result = np.einsum("ojnk,nk->onj", change, by_value) / steps
         # a clipped coordinate has no effect
         by_x = result[0] * (within == x)
         return by_x, result[1], result[2]

@@ -14,12 +14,13 @@ from calib.data.csv_table import read_table
 from calib.dynamics.base import expressions
 from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
+from calib.identification.joint_compliance import JointCompliance, encoder_difference
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.physical_consistency import information
 from calib.identification.prediction import Dynamics, Score, predict
 from calib.identification.rows import Case
 from calib.identification.uncertainty.torque_errors import TorqueErrorModel, read_uncertainty
-from calib.procedure.dynamic_stage import geometry_tables
+from calib.procedure.dynamic_stage import geometry_tables, with_geometry
 from calib.procedure.dynamic_stage.identify import (
     DynamicsAssessment,
     IdentificationOutcome,
@@ -37,7 +38,16 @@ from calib.units import headings, per_ampere
 # of torques_1.csv [Hz]
 TORQUE_RATE = 100.0
 
-INSTRUMENTAL = "instrumental.csv"
+INSTRUMENTAL, COMPLIANCE = "instrumental.csv", "joint_compliance.csv"
+COMPLIANCE_HEADER = (
+    "joint",
+    "compliance [rad/(N m)]",
+    "sigma",
+    "identified",
+    "difference [mrad]",
+    "without delay [mrad]",
+    "residual [mrad]",
+)
 # statuses of gains in tables
 GAIN_STATUS = {"told": "identified", "not told": "not identified", "reference": "reference"}
 OURS = (
@@ -47,6 +57,7 @@ OURS = (
     folders.COVARIANCE,
     information.INFORMATION,
     INSTRUMENTAL,
+    COMPLIANCE,
     folders.METRICS,
     "drive_gains.csv",
     folders.REPORT,
@@ -57,9 +68,10 @@ OURS = (
     geometry_tables.SENSITIVITY,
     geometry_tables.GEOMETRIES,
     geometry_tables.TORQUE_COVARIANCE,
-    "plot_torque_[0-9]*.png",
-    *(f"plot_{name}.png" for name in ("errors", "residuals", "friction", "significance")),
-    *(f"plot_{name}.png" for name in ("geometries", "geometry_effects")),
+    with_geometry.TABLE,
+    with_geometry.COVARIANCE,
+    *folders.figure_files("torque_[0-9]*", "velocity_[0-9]*", "errors", "residuals", "friction", "significance"),
+    *folders.figure_files("geometries", "geometry_effects"),
 )
 """Files of an earlier identification that a new one replaces."""
 INSTRUMENTAL_HEADER = ("name", "unit", "instrumental", "sigma", "least_squares", "shift_sigma", "explained_percent")
@@ -237,6 +249,8 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
         covariance = outcome.carried.covariance
     folders.write_covariance(folder / folders.COVARIANCE, identification.names, covariance)
     geometry_tables.write(outcome, folder)
+    if outcome.jointly is not None and outcome.carried is not None:
+        with_geometry.write(outcome.jointly, outcome.carried, folder)
     if identification.loop.table:
         files.write_table(folder / INSTRUMENTAL, INSTRUMENTAL_HEADER, identification.loop.table)
     # without a prior and constraints, estimate and covariance say it all
@@ -245,7 +259,12 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     if identification.prior is not None or binding:
         information.write(identification, folder)
 
-    gains = inputs.gains and GainRecord.of(inputs.gains, inputs.unit)
+    difference = encoder_difference(identification.dynamics, inputs.cases)
+    if difference is not None:
+        compliance_rows = [_compliance_row(joint, inputs.chain.joint_names) for joint in difference.joints]
+        files.write_table(folder / COMPLIANCE, COMPLIANCE_HEADER, compliance_rows)
+
+    gains = None if inputs.gains is None else GainRecord.of(inputs.gains, inputs.unit)
     model_table = robot.model_table if isinstance(robot, Mechanism) else to_table
     table = model_table(identification.dynamics, identification.base, inputs.unit)
     files.write_json(folder / MODEL, table | {"drive_gains": gains})
@@ -258,6 +277,12 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
         rows = zip(inputs.chain.joint_names, plain(gains.values), plain(gains.sigma), status)
         files.write_table(folder / "drive_gains.csv", header, rows)
     files.write_json(folder / folders.METRICS, metrics(outcome))
+
+
+def _compliance_row(joint: JointCompliance, names: Sequence[str]) -> tuple[object, ...]:
+    """Return the row of ``joint_compliance.csv`` for a joint with two encoders, in the order of `COMPLIANCE_HEADER`."""
+    milli = [1e3 * size for size in (joint.difference, joint.delayed, joint.residual)]
+    return (names[joint.joint], joint.compliance, joint.sigma, "yes" if joint.identified else "no", *milli)
 
 
 def _write_torques(

@@ -22,7 +22,7 @@ from calib.identification.prediction import Dynamics, Score, predict, score
 from calib.identification.rows import Case
 from calib.identification.uncertainty import geometry_uncertainty, torque_errors
 from calib.identification.uncertainty.learned_torque_errors import learn_torque_errors
-from calib.procedure.dynamic_stage import plain, plausibility
+from calib.procedure.dynamic_stage import plain, plausibility, with_geometry
 from calib.procedure.dynamic_stage import verdict as judging
 from calib.procedure.dynamic_stage.hypotheses import gravity_hypotheses
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress, silent
@@ -285,6 +285,7 @@ class IdentificationOutcome(DynamicsAssessment):
         geometries: comparison with the estimate on the nominal geometry; None if the geometry is nominal.
         errors: expected torque errors; None if too little was recorded to estimate them.
         seed: seed of all random numbers.
+        jointly: geometry estimated together with the dynamics; None if it was not requested.
     """
 
     inputs: IdentificationInputs
@@ -294,6 +295,7 @@ class IdentificationOutcome(DynamicsAssessment):
     geometries: geometry_uncertainty.GeometryComparison | None = None
     errors: torque_errors.TorqueErrorModel | None = None
     seed: int = 0
+    jointly: with_geometry.GeometryFromTorques | None = None
 
 
 T = TypeVar("T", bound=IdentificationOutcome)
@@ -313,17 +315,24 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     hypotheses = gravity_hypotheses(inputs)
     if settings.friction == "auto" and hypotheses is not None and hypotheses.refuted:
         settings = replace(settings, friction="standard")
-    return judged(inputs, identify(inputs.robot, inputs.cases, settings, progress), progress)
+    if settings.with_geometry:
+        inputs = replace(inputs, options=replace(inputs.options, settings=settings))
+        return judged(*with_geometry.run_jointly(inputs, progress or silent), progress=progress)
+    return judged(inputs, identify(inputs.robot, inputs.cases, settings, progress), progress=progress)
 
 
 def judged(
-    inputs: IdentificationInputs, found: Identification, progress: Progress | None = None
+    inputs: IdentificationInputs,
+    found: Identification,
+    jointly: with_geometry.GeometryFromTorques | None = None,
+    progress: Progress | None = None,
 ) -> IdentificationOutcome:
     """Return the outcome of a finished identification: torque predictions for every recording, errors, and the verdict.
 
     Args:
         inputs: robot, recordings and options.
         found: the identification.
+        jointly: geometry estimated together with the dynamics; None if it was not requested.
         progress: called with a text on each step; None: silent.
 
     Raises:
@@ -333,13 +342,18 @@ def judged(
     # refused before hours go into the geometry's share
     wrong = driven(found.dynamics, inputs.cases)
     carried, geometries = _carry(inputs, found, say)
+    noticed = judging.model_findings(inputs.cases, found)
+    if jointly is not None:
+        noticed = [*noticed, *jointly.noticed]
+        if jointly.delivered:
+            carried = with_geometry.with_covariance(carried, jointly)
     say("errors on held-out time")
     errors = learn_torque_errors(found, inputs.cases, carried.covariance)
     findings = ModelFindings(
         rests=judging.resting_parameters(found),
-        noticed=judging.model_findings(inputs.cases, found),
+        noticed=tuple(noticed),
         controller=found.loop.controller,
-        errors=errors and errors.discrepancy,
+        errors=None if errors is None else errors.discrepancy,
         contradiction=contradiction(found, inputs.chain) if inputs.unit == TORQUE else None,
         unlike=found.loop.disagreement,
         plain=tuple(plain.plain_values(found).tolist()),
@@ -354,6 +368,7 @@ def judged(
         geometries=geometries,
         errors=errors,
         seed=found.settings.seed,
+        jointly=jointly,
     )
 
 

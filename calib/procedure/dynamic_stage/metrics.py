@@ -25,7 +25,7 @@ from calib.identification.prediction import Score, relative_error_sigma
 from calib.identification.registry import METHODS
 from calib.identification.rows import Case
 from calib.identification.uncertainty.error_growth import error_growth
-from calib.procedure.dynamic_stage import geometry_tables
+from calib.procedure.dynamic_stage import geometry_tables, with_geometry
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.plain import PlainReferences
@@ -172,6 +172,7 @@ class ModelMetrics(JudgedMetrics):
         constraints: constraints of the estimate; None: none.
         filters: name of a recording -> its filters.
         geometry: effect of the geometry's uncertainty; None: not computed.
+        geometry_from_torques: geometry estimated together with the dynamics; None: not requested.
         repeated: name of a held-out recording that repeats training motion -> share of its states in the training.
         findings: findings that the verdict needs besides the recordings; None in files of earlier versions.
         error_density: (rows,) spectral density of the torque errors [N² m² s or N² s]; None in files of earlier
@@ -197,6 +198,7 @@ class ModelMetrics(JudgedMetrics):
     constraints: ConstraintMetrics | None = None
     filters: Mapping[str, FilterMetrics] = field(default_factory=dict)
     geometry: geometry_tables.GeometryMetrics | None = None
+    geometry_from_torques: with_geometry.GeometryFromTorquesMetrics | None = None
     repeated: Mapping[str, float] = field(default_factory=dict)
     findings: ModelFindings | None = None
     error_density: Array | None = None
@@ -252,11 +254,12 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         elimination=steps,
         unit=inputs.unit,
         switched_off=identification.friction.off,
-        drive_gains=inputs.gains and GainRecord.of(inputs.gains, inputs.unit),
+        drive_gains=inputs.gains and GainRecord.of(inputs.gains, inputs.unit),  # ty: ignore[invalid-argument-type]
         loop=identification.loop.metrics,
-        constraints=constrained and ConstraintMetrics(constrained.names, constrained.binding, constrained.postures),
+        constraints=constrained and ConstraintMetrics(constrained.names, constrained.binding, constrained.postures),  # ty: ignore[invalid-argument-type]
         filters=filters,
-        geometry=outcome.carried and geometry_tables.metrics(outcome.carried, outcome.geometries),
+        geometry=outcome.carried and geometry_tables.metrics(outcome.carried, outcome.geometries),  # ty: ignore[invalid-argument-type]
+        geometry_from_torques=outcome.jointly and with_geometry.metrics(outcome.jointly),  # ty: ignore[invalid-argument-type]
         repeated=outcome.repeated,
         findings=outcome.findings,
         error_density=_error_density(identification, inputs.cases),

@@ -221,7 +221,7 @@ def track(
     replays = {}
     try:
         if loop is None or loop.controller != "identify":
-            controller = loop and stated_controller(loop, chain.n)
+            controller = None if loop is None else stated_controller(loop, chain.n)
         rate = None if controller is None or loop is None else loop.rate
         for case in inputs.unseen[:MAX_REPLAYS] or inputs.cases[:1]:
             simulated = replay(chain, dynamics, case, predictions[case.name], controller, rate)

@@ -15,7 +15,8 @@ from calib.data.signals.persistency import ExcitationReport
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, finding
 from calib.identification.identify import Identification
-from calib.identification.prediction import Score
+from calib.identification.joint_compliance import encoder_difference
+from calib.identification.prediction import Dynamics, Score
 from calib.identification.rows import Case
 from calib.identification.uncertainty.torque_errors import COVERED, TorqueIntervals
 from calib.procedure.findings import Verdict, limit, lines_of, sentence, settle
@@ -275,7 +276,7 @@ def model_findings(cases: Sequence[Case], identification: Identification) -> tup
         *parameter_findings(identification),
         *identification.loop.findings,
         *_unmodelled(identification),
-        *_elastic(cases),
+        *elastic_findings(cases, identification.dynamics),
     )
 
 
@@ -422,16 +423,32 @@ def _unmodelled(identification: Identification) -> list[Finding]:
     return [finding("autocorrelated-residual", joints=joints)] if joints else []
 
 
-def _elastic(cases: Sequence[Case]) -> Iterable[Finding]:
-    """Yield a finding for each recording with second encoders that show joint elasticity.
+def elastic_findings(cases: Sequence[Case], dynamics: Dynamics[RegressorModel]) -> Iterable[Finding]:
+    """Yield findings on second encoders: their delay, joints that bend, and compliances that they tell.
 
     Args:
         cases: training recordings.
+        dynamics: the identified model, whose bodies' torques bend the joints.
     """
-    for case in cases:
-        if case.motion.q_link is None:
-            continue
-        bend = np.std(np.asarray(case.motion.q_link - case.motion.q), axis=0)
-        joints = [f"{1e3 * bend[j]:.2g} mrad at joint {j + 1}" for j in np.flatnonzero(bend > BEND)]
-        if joints:
-            yield finding("elastic-joints", file=case.name, joints=joints)
+    with_encoders = [case for case in cases if case.motion.q_link is not None]
+    difference = encoder_difference(dynamics, with_encoders)
+    if difference is None:
+        return
+    file = ", ".join(case.name for case in with_encoders)
+    if abs(difference.delay) > SURELY * difference.delay_sigma:
+        delay, sigma = 1e3 * difference.delay, 1e3 * difference.delay_sigma
+        yield finding("encoders-late", file=file, delay=delay, sigma=sigma)
+    bent = [joint for joint in difference.joints if joint.delayed > BEND]
+    joints = [f"{1e3 * joint.delayed:.2g} mrad at joint {joint.joint + 1}" for joint in bent]
+    if joints:
+        yield finding("elastic-joints", file=file, joints=joints)
+    for joint in difference.joints:
+        if joint.identified:
+            stiffness = -1.0 / joint.compliance
+            yield finding(
+                "joint-compliance",
+                joint=joint.joint + 1,
+                compliance=joint.compliance,
+                sigma=joint.sigma,
+                stiffness=stiffness,
+            )

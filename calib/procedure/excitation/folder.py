@@ -11,7 +11,7 @@ import numpy as np
 
 from calib import files
 from calib.errors import counted
-from calib.folders import METRICS, check_target, write_staged
+from calib.folders import METRICS, check_target, figure_files, write_staged
 from calib.procedure.excitation import coefficients, prediction, stored_front
 from calib.procedure.excitation.design import INSTANTS, Designed
 from calib.procedure.excitation.limits import MotionBounds
@@ -32,7 +32,8 @@ DESIGN = (METRICS, coefficients.SAMPLES, coefficients.NAME)
 PLAN = (METRICS, coefficients.PLANNED, "trajectory.yaml", "trajectory.json")
 APPROACH = "approach.csv"
 REHEARSAL = "rehearsal.csv"
-FIGURES = tuple(f"plot_{name}.png" for name in ("motion", "path", "history", "front", "profile", "outlook"))
+PAGE = "report.html"
+FIGURES = (PAGE, *figure_files("motion", "path", "history", "front", "profile", "outlook"))
 # files and folders of an earlier run that a new one replaces
 FRONT = (stored_front.TABLE, stored_front.FOLDER)
 ALL = (*DESIGN, *PLAN[1:], coefficients.ARM, coefficients.RUN, prediction.NAME, *FRONT, APPROACH, REHEARSAL, *FIGURES)

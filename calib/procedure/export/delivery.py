@@ -45,6 +45,7 @@ import numpy as np
 from calib import files
 from calib.errors import UsageError
 from calib.folders import OFFSETS, PARAMETERS, check_target, write_staged
+from calib.procedure.dynamic_stage import with_geometry
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import JudgedMetrics, ModelMetrics, UnseenReport
 from calib.procedure.export import geometry, identified
@@ -110,9 +111,16 @@ class Export:
     prior: str = "entropic"
     remark: str = ""
 
+    @property
+    def geometry_folder(self) -> Path:
+        """Folder of the geometry: of the fit, or of an identification that estimated the geometry with the dynamics."""
+        if self.fit is None or (self.identified is not None and (self.identified / with_geometry.COVARIANCE).is_file()):
+            return self.identified or Path()
+        return self.fit
+
     @cached_property
     def robot(self) -> CalibratedChain:
-        return geometry.read(self.fit or self.identified or Path())
+        return geometry.read(self.geometry_folder)
 
     @cached_property
     def dynamics(self) -> IdentifiedRobot:
@@ -197,7 +205,8 @@ def _geometric_urdf(export: Export, path: Path, name: str) -> list[str]:
 
 
 def _copy(export: Export, path: Path) -> list[str]:
-    original = (export.fit or Path()) / path.name
+    folder = export.geometry_folder if path.name == ROBOT else export.fit or Path()
+    original = folder / path.name
     if not original.exists():
         return []
     files.write(path, original.read_bytes())
@@ -331,7 +340,10 @@ def deliver(export: Export, out: Path) -> list[str]:
         for file in export.files:
             try:
                 notes.extend(file.write(export, staging / file.name))
-            except (geometry.NoSuchArm, NoOffsets) as error:
+            except geometry.NoSuchArm:
+                # a file for arms of another maker
+                continue
+            except NoOffsets as error:
                 notes.append(f"{file.name}: left out: {error}")
 
     write_staged(out, [file.name for file in export.files], write)

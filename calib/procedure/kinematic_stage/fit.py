@@ -20,9 +20,11 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import folds_by_name
-from calib.geometry.model_choice.ladder import ModelSelection, select_model
+from calib.geometry.model_choice.ladder import MIN_GAIN, RIGID_MODELS, ModelSelection, select_model
 from calib.geometry.observability import unidentified
 from calib.geometry.observation import fixed_parameters, stated_prior
+from calib.geometry.static_torques.load_errors import DESCRIBED, WEIGHED
+from calib.geometry.static_torques.sources import MODELLED, torques_used
 from calib.geometry.weighing import GeometricFit, Settings, calibrated_chain
 from calib.procedure.findings import Verdict, level_of, sentence, settle
 from calib.procedure.kinematic_stage import plausibility
@@ -176,18 +178,13 @@ def run(
         prediction.check_robot(inputs.chain.joint_names)
 
     progress("estimating the placements of instrument and tool")
-    start = install(inputs.chain, inputs.fit, inputs.known)
-    climb = partial(
-        select_model,
-        start,
-        inputs.fit,
-        fixed=fixed_parameters(start, options),
-        prior=stated_prior(start, options),
-        folds=folds_by_name(settings.folds, inputs.fit, settings.seed),
-        seed=settings.seed,
-        progress=lambda done, total, what: progress(f"fitting: {what}"),
-    )
-    selection = climb(model, settings=weighing)
+    climb, selection = _selected(inputs, options, settings, weighing, progress)
+    if inputs.gravity is not None and model not in RIGID_MODELS:
+        modelled = inputs.driven_by(MODELLED)
+        of_modelled = _selected(modelled, options, settings, weighing, progress)
+        if of_modelled[1].cross_validated < (1.0 - MIN_GAIN) * selection.cross_validated:
+            inputs = modelled
+            climb, selection = of_modelled
     nominal = selection.nominal.cell
     _check_convergence(selection, inputs, options)
 
@@ -202,6 +199,7 @@ def run(
     if not changes:
         for block in inputs.fit:
             notes += parted_set_up(inputs.chain, block)
+    notes += torques_used(selection.fit.cell.deflection, inputs.gravity, inputs.torques)
     if prediction is not None:
         ratio = compared_with_fit(prediction, selection.fit)
         if ratio is not None:
@@ -214,7 +212,8 @@ def run(
     findings = replace(findings, joint_range=measured_range)
 
     progress("estimating the expected errors")
-    expected = learn_errors(selection, inputs.fit, settings.seed)
+    mass_doubt = DESCRIBED if inputs.gravity is None else WEIGHED
+    expected = learn_errors(selection, inputs.fit, settings.seed, mass_doubt)
     if expected is not None:
         findings = replace(findings, discrepancy=expected.discrepancy)
     plain = plain_reference(nominal, inputs)
@@ -233,6 +232,33 @@ def run(
         expected=expected,
         loss=loss,
     )
+
+
+def _selected(
+    inputs: Inputs, options: FitOptions, settings: FitSettings, weighing: Settings, progress: Progress
+) -> tuple[Callable[..., ModelSelection], ModelSelection]:
+    """Return the function that selects models on the rows to fit, and the model that it selects.
+
+    Args:
+        inputs: robot and measurements.
+        options: content of the fit options file.
+        settings: model, folds and seed.
+        weighing: settings of the loss function.
+        progress: called with a text on each stage.
+    """
+    start = install(inputs.chain, inputs.fit, inputs.known)
+    climb = partial(
+        select_model,
+        start,
+        inputs.fit,
+        fixed=fixed_parameters(start, options),
+        prior=stated_prior(start, options),
+        folds=folds_by_name(settings.folds, inputs.fit, settings.seed),
+        seed=settings.seed,
+        progress=lambda done, total, what: progress(f"fitting: {what}"),
+        masses=inputs.masses,
+    )
+    return climb, climb(settings.model or options.model, settings=weighing)
 
 
 def _rigid_misfit(

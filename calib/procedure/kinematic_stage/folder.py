@@ -49,6 +49,7 @@ FIGURES = (
     "singular_values",
     "joints",
     "map",
+    "rows",
     "parameters",
     "correlations",
 )
@@ -67,7 +68,7 @@ OURS = (
     REPORT,
     *PAGES,
     METRICS,
-    *(f"plot_{name}.png" for name in FIGURES),
+    *folders.figure_files(*FIGURES, "coverage", "coverage_[0-9]*"),
 )
 # what these folders are called in a session
 IN_SESSION = "4-fit"

@@ -24,6 +24,8 @@ from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
 from calib.geometry.repeatability import repeated, repeated_rows, without_copies
+from calib.geometry.static_torques.gravity_fit import GravityFit, gravity_fit
+from calib.geometry.static_torques.sources import MEASURED, driven, load_findings, with_stated_load
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.undecided_files import decided
 from calib.procedure.robot_kinds import joints_of
@@ -34,7 +36,6 @@ from calib.robot.description import remarks
 from calib.robot.formats import arm_ends, urdf
 from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.formats.urdf_tree import read as read_tree
-from calib.robot.kinematics import gravity_torques
 from calib.robot.library import load, resolve
 
 PLANNED_POSES: Point[Callable[[Path, Chain, FileOptions], list[PoseMeasurements]]] = Point(
@@ -72,7 +73,9 @@ class Inputs:
         earlier: the robot with the results of an earlier fit, as its file contains them; None for a URDF.
         masses: (n, 10) identified standard parameters, from which gravity torques are computed; None: parameters of the
             robot's description.
-        noticed: findings on readings that were left out, since the instrument did not see the target.
+        noticed: findings on readings that were left out, since the instrument did not see the target, and on torques.
+        gravity: gravity of the arm by the torques that it measured at rest; None without such torques.
+        torques: whether measured torques drive the compliance, or those of the masses.
     """
 
     chain: Chain
@@ -83,6 +86,23 @@ class Inputs:
     earlier: CalibratedChain | None = None
     masses: np.ndarray | None = None
     noticed: tuple[Finding, ...] = ()
+    gravity: GravityFit | None = None
+    torques: str = MEASURED
+
+    def driven_by(self, source: str) -> "Inputs":
+        """Return the inputs whose compliance is driven by measured or by modelled torques.
+
+        Args:
+            source: `MEASURED` or `MODELLED`; without measured torques both are the same.
+        """
+        gravity = self.gravity
+        if gravity is None:
+            return self
+        fitted = tuple(driven(block, gravity, source) for block in self.fit)
+        unseen = {}
+        for name, rows in self.unseen.items():
+            unseen[name] = replace(rows, block=driven(rows.block, gravity, source))
+        return replace(self, fit=fitted, unseen=unseen, torques=source)
 
     @property
     def weighed(self) -> Chain:
@@ -180,10 +200,16 @@ def gather(
         if held_out is not None:
             unseen[_free_name(unseen, block.file)] = Unseen(held_out, held_out=True)
 
-    if masses is not None:
+    gravity, torque_findings = gravity_fit(weighed, fitted_blocks)
+    noticed += torque_findings
+    if gravity is not None:
+        for block in fitted_blocks:
+            noticed += load_findings(block, gravity)
+        masses = gravity.chain.inertias
+    elif masses is not None:
         notes += (f"gravity torques of the compliance are those of the masses identified in {settings.masses}",)
-    inputs = Inputs(chain, robot_file, tuple(fitted_blocks), unseen, notes, earlier, masses, tuple(noticed))
-    inputs = with_unseen(inputs, validate, options, settings)
+    inputs = Inputs(chain, robot_file, tuple(fitted_blocks), unseen, notes, earlier, masses, tuple(noticed), gravity)
+    inputs = with_unseen(inputs, validate, options, settings).driven_by(MEASURED)
     if earlier is None or earlier.corrections is None:
         return inputs
     name = robot_file if isinstance(robot, CalibratedChain) else robot
@@ -218,6 +244,8 @@ def with_unseen(
             name = _free_name(unseen, block.file)
             block, unseen_readings = without_unseen(inputs.weighed, block, "copies" in options.accept)
             noticed += unseen_readings
+            if inputs.gravity is not None:
+                noticed += load_findings(block, inputs.gravity)
             if settings.refit_frames:
                 unseen[name] = Unseen(block, own_frames=True, seen=fitted)
             else:
@@ -429,7 +457,7 @@ def read_file(
         # of unseen files, too: the fit checks the rows that it fits only
         check_scale(block, chain)
         check_orientations(chain, block)
-    return [replace(block, torque=gravity_of(chain, block.q)) for block in result]
+    return [with_stated_load(chain, block) for block in result]
 
 
 def _refuse_pairs(path: Path, options: FileOptions) -> None:
@@ -443,18 +471,6 @@ def _refuse_pairs(path: Path, options: FileOptions) -> None:
             "hand-eye places camera and board by them; all else needs joint values",
             path,
         )
-
-
-def gravity_of(chain: Chain, q: np.ndarray) -> np.ndarray | None:
-    """Return gravity torques (m, n) [N m or N] at joint values (m, n); None if the robot's masses are unknown.
-
-    Args:
-        chain: the arm with its masses.
-        q: joint values [rad or m].
-    """
-    if chain.inertias is None or len(chain.driven) != chain.n:
-        return None
-    return gravity_torques(chain, q)
 
 
 def _path(source: Path | PoseMeasurements) -> Path:

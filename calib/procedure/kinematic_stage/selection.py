@@ -16,6 +16,7 @@ import numpy as np
 
 from calib import files
 from calib.config import Tables
+from calib.config_types import Plots
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pose_lists import read_poses, write_poses
@@ -49,6 +50,8 @@ METHODS_BY_CANDIDATES = ("detmax",)
 VIEWS = 600
 # sigma of the tool over the workspace, and by the number of poses
 FIGURES = ("predicted", "outlook")
+# end of the name of the page with them, after the stem of the CSV
+FIGURES_PAGE = "_figures.html"
 # poses all over the workspace, seen or not, at which the tool's sigma is predicted (our choice)
 TYPICAL = 300
 # random postures by which the share is estimated that keeps each constraint
@@ -252,7 +255,7 @@ def _feasible_candidates(
         )
     source = candidates(settings.candidates) if callable(candidates) else candidates
     with refused_as(UsageError, CalibError, "candidates: {}"):
-        q = read_poses(source, joints_of(chain))
+        q = read_poses(source, joints_of(chain))  # ty: ignore[invalid-argument-type]
     numbers = np.flatnonzero(is_feasible(space, q))
     if len(numbers) < m:
         exceeding = int(((q < space.lower) | (q > space.upper)).any(axis=1).sum())
@@ -404,26 +407,27 @@ def _outlook(
     return PoseOutlook(predicted(q), others, blind, comparable)
 
 
-def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[str, Path]:
+def beside_poses(out: Path, plots: Plots, chosen: Chosen | None = None) -> dict[str, Path]:
     """Return the paths of the files next to a selection's CSV: the prediction, and the figures by name.
 
     Args:
         out: path of the CSV.
-        plots: whether figures are written.
+        plots: figures: none, on a page, or as files of a format, too.
         chosen: the selection, which determines the files; None: all files that a selection may write.
     """
     paths = {}
     if chosen is None or chosen.prediction is not None:
         paths["prediction"] = forecast.beside(out)
-    figures = ()
-    if plots:
-        figures = FIGURES if chosen is None else chosen.figure_names
-    for name in figures:
-        paths[name] = out.parent / f"{out.stem}_{name}.png"
+    figures = FIGURES if chosen is None else chosen.figure_names
+    if plots and figures:
+        paths["figures"] = out.parent / f"{out.stem}{FIGURES_PAGE}"
+    if isinstance(plots, str):
+        for name in figures:
+            paths[name] = out.parent / f"{out.stem}_{name}.{plots}"
     return paths
 
 
-def targets(out: Path, plots: bool) -> files.Results:
+def targets(out: Path, plots: Plots) -> files.Results:
     """Return the paths of all files that a selection may write, with their allowed suffixes.
 
     Args:

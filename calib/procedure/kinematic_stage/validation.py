@@ -18,6 +18,7 @@ from calib.geometry.error_model import ErrorModel
 from calib.geometry.fit import without_corrections
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.ladder import MIN_GAIN
+from calib.geometry.static_torques.sources import load_changes
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import NOT_JUDGED, Verdict, catalogue, level_of, limit, lines_of, sentence
 from calib.procedure.kinematic_stage.comparison import MARGIN, Comparison, compare, compare_unseen
@@ -186,8 +187,13 @@ def _figures(worst: _Proof, arm: str, tolerance: float | None = None) -> str:
         arm: name of the deliverable if there are several; otherwise empty.
         tolerance: largest acceptable rms on held-out poses [m]; None if not stated.
     """
-    figures = finding("errors", after=worst.after, before=worst.before, where=worst.where, arm=arm, tolerance=tolerance)
-    return sentence(figures)
+    before = worst.before
+    if before == worst.after:
+        # the arm was not changed
+        before = None
+    return sentence(
+        finding("errors", after=worst.after, before=before, where=worst.where, arm=arm, tolerance=tolerance)
+    )
 
 
 def _far_off(
@@ -440,6 +446,7 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
         noticed += filter(level_of, _references(name, rows, deliverable, frames_only))
     noticed += findings.noticed
     noticed += inputs.noticed
+    noticed += load_changes(inputs.fit, [rows.block for rows in inputs.unseen.values()])
     copies = _copies(inputs)
     if copies:
         noticed.append(finding("not-unseen", files=copies))

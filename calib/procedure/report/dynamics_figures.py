@@ -1,6 +1,7 @@
 """Figures on the dynamics, made from an identification's outcome or from the files in its folder."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +10,17 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import TermMotion
 from calib.dynamics.torque_rows import MOTOR
 from calib.estimation.whiteness import Whiteness
+from calib.identification.rows import Case
 from calib.procedure.dynamic_stage.geometry_tables import GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
-from calib.procedure.dynamic_stage.identify import IdentificationOutcome
+from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import TorqueCurves, UnseenReport
-from calib.procedure.report.charts import Captioned, Chart, Panel, bars, level, line, text
 from calib.procedure.report.dynamics_section import SIGNIFICANT, DynamicReport, IdentifiedParameter, percent, proof_of
-from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET, thinned
+from calib.procedure.report.figures.charts import Bars, Captioned, Chart, Label, Level, Line, Panel
+from calib.procedure.report.figures.style import AFTER, BEFORE, CURVES, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import read_rows
+from calib.robot.chain import Joint
 from calib.units import small
 
 # torque rows whose figures fit half a page
@@ -25,6 +29,8 @@ MAX_HALF_PAGE_ROWS = 8
 MAX_ELEMENTS = 15
 # parameters along an axis: more cannot be read on A4
 MAX_LABELS = 40
+# samples per period of the highest frequency of low-passed torques: their curve looks as if it had all
+SAMPLES_PER_CYCLE = 8.0
 # points of a cloud of friction, and of its curve
 MAX_CLOUD_POINTS = 1400
 CURVE_POINTS = 400
@@ -60,11 +66,78 @@ def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:
     result = {}
     cases = (*outcome.inputs.unseen, *outcome.inputs.cases)
     for number, case in enumerate(cases, 1):
-        curves = TorqueCurves.of(case, outcome.predictions[case.name])
+        curves = _sampled(case, outcome.predictions[case.name])
         result[f"torque_{number}"], _ = recorded(curves, report)
-    for name, (chart, _) in _error_charts(report).items():
+    for name, (chart, _) in (_error_charts(report) | friction(outcome)).items():
         result[name] = chart
-    return result | friction(outcome)
+    return result
+
+
+def recordings(
+    inputs: IdentificationInputs, assessment: DynamicsAssessment, report: UnseenReport
+) -> dict[str, Captioned]:
+    """Return charts of torques and velocities of the recordings that decide the verdict, by name, with all samples.
+
+    Args:
+        inputs: robot and recordings.
+        assessment: the model's predictions.
+        report: report on the model's errors.
+    """
+    result: dict[str, Captioned] = {}
+    for number, case in enumerate(inputs.unseen or inputs.cases, 1):
+        curves = _sampled(case, assessment.predictions[case.name])
+        chart, caption = recorded(curves, report)
+        linked = f"recording {number}"
+        result[f"torque_{number}"] = replace(chart, linked=linked), caption
+        if not isinstance(inputs.robot, Mechanism):
+            chart = _velocities(case, curves.t, inputs.chain.joints, report.rows)
+            caption = f"Velocities of the joints on {case.name}, with the cursor of the torques."
+            result[f"velocity_{number}"] = replace(chart, linked=linked), caption
+    return result
+
+
+def _sampled(case: Case, predicted: np.ndarray) -> TorqueCurves:
+    """Return the low-passed torques of a recording with as many samples as their band needs.
+
+    Args:
+        case: the recording with N samples.
+        predicted: (N, rows) torques that the model predicts for it.
+    """
+    motion = case.motion
+    step = _step(case)
+    measured, predicted = motion.in_band(np.asarray(case.target)), motion.in_band(predicted)
+    return TorqueCurves(case.name, motion.t[::step], measured[::step].T, predicted[::step].T, motion.band)
+
+
+def _step(case: Case) -> int:
+    motion = case.motion
+    if not np.isfinite(motion.band):
+        return 1
+    return max(1, int(motion.rate / (SAMPLES_PER_CYCLE * motion.band)))
+
+
+def _velocities(case: Case, t: np.ndarray, joints: Sequence[Joint], rows: Sequence[str]) -> Chart:
+    """Return a chart of the joints' velocities on a recording.
+
+    Args:
+        case: the recording.
+        t: (K,) times of the samples of its torques [s].
+        joints: the robot's joints.
+        rows: names of the torque rows; where they are one per joint, they are the joints' switches, too.
+    """
+    v = np.asarray(case.motion.v)[:: _step(case)]
+    units = set()
+    lines = []
+    for j, joint in enumerate(joints):
+        switch = joint.name
+        if len(rows) == len(joints):
+            switch = rows[j]
+        colour = CURVES[j % len(CURVES)]
+        lines.append(Line(t, v[:, j], "-", colour, 0.8, label=joint.name, switch=switch))
+        units.add("m/s" if joint.kind == "prismatic" else "rad/s")
+    label = f"velocity [{', '.join(sorted(units))}]"
+    panel = Panel(lines, x="time [s]", y=label, xlim=(t[0], t[-1]))
+    return Chart([panel], 2.0, title=f"velocities on {case.name}")
 
 
 def recorded(curves: TorqueCurves, report: UnseenReport) -> Captioned:
@@ -88,8 +161,8 @@ def recorded(curves: TorqueCurves, report: UnseenReport) -> Captioned:
     return chart, f"Torques on {curves.name}, {role}: measured, predicted, and the residual."
 
 
-def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
-    """Return a chart of friction over velocity, as a dictionary with the key ``friction``; empty for mechanisms.
+def friction(outcome: IdentificationOutcome) -> dict[str, Captioned]:
+    """Return a captioned chart of friction over velocity, with the key ``friction``; empty for mechanisms.
 
     The chart shows the friction model, and as points the torques of the first training recording minus the rigid-body
     model. If a torque row depends on several joints (such as power), only the friction model is shown.
@@ -123,9 +196,9 @@ def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
             if column.form.of_velocity and column.joint == j:
                 curve += value * _friction(column, grid)
                 cloud += value * _friction(column, v[:, j])
-        layers = [line(grid, curve, width=1.2, label="model")]
+        layers = [Line(grid, curve, width=1.2, label="model")]
         if by_joint:
-            layers.insert(0, line(v[::step, j], cloud[::step], ".", BEFORE, size=1.5, label="model + residual"))
+            layers.insert(0, Line(v[::step, j], cloud[::step], ".", BEFORE, size=1.5, label="model + residual"))
         # the unit stands where it changes, and at the start of a row of panels
         label = ""
         if j % columns == 0 or units[j] != units[j - 1]:
@@ -134,7 +207,9 @@ def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
         panels.append(Panel(layers, joint.name, f"velocity [{velocity_unit}]", label))
     title = f"friction over velocity on {case.name}"
     rows = -(-len(joints) // columns)
-    return {"friction": Chart(panels, 0.5 + 1.55 * rows, columns, title=title)}
+    chart = Chart(panels, 0.5 + 1.55 * rows, columns, title=title)
+    caption = "Friction over velocity: the model, and, light, what the model of the bodies leaves of the torques."
+    return {"friction": (chart, caption)}
 
 
 def _friction(column: DriveTerm, velocity: np.ndarray) -> np.ndarray:
@@ -177,13 +252,12 @@ def torques(
         if j < len(errors) and np.isfinite(errors[j]):
             row_title += f": {errors[j]:.3g} % unexplained"
         residual = measured[:, j] - predicted[:, j]
-        # thinned here already: a chart of an hour would be held, and pickled, in full
         lines = [
-            line(*thinned(t, measured[:, j]), "-", BEFORE, 2.4, label="measured"),
-            line(*thinned(t, predicted[:, j]), "-", AFTER, 0.7, label="predicted"),
-            line(*thinned(t, residual), "-", QUIET, 0.5, label="measured - predicted"),
+            Line(t, measured[:, j], "-", BEFORE, 2.4, label="measured"),
+            Line(t, predicted[:, j], "-", AFTER, 0.7, label="predicted"),
+            Line(t, residual, "-", QUIET, 0.5, label="measured - predicted"),
         ]
-        panels.append(Panel(lines, row_title, time_label, xlim=(t[0], t[-1])))
+        panels.append(Panel(lines, row_title, time_label, xlim=(t[0], t[-1]), switch=row))
     columns = 2 if len(rows) > MAX_HALF_PAGE_ROWS else 1
     height = 0.7 + 0.95 * -(-len(rows) // columns)
     return Chart(panels, height, columns, title=title, shared="x")
@@ -204,7 +278,7 @@ def autocorrelations(
     for row, white in zip(rows, whiteness):
         if white is None or not len(white.acf):
             continue
-        layers = [bars([0.0, *white.acf], upright=True, thick=0.4), level(white.bound), level(-white.bound)]
+        layers = [Bars([0.0, *white.acf], upright=True, thick=0.4), Level(white.bound), Level(-white.bound)]
         lags = 0.0, len(white.acf) + 1.0
         panels.append(Panel(layers, row, "lag [samples]", ylim=(-1.0, 1.0), xlim=lags, ticks=3))
     if not panels:
@@ -277,7 +351,7 @@ def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
     x = np.arange(len(chosen))
     percent = 100.0 / np.abs(calibrated)
     above = [
-        line(
+        Line(
             x - 0.15,
             percent * (nominal - calibrated),
             "o",
@@ -287,7 +361,7 @@ def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
             label="nominal (CAD) geometry",
             spread=2.0 * percent * sigma_nominal,
         ),
-        line(
+        Line(
             x + 0.15,
             percent * (calibrated - calibrated),
             "o",
@@ -299,7 +373,7 @@ def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
         ),
     ]
     colours = np.where(np.abs(difference) > SIGNIFICANT, MARK, QUIET).tolist()
-    below = [bars(difference, colours, upright=True)]
+    below = [Bars(difference, colours, upright=True)]
     names = [rows[k].name for k in chosen]
     panels = [
         Panel(above, y="from calibrated [%]", xnames=[""] * len(chosen), grid="y", symlog=1.0),
@@ -317,10 +391,10 @@ def _effects(rows: Sequence[GeometricEffect]) -> Chart:
     shifts = np.array([row.shift_sigma or 0.0 for row in rows])
     shifts = np.nan_to_num(shifts, posinf=0.0)
     matters = shifts > MIN_SHIFT
-    layers = [bars(shifts, np.where(matters, AFTER, QUIET).tolist()), level(MIN_SHIFT, upright=True)]
+    layers = [Bars(shifts, np.where(matters, AFTER, QUIET).tolist()), Level(MIN_SHIFT, upright=True)]
     labels = []
     for k, (row, shift) in enumerate(zip(rows, shifts)):
-        layers.append(text(row.parameter, shift, k, (3, 0), along="center"))
+        layers.append(Label(row.parameter, shift, k, (3, 0), along="center"))
         sigma = small(row.sigma or 0.0, row.unit, digits=2)
         labels.append(f"{row.element} ({sigma})")
     title = f"{int(matters.sum())} of {len(rows)} geometric errors matter"
@@ -342,8 +416,8 @@ def _error_charts(unseen: UnseenReport) -> dict[str, Captioned]:
     training_errors = np.nan_to_num(training.raw.joints)
     proof_errors = np.nan_to_num(proof.raw.joints)
     layers = [
-        bars(training_errors, BEFORE, shift=-0.19, thick=0.36, label="training"),
-        bars(proof_errors, AFTER, shift=0.19, thick=0.36, label="unseen"),
+        Bars(training_errors, BEFORE, shift=-0.19, thick=0.36, label="training"),
+        Bars(proof_errors, AFTER, shift=0.19, thick=0.36, label="unseen"),
     ]
     title = f"at most {max(proof_errors, default=0.0):.3g} % unexplained"
     panel = Panel(layers, x="torque unexplained [%]", ynames=unseen.rows, grid="x")
@@ -375,7 +449,7 @@ def _significance(parameters: Sequence[IdentifiedParameter]) -> Captioned:
     distance = distance[chosen]
     names = [parameters[k].name for k in chosen]
     colours = np.where(distance > SIGNIFICANT, AFTER, QUIET).tolist()
-    layers = [bars(distance, colours, upright=True, base=0.1), level(SIGNIFICANT)]
+    layers = [Bars(distance, colours, upright=True, base=0.1), Level(SIGNIFICANT)]
     limits = 0.1, 2.0 * float(distance.max(initial=SIGNIFICANT))
     panel = Panel(layers, title, label, "|value| / σ", ylim=limits, log="y", xnames=names)
     return Chart([panel], 2.3), "Distance of each parameter from zero, in its σ; grey: not significant."

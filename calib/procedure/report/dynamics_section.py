@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.errors import UsageError
+from calib.errors import UsageError, listing
 from calib.folders import read_estimate
 from calib.identification.friction.ripple import RippleWaves
 from calib.identification.loop import (
@@ -30,6 +30,7 @@ from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport
 from calib.procedure.dynamic_stage.metrics import metrics as record_of
+from calib.procedure.dynamic_stage.with_geometry import GeometryFromTorquesMetrics
 from calib.procedure.findings import as_notes, lines_of
 from calib.procedure.report import page
 from calib.records import read_rows
@@ -205,7 +206,7 @@ def outcome_section(outcome: IdentificationOutcome) -> page.Section:
 
 def report_section(
     report: DynamicReport,
-    figures: Mapping[str, page.Picture],
+    figures: Mapping[str, page.ChartPicture],
     exported: Sequence[str] = (),
     tolerance: float = 0.0,
     delivered: float | None = None,
@@ -226,15 +227,19 @@ def report_section(
     if tests:
         blocks.insert(0, _test_table(unseen, tests))
 
-    torque_figures = [name for name in figures if name.startswith("torque_")]
+    torque_figures = [name for name in figures if name.startswith(("torque_", "velocity_"))]
+    # each recording's velocities below its torques
+    torque_figures.sort(key=lambda name: int(name.partition("_")[2]))
     blocks.append(page.pictures("", figures, ("errors", "residuals")))
     blocks.append(page.pictures("Torques", figures, torque_figures))
+    blocks.append(page.pictures("Friction", figures, ("friction",)))
     blocks.append(page.pictures("Excitation", figures, ("excitation",)))
 
     if len(metrics.ladder) > 1:
         blocks.append(_friction_table(metrics))
     blocks.append(page.Text("The model", _model_sentences(metrics)))
     blocks.append(page.Text("What the motion identifies", _identifiability(report)))
+    blocks += _joint_blocks(metrics.geometry_from_torques)
     blocks += _geometry_blocks(metrics, report.effects)
     blocks += _comparison_blocks(report.geometries)
     blocks.append(page.pictures("", figures, ("geometries", "geometry_effects")))
@@ -591,6 +596,38 @@ def _coupling_sentences(metrics: ModelMetrics) -> list[str]:
     return lines
 
 
+def _joint_blocks(jointly: GeometryFromTorquesMetrics | None) -> list[page.Block]:
+    """Return what torques say about the geometry: the elements that they determine, before and after; empty: nothing.
+
+    Args:
+        jointly: geometry estimated together with the dynamics; None: not requested.
+    """
+    if jointly is None:
+        return []
+    determined = [change for change in jointly.elements if change.identified]
+    resting = [change.element for change in jointly.elements if not change.identified]
+    state = "the robot has the geometry from poses and torques" if jointly.delivered else "the geometry is unchanged"
+    lines = [
+        f"{state}: squared error of held-out torques {jointly.held_out:.4g} times that of the two stages",
+        f"torques determine {jointly.combinations} combinations of {len(jointly.elements)} elements; offsets of the "
+        "first and the last joint are not identifiable",
+    ]
+    if resting:
+        lines.append(f"determined by poses or their prior rather than by torques: {listing(resting, 8)}")
+    rows = []
+    for change in determined:
+        before = f"{1e3 * change.sigma_before:.3g}"
+        after = f"{1e3 * change.sigma_after:.3g}"
+        shift = f"{1e3 * change.change:+.3g}"
+        sigmas = f"{change.change / change.sigma_after:+.2g}"
+        rows.append([change.element, f"m{change.unit}", shift, before, after, sigmas])
+    blocks: list[page.Block] = [page.Text("Geometry from torques", lines)]
+    if rows:
+        header = ("element", "unit", "change", "σ before", "σ after", "change / σ after")
+        blocks.append(page.ReportTable("Elements that torques determine", header, rows, numbers=[2, 3, 4, 5]))
+    return blocks
+
+
 def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.GeometricEffect]) -> list[page.Block]:
     """Return the summary of how geometric errors affect the dynamic parameters, and a table of the largest effects."""
     geometry = metrics.geometry
@@ -598,7 +635,9 @@ def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.Ge
         return []
     lines = [geometry.summary]
     tilt = geometry.moved_by_1_mrad_of_tilt
-    if geometry.propagated and tilt.sigmas > geometry_tables.MIN_SHIFT:
+    jointly = metrics.geometry_from_torques
+    includes_tilt = jointly is not None and jointly.delivered
+    if geometry.propagated and not includes_tilt and tilt.sigmas > geometry_tables.MIN_SHIFT:
         lines.append(
             f"a tilt of the base is not included: 1 mrad against gravity would change {tilt.parameter} by "
             f"{tilt.sigmas:.2g} of its sigma of torque noise"

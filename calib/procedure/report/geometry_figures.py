@@ -4,14 +4,27 @@ Errors of the nominal arm are light and those of the calibrated arm dark, so tha
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from calib.geometry.model_choice.ladder import ModelStep
 from calib.procedure.kinematic_stage.validation import ARM
-from calib.procedure.report.charts import Captioned, Chart, Panel, bars, dots, heat, histogram, level, line, text
-from calib.procedure.report.fit_report import FittedParameter, Report
-from calib.procedure.report.style import AFTER, BEFORE, BROWN, HALF_WIDTH, INK, MARK, PAGE_WIDTH, number
+from calib.procedure.report.figures.charts import (
+    Bars,
+    Captioned,
+    Chart,
+    Cloud,
+    Dots,
+    Heat,
+    Histogram,
+    Label,
+    Level,
+    Line,
+    Panel,
+)
+from calib.procedure.report.figures.style import AFTER, BEFORE, BROWN, HALF_WIDTH, INK, MARK, PAGE_WIDTH, number
+from calib.procedure.report.fit_report import FittedParameter, Report, RowErrors
 from calib.units import ERRORS
 
 # (effort, sigma) pairs
@@ -52,13 +65,13 @@ def error_histogram(
     count_after, _ = np.histogram(after, edges)
 
     layers = [
-        histogram(count_before, edges, BEFORE),
-        histogram(count_after, edges, AFTER),
-        level(rms_before, BROWN, upright=True, words="nominal"),
-        level(rms_after, AFTER, upright=True, words=arm, height=0.9),
+        Histogram(count_before, edges, BEFORE),
+        Histogram(count_after, edges, AFTER),
+        Level(rms_before, BROWN, upright=True, text="nominal"),
+        Level(rms_after, AFTER, upright=True, text=arm, height=0.9),
     ]
     if noise:
-        layers.append(level(factor * noise, INK, ":", upright=True, words="instrument", height=0.82))
+        layers.append(Level(factor * noise, INK, ":", upright=True, text="instrument", height=0.82))
     panel = Panel(
         layers,
         f"{rms_before:.3g} {unit} rms before, {rms_after:.3g} {unit} after",
@@ -102,11 +115,12 @@ def residuals_by_joint(
         if prismatic[j]:
             x, joint_unit = q[:, j], "m"
         clouds = [
-            line(x, factor * before, ".", BEFORE, size=4.5, label="nominal"),
-            line(x, factor * after, ".", AFTER, size=4.5, label=arm),
+            Line(x, factor * before, ".", BEFORE, size=4.5, label="nominal"),
+            Line(x, factor * after, ".", AFTER, size=4.5, label=arm),
         ]
         label = f"{name} [{joint_unit}]"
-        panels.append(Panel(clouds, x=label, y=f"error [{unit}]", ylim=limits, log="y", grid="y", ticks=5))
+        y_label = f"error [{unit}]"
+        panels.append(Panel(clouds, x=label, y=y_label, ylim=limits, log="y", grid="y", ticks=5, switch=name))
 
     n = q.shape[1]
     columns = 4
@@ -152,7 +166,8 @@ def error_map(
         sizes_mm = 1e3 * np.asarray(values)
         panels.append(_map_panel(points, sizes_mm, colour_limits_mm, 1, from_above))
         panels.append(_map_panel(points, sizes_mm, colour_limits_mm, 2, from_side))
-    return Chart(panels, 3.0 * len(maps), 2)
+    cloud = Cloud(points, 1e3 * np.asarray(sizes), *colour_limits_mm, "mm")
+    return Chart(panels, 3.0 * len(maps), 2, cloud=cloud)
 
 
 def _map_panel(
@@ -168,9 +183,9 @@ def _map_panel(
         title: title of the map.
     """
     layers = [
-        dots(points[:, 0], points[:, axis], sizes_mm, *limits_mm, "[mm]" if axis == 2 else ""),
-        line([0.0], [0.0], "+", INK, size=9.0),
-        text("base", 0.0, 0.0, (-5, 4), across="right"),
+        Dots(points[:, 0], points[:, axis], sizes_mm, *limits_mm, "[mm]" if axis == 2 else ""),
+        Line([0.0], [0.0], "+", INK, size=9.0),
+        Label("base", 0.0, 0.0, (-5, 4), across="right"),
     ]
     return Panel(layers, title, "x [m]", f"{'xyz'[axis]} [m]", grid="both", equal=True, ticks=6)
 
@@ -196,8 +211,8 @@ def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) ->
     width, height = size
     extent = 0, width, height, 0
     covered = count > 0
-    counts = heat(np.where(covered, count.astype(float), np.nan), "", extent)
-    errors = heat(np.where(covered, rms, np.nan), "[px]", extent)
+    counts = Heat(np.where(covered, count.astype(float), np.nan), "", extent)
+    errors = Heat(np.where(covered, rms, np.nan), "[px]", extent)
     counts_title = f"corners seen, in {np.mean(covered):.0%} of the image"
     panels = [
         Panel([counts], counts_title, "u [px]", "v [px]", ticks=5),
@@ -229,7 +244,7 @@ def parameter_changes(rows: Sequence[FittedParameter], most: int = 48, of: str =
         colours = np.where(clear, AFTER, PALE).tolist()
         title = f"{int(clear.sum())} of {len(chosen)} {quantity} clearly changed"
         labels = [parameters[k].name for k in chosen]
-        layer = bars(value, colours, spread=two_sigmas)
+        layer = Bars(value, colours, spread=two_sigmas)
         panels.append(Panel([layer], title, f"{of} [{unit}], bars ±2σ", ynames=labels, grid="x"))
         longest = max(longest, len(chosen))
     return Chart(panels, 0.65 + 0.155 * longest, max(1, len(panels)))
@@ -248,12 +263,12 @@ def singular_values(values: np.ndarray, rank: int) -> Chart:
     # zeros have no place on a logarithmic axis
     sizes = np.maximum(values, max(values[0] * 1e-17, 1e-17))
     number_of = np.arange(1, len(values) + 1)
-    layers = [line(number_of[:rank], sizes[:rank], "o"), line(number_of[rank:], sizes[rank:], "o", MARK, hollow=True)]
+    layers = [Line(number_of[:rank], sizes[:rank], "o"), Line(number_of[rank:], sizes[rank:], "o", MARK, hollow=True)]
     if 0 < rank < len(values):
         last, first = sizes[rank - 1], sizes[rank]
         middle = float(np.sqrt(last * first))
         gap = f"gap {number(last / first)}"
-        layers.append(text(gap, rank + 0.5, middle, (-6, 0), MARK, across="right", along="center"))
+        layers.append(Label(gap, rank + 0.5, middle, (-6, 0), MARK, across="right", along="center"))
     title = f"{rank} of {len(values)} parameters are identifiable"
     limits = 0.3 * float(sizes.min()), 3.0 * float(sizes.max())
     panel = Panel(layers, title, "number", "singular value", ylim=limits, log="y", grid="y")
@@ -273,15 +288,15 @@ def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
     kept = np.flatnonzero([not step.note for step in steps])
     rejected, chosen = np.setdiff1d(x, kept), kept[-1:]
     layers = [
-        line(x[kept], errors[kept], "o-", size=5.0),
-        line(x[rejected], errors[rejected], "o", size=5.0, hollow=True),
-        line(x[chosen], errors[chosen], "o", size=8.0),
+        Line(x[kept], errors[kept], "o-", size=5.0),
+        Line(x[rejected], errors[rejected], "o", size=5.0, hollow=True),
+        Line(x[chosen], errors[chosen], "o", size=8.0),
     ]
     for k, error in enumerate(errors):
-        layers.append(text(f"{error:.3g}", k, error, (0, 8), across="center"))
+        layers.append(Label(f"{error:.3g}", k, error, (0, 8), across="center"))
     lowest = errors.min()
     if noise:
-        layers.append(level(1e3 * noise, INK, ":", words="instrument"))
+        layers.append(Level(1e3 * noise, INK, ":", text="instrument"))
         lowest = min(lowest, 1e3 * noise)
 
     title = ""
@@ -310,7 +325,7 @@ def correlation_map(names: Sequence[str], correlation: np.ndarray) -> Chart:
         correlation: the matrix.
     """
     off = np.abs(correlation - np.diag(np.diag(correlation)))
-    matrix = heat(correlation, limits=(-1.0, 1.0), colours="PuOr", written=len(names) <= 10)
+    matrix = Heat(correlation, limits=(-1.0, 1.0), colours="PuOr", written=len(names) <= 10)
     # long names widen the figure, and never overlap
     side = max(HALF_WIDTH, 0.13 * len(names) + 0.05 * max(map(len, names)) + 1.0)
     panel = Panel([matrix], f"correlations up to {off.max():.2f}", xnames=names, ynames=names)
@@ -329,9 +344,9 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
     with_plan = np.vstack([points, [own]])
     low, high = with_plan.min(axis=0), with_plan.max(axis=0)
     layers = [
-        line(points[:, 0], points[:, 1], "o-", BEFORE),
-        line([own[0]], [own[1]], "o", MARK, size=5.5),
-        text("this plan", *own),
+        Line(points[:, 0], points[:, 1], "o-", BEFORE),
+        Line([own[0]], [own[1]], "o", MARK, size=5.5),
+        Label("this plan", *own),
     ]
     panel = Panel(
         layers,
@@ -344,6 +359,48 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
         grid="both",
     )
     return Chart([panel], 2.4, width=HALF_WIDTH)
+
+
+def _point_values(report: Report, errors: RowErrors) -> dict[str, np.ndarray]:
+    """Return what a page shows of each row under the pointer: row number, expected error [mm], and joint values.
+
+    Args:
+        report: results of the fit.
+        errors: errors of the rows.
+    """
+    values = {"row": np.array(errors.rows, dtype=float)}
+    if errors.expected:
+        values["95 % expected within [mm]"] = 1e3 * np.array(errors.expected)
+    joint_values = np.array(errors.q)
+    for j, name in enumerate(report.joints):
+        if report.prismatic[j]:
+            values[f"{name} [m]"] = joint_values[:, j]
+        else:
+            values[f"{name} [deg]"] = np.rad2deg(joint_values[:, j])
+    return values
+
+
+def errors_by_row(report: Report, nature: str) -> Chart:
+    """Return a chart of the delivered arm's errors over the rows of the files, a panel per set of rows.
+
+    Args:
+        report: results of the fit.
+        nature: ``position``, ``orientation`` or ``distance``.
+    """
+    factor, unit = ERRORS[nature]
+    deliverable = report.metrics.deliverable
+    panels = []
+    for errors in report.sets:
+        delivered = errors.judged(deliverable)
+        if nature not in delivered or len(errors.rows) != len(delivered[nature]):
+            continue
+        sizes = factor * np.array(delivered[nature])
+        title = "fitted rows"
+        if errors.unseen:
+            title = f"unseen rows of {errors.name}"
+        points = Line(np.array(errors.rows), sizes, ".", AFTER, size=4.5)
+        panels.append(Panel([points], title, "row", f"error [{unit}]", grid="y"))
+    return Chart(panels or [Panel([])], 0.5 + 1.2 * max(1, len(panels)))
 
 
 def captioned(report: Report) -> dict[str, Captioned]:
@@ -379,6 +436,8 @@ def captioned(report: Report) -> dict[str, Captioned]:
         nature = "position" if "position" in delivered else "distance"
         before, after = np.array(proof.nominal[nature]), np.array(delivered[nature])
         chart = residuals_by_joint(np.array(proof.q), before, after, report.joints, report.prismatic, nature, arm)
+        points = _point_values(report, proof)
+        chart = replace(chart, points=points)
         result["joints"] = chart, f"Errors against each joint, {label}: a trend shows an unmodelled effect."
 
         # intervals hold the joint corrections' errors: they say nothing of the robot without them
@@ -387,7 +446,12 @@ def captioned(report: Report) -> dict[str, Captioned]:
         quantity = report.metrics.fit.words(nature)
         caption = f"Remaining {quantity} error over the workspace, {label}"
         caption += "; below: radius expected to contain 95 % of the errors." if expected else "."
-        result["map"] = chart, caption
+        result["map"] = replace(chart, points=points), caption
+        chart = errors_by_row(report, nature)
+        result["rows"] = (
+            chart,
+            f"{quantity.capitalize()} errors by row of the file: a step shows a change of the set-up.",
+        )
 
     for k, images in enumerate(report.images, 1):
         name = "coverage" if k == 1 else f"coverage_{k}"

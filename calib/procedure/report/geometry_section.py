@@ -92,7 +92,7 @@ def outcome_section(metrics: FitMetrics) -> page.Section:
     return page.Section("Geometry", blocks, metrics.verdict, metrics.reason)
 
 
-def report_section(report: Report, figures: Mapping[str, page.Picture]) -> page.Section:
+def report_section(report: Report, figures: Mapping[str, page.ChartPicture]) -> page.Section:
     """Return the report section on the geometry: errors, tried models, parameters, identifiability, figures, outliers.
 
     Args:
@@ -102,7 +102,7 @@ def report_section(report: Report, figures: Mapping[str, page.Picture]) -> page.
     metrics = report.metrics
     blocks: list[page.Block] = [error_table(_sets(metrics), metrics.deliverable), *iso9283_tables(metrics)]
     blocks.append(page.pictures("Before and after", figures, ("position", "orientation", "distance")))
-    blocks.append(page.pictures("What remains", figures, ("joints", "map")))
+    blocks.append(page.pictures("What remains", figures, ("joints", "map", "rows")))
     coverage = [name for name in figures if name.startswith("coverage")]
     blocks.append(page.pictures("Image coverage", figures, coverage))
     if any(step.cross_validated_mm is not None for step in metrics.ladder):

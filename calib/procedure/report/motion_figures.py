@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.procedure.report.charts import Chart, Panel, level, line, save_all, text
+from calib.procedure.report.figures.charts import Captioned, Chart, Label, Layer, Level, Line, Panel
+from calib.procedure.report.figures.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
 from calib.procedure.report.geometry_figures import outlook_figure
-from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, QUIET
 from calib.robot.chain import Chain, Joint
 from calib.robot.kinematics import sweep
 from calib.trajectories.basis import SampledMotion
@@ -48,12 +47,13 @@ def motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[
         name = joint.name.replace("_", "_\n") if len(joint.name) > LONG_NAME else joint.name
         for k, (values, lower, upper) in enumerate(series):
             quantity, unit = TITLES[k], units[k]
-            layers = [line(times, values[:, j])]
+            layers: list[Layer] = [Line(times, values[:, j])]
             bounds = [float(bound) for bound in (lower[j], upper[j]) if np.isfinite(bound)]
-            layers += map(level, bounds)
+            layers += map(Level, bounds)
             panel_title = f"{quantity} [{unit}]" if j == 0 else ""
             label = name if k == 0 else ""
-            panels.append(Panel(layers, panel_title, "time [s]", label, xlim=(times[0], times[-1]), ticks=4))
+            limits = times[0], times[-1]
+            panels.append(Panel(layers, panel_title, "time [s]", label, limits, ticks=4, switch=joint.name))
             if len(bounds) == 2 and upper[j] > lower[j]:
                 gap = min(upper[j] - values[:, j].max(), values[:, j].min() - lower[j]) / (upper[j] - lower[j])
                 if gap < smallest_gap:
@@ -88,11 +88,11 @@ def _path_figure(designed: Designed) -> Chart:
     panels = []
     for axis, title in ((1, "the tool's path from above"), (2, "from the side")):
         layers = [
-            line(position[0], position[axis], form="-"),
-            line(position[0, :1], position[axis, :1], "o", MARK),
-            text("start", position[0, 0], position[axis, 0]),
-            line([0.0], [0.0], "+", QUIET),
-            text("base", 0.0, 0.0),
+            Line(position[0], position[axis], form="-"),
+            Line(position[0, :1], position[axis, :1], "o", MARK),
+            Label("start", position[0, 0], position[axis, 0]),
+            Line([0.0], [0.0], "+", QUIET),
+            Label("base", 0.0, 0.0),
         ]
         panels.append(Panel(layers, title, "x [m]", f"{'xyz'[axis]} [m]", grid="both", equal=True))
     return Chart(panels, 3.2, 2)
@@ -108,7 +108,7 @@ def _history_figure(designed: Designed) -> Chart:
     """
     history = np.asarray(designed.found.history, dtype=float)
     title = f"{history[0]:.4g} at first, {history[-1]:.4g} at last" if len(history) else ""
-    curve = line(np.arange(len(history)), history)
+    curve = Line(np.arange(len(history)), history)
     return Chart([Panel([curve], title, "improving feasible motions", "objective")], 2.2, width=HALF_WIDTH)
 
 
@@ -123,10 +123,10 @@ def front_figure(front: Front) -> Chart:
     efficient, dominated = order[front.best[order]], order[~front.best[order]]
     designed = front.designed
     layers = [
-        line(torque[efficient], condition[efficient], "o-", size=4.0),
-        line(torque[dominated], condition[dominated], "o", BEFORE, hollow=True),
-        line(torque[[designed]], condition[[designed]], "s", MARK, size=5.5),
-        text("designed", torque[designed], condition[designed]),
+        Line(torque[efficient], condition[efficient], "o-", size=4.0),
+        Line(torque[dominated], condition[dominated], "o", BEFORE, hollow=True),
+        Line(torque[[designed]], condition[[designed]], "s", MARK, size=5.5),
+        Label("designed", torque[designed], condition[designed]),
     ]
     count = len(np.unique(front.values[efficient], axis=0))
     label = f"mean {front.names[1].replace('slack ', '')} / limit"
@@ -139,34 +139,33 @@ def _dense_motion(designed: Designed) -> SampledMotion:
     return dense_motion(designed.family, designed.found.x, times, designed.found.factor)
 
 
-def design_figures(designed: Designed) -> dict[str, Chart]:
+def design_figures(designed: Designed) -> dict[str, Captioned]:
     """Return the figures of a designed motion by name: motion, history, and, if available, path, front and outlook."""
-    figures = {"motion": _motion_figure(designed), "history": _history_figure(designed)}
+    motion, history = _motion_figure(designed), _history_figure(designed)
+    figures = {
+        "motion": (motion, "One period of the motion; dashed: limits."),
+        "history": (history, "The objective over the search, from the start point that led to the best motion."),
+    }
     if isinstance(designed.inputs.chain, Chain):
-        figures["path"] = _path_figure(designed)
+        figures["path"] = _path_figure(designed), "The tool's path."
     if designed.front is not None and len(designed.front.values):
-        figures["front"] = front_figure(designed.front)
+        caption = "Trade-off between condition number and mean torque; light points are dominated by others."
+        figures["front"] = front_figure(designed.front), caption
     outlook = designed.outlook
     if outlook is not None and outlook.by_period:
         curve = [(period.seconds, 100 * period.torque_sigma_share) for period in outlook.by_period]
         plan = outlook.own.seconds, 100 * outlook.own.torque_sigma_share
-        figures["outlook"] = outlook_figure(curve, plan, "motion [s]", "σ of torques [% of limits]")
+        chart = outlook_figure(curve, plan, "motion [s]", "σ of torques [% of limits]")
+        figures["outlook"] = chart, "What shorter and longer motions are predicted to identify."
     return figures
 
 
-def plan_figures(planned: Planned) -> dict[str, Chart]:
+def plan_figures(planned: Planned) -> dict[str, Captioned]:
     """Return the figures of a planned motion by name: joint motion and speed profile."""
-    return {"motion": _plan_figure(planned), "profile": _profile_figure(planned)}
-
-
-def write_design(designed: Designed, folder: Path) -> None:
-    """Write the figures of a designed motion as PNG into a folder."""
-    save_all(design_figures(designed), folder)
-
-
-def write_plan(planned: Planned, folder: Path) -> None:
-    """Write the figures of a planned motion as PNG into a folder."""
-    save_all(plan_figures(planned), folder)
+    return {
+        "motion": (_plan_figure(planned), "The motion; dashed: limits."),
+        "profile": (_profile_figure(planned), "Speed along the path, and the used share of each limit."),
+    }
 
 
 def _plan_figure(planned: Planned) -> Chart:
@@ -191,15 +190,15 @@ def _profile_figure(planned: Planned) -> Chart:
     start = 0.0
     for timing in planned.timings:
         times = start + timing.profile.times
-        speeds.append(line(times, np.sqrt(timing.profile.x)))
+        speeds.append(Line(times, np.sqrt(timing.profile.x)))
         per_interval = len(timing.sampled.s) // (len(times) - 1)
         instants = np.repeat(times[:-1], per_interval)
         for (name, share), colour in zip(timing.used.items(), (BEFORE, AFTER, QUIET)):
             # the legend names the curves of the first path only
             label = name if start == 0.0 else ""
-            shares.append(line(instants, share.max(axis=1), colour=colour, label=label))
+            shares.append(Line(instants, share.max(axis=1), colour=colour, label=label))
         start = float(times[-1])
-    shares.append(level(1.0))
+    shares.append(Level(1.0))
     panels = [
         Panel(shares, x="time [s]", y="share of the limit", xlim=(0.0, start), ylim=(0.0, 1.05)),
         Panel(speeds, x="time [s]", y="speed along the path", xlim=(0.0, start)),

@@ -5,7 +5,7 @@ Report and certificate show the same values as HTML and PDF; this module does no
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from rich import box
 from rich.console import RenderableType
@@ -13,11 +13,16 @@ from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
 from calib.procedure.findings import LEVELS, Note
+from calib.procedure.report.figures import figure_files
+from calib.procedure.report.figures.charts import Captioned, Chart
+from calib.procedure.report.figures.style import HALF_WIDTH
 
 # name, what it is, bytes, SHA-256
 FileRow = tuple[str, str, str, str]
 # RSD [%] above which no value is printed: the parameter is unknown
 MAX_PRINTED_RSD = 999.0
+# letters of what a screen reader says of a figure
+MAX_SUMMARY_LETTERS = 400
 COLOURS: dict[str, str] = dict(zip(LEVELS, ("green", "green", "yellow", "yellow", "red")))
 
 
@@ -159,19 +164,60 @@ class Text:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure as PNG or SVG.
+    """A drawn figure, as PNG or SVG.
 
     Attributes:
         image: content of the PNG or SVG file.
         caption: caption of the figure.
         wide: whether the figure uses the full width of the page.
-        chart: the chart from which the figure was drawn; None: unknown.
     """
 
     image: bytes
     caption: str
     wide: bool = False
-    chart: Any = None
+
+
+@dataclass(frozen=True)
+class ChartPicture:
+    """A figure that the page draws from its chart.
+
+    Attributes:
+        chart: the chart.
+        caption: caption of the figure.
+        name: name of the figure; on a page no two figures have the same.
+    """
+
+    chart: Chart
+    caption: str
+    name: str = "figure"
+
+    @property
+    def wide(self) -> bool:
+        """Whether the figure uses the full width of the page."""
+        return self.chart.width > HALF_WIDTH
+
+    @property
+    def image(self) -> bytes:
+        """The figure as PNG, drawn by matplotlib."""
+        return figure_files.drawn(self.chart, "png")
+
+    def vector(self) -> Picture:
+        """Return the figure as a vector picture (SVG) for print."""
+        return Picture(figure_files.drawn(self.chart, "svg"), self.caption, self.wide)
+
+    @property
+    def summary(self) -> str:
+        """What the figure shows, for those who do not see it: its titles, and the quantities along its axes."""
+        texts = [self.caption, self.chart.title]
+        for panel in self.chart.panels:
+            texts += [panel.title, f"{panel.y or panel.title} over {panel.x}" * bool(panel.x)]
+        sentences = dict.fromkeys(text.rstrip(".") for text in texts if text)
+        return shortened("; ".join(sentences), MAX_SUMMARY_LETTERS)
+
+
+def chart_pictures(charts: Mapping[str, Captioned]) -> dict[str, ChartPicture]:
+    """Return charts with captions as figures of a page, by name."""
+    return {name: ChartPicture(chart, caption, name) for name, (chart, caption) in charts.items()}
 
 
 @dataclass(frozen=True)
@@ -179,14 +225,14 @@ class Pictures:
     """Figures that are shown side by side."""
 
     title: str
-    pictures: Sequence[Picture]
+    pictures: Sequence[Picture | ChartPicture]
     kind: str = "pictures"
 
     def __len__(self) -> int:
         return len(self.pictures)
 
 
-def pictures(title: str, figures: Mapping[str, Picture], names: Iterable[str]) -> Pictures:
+def pictures(title: str, figures: Mapping[str, ChartPicture], names: Iterable[str]) -> Pictures:
     """Return the figures with the given names, to be shown side by side; absent figures are left out.
 
     Args:

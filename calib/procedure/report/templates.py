@@ -3,16 +3,31 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime
 from functools import cache
 from importlib import metadata, resources
 from typing import TYPE_CHECKING
 
+from calib.procedure.report.figures import figure_data
+from calib.procedure.report.figures.charts import Captioned
+from calib.procedure.report.page import ChartPicture, Pictures, Section
+
 if TYPE_CHECKING:
     import jinja2
 
 HERE = "calib.procedure.report"  # where the templates of blocks and the style are
+BROWSER = "calib.procedure.report.figures.browser"
+# what draws figures in the browser: uPlot (see vendored.toml) and what uses it
+BROWSER_FILES = {
+    "library": "uPlot.iife.min.js",
+    "library_style": "uPlot.min.css",
+    "style": "figures.css",
+    "script": "figures.js",
+}
 
 
 @cache
@@ -50,6 +65,54 @@ def filled(package: str, file: str, **values: object) -> str:
         values: values of the template's variables.
     """
     return _template(package, file).render(**values, style=read(HERE, "style.css"))
+
+
+def interactive(sections: Sequence[Section]) -> tuple[list[Section], Mapping[str, str]]:
+    """Return the sections of a page with numbered figures, and what draws these in the browser.
+
+    The latter has the keys of `BROWSER_FILES` and ``data``; it is empty without figures.
+
+    Args:
+        sections: sections of the page.
+    """
+    charts: dict[str, Captioned] = {}
+    numbered = []
+    for section in sections:
+        blocks = [_numbered(block, charts) if isinstance(block, Pictures) else block for block in section.blocks]
+        numbered.append(replace(section, blocks=blocks))
+    if not charts:
+        return numbered, {}
+    browser = {key: read(BROWSER, name) for key, name in BROWSER_FILES.items()}
+    return numbered, browser | {"data": figure_data.page_text(charts)}
+
+
+@cache
+def script_sources() -> str:
+    """Return the scripts of a page as sources of a Content-Security-Policy: their SHA-256, so that no others run."""
+    sources = []
+    for key in ("library", "script"):
+        digest = hashlib.sha256(read(BROWSER, BROWSER_FILES[key]).encode()).digest()
+        sources.append(f"'sha256-{base64.b64encode(digest).decode()}'")
+    return " ".join(sources)
+
+
+def _numbered(block: Pictures, charts: dict[str, Captioned]) -> Pictures:
+    """Return a block whose figures have names that no figure in `charts` has, and add them there.
+
+    Args:
+        block: the figures.
+        charts: charts with captions of the page so far, by name.
+    """
+    pictures = []
+    for picture in block.pictures:
+        if isinstance(picture, ChartPicture):
+            name, number = picture.name, 2
+            while name in charts:
+                name, number = f"{picture.name}_{number}", number + 1
+            charts[name] = picture.chart, picture.caption
+            picture = replace(picture, name=name)
+        pictures.append(picture)
+    return replace(block, pictures=pictures)
 
 
 @cache

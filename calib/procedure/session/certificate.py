@@ -18,8 +18,9 @@ from calib.procedure.report import fit_report
 from calib.procedure.report.certificate import dynamics_pages, geometry, rendering
 from calib.procedure.report.certificate.record import EDITED, Certificate, Entry, Page, StageRecord, records
 from calib.procedure.report.certificate.results import measured_range, tolerance
+from calib.procedure.report.figures import figure_data
 from calib.procedure.report.fit_report import RowErrors, file_row, unseen_role
-from calib.procedure.report.page import FileRow, Text
+from calib.procedure.report.page import FileRow, Text, chart_pictures
 from calib.procedure.report.templates import versions
 from calib.procedure.session.folder import (
     CHECKED,
@@ -96,10 +97,9 @@ def _geometry(session: Session, report: fit_report.Report) -> StageRecord:
     """Return the content of report and certificate on the geometry; with figures if the session draws figures."""
     figures = {}
     if session.plots:
-        from calib.procedure.report.charts import pictures
         from calib.procedure.report.geometry_figures import captioned
 
-        figures = pictures(captioned(report))
+        figures = chart_pictures(captioned(report))
     return _with_arrival(geometry.stage(report, figures), _arrival_notes(session, "3-measured", "validate"))
 
 
@@ -113,13 +113,16 @@ def _dynamics(session: Session) -> StageRecord:
     report = dynamics_section.read(session.identification.path)
     figures = {}
     if session.plots:
-        from calib.procedure.report.charts import picture, pictures
         from calib.procedure.report.dynamics_figures import captioned
 
-        figures = pictures(captioned(report, session.identification.path))
+        charts = captioned(report, session.identification.path)
+        # friction, and the torques with all samples
+        for path in (session.identification.path, session.identification.unseen.path):
+            charts |= figure_data.of_folder(path)
         training = session.path("6-excitation") / "training"
         if session.settings.dynamics.plan and (training / coefficients.NAME).exists():
-            figures["excitation"] = picture(*dynamics_pages.trained_on(training, chain_of(session).joints))
+            charts["excitation"] = dynamics_pages.trained_on(training, chain_of(session).joints)
+        figures = chart_pictures(charts)
     allowed = session.settings.dynamics.tolerance_percent
     predicted = prediction(session.path(session.export))
     delivered = None

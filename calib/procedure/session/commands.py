@@ -14,7 +14,7 @@ from rich.text import Text
 
 from calib.arguments import checked
 from calib.config import parse
-from calib.config_types import ParsedTable
+from calib.config_types import ParsedTable, Plots
 from calib.controllers.axes import check_controller
 from calib.data.csv_table import read_table
 from calib.data.poses import IMAGES
@@ -400,7 +400,7 @@ def _limits(
 
 
 def go_on(
-    folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True, pick: int = 0
+    folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: Plots = True, pick: int = 0
 ) -> _Stop:
     """Run all steps whose inputs exist, and return the step that waits for input, with instructions.
 

@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial import KDTree
-from scipy.stats import f, norm
+from scipy.special import fdtrc, ndtri
 
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.measurements import PoseMeasurements, Positions
@@ -276,8 +276,8 @@ def _trend(what: str, unit: str, x: np.ndarray, off: np.ndarray, pose: np.ndarra
         return None
     slope = centred @ moved / spread
     left = max(float(np.sqrt(np.sum((moved - np.outer(centred, slope)) ** 2) / dof)), sigma, 1e-12)
-    chance = f.sf(spread * float(slope @ slope) / (3.0 * left**2), 3, dof)
-    sigmas = float(norm.isf(max(float(chance), 1e-300) / 2.0))
+    chance = fdtrc(3, dof, spread * float(slope @ slope) / (3.0 * left**2))
+    sigmas = -float(ndtri(max(float(chance), 1e-300) / 2.0))
     return Trend(what, unit, x[again], moved, poses, float(np.ptp(x)), slope, left / np.sqrt(spread), sigmas)
 
 

@@ -68,7 +68,13 @@ def options_of(session: Session) -> IdentifyOptions:
     settings = options.settings
     if not section.options:
         rows = torque_rows(section.torques)
-        settings = replace(settings, torque_rows=rows, friction=section.friction, method=section.method)
+        settings = replace(
+            settings,
+            torque_rows=rows,
+            friction=section.friction,
+            method=section.method,
+            with_geometry=section.with_geometry,
+        )
     payloads = dict(section.payloads) | dict(settings.payloads)
     settings = replace(settings, payloads=payloads, seed=session.settings.seed)
     by_file = dict(options.files)
@@ -207,7 +213,9 @@ def _design(
         raise KeyboardInterrupt
     draw = None
     if session.plots and name == "training":
-        from calib.procedure.report.motion_figures import write_design as draw
+        from calib.procedure.report.outputs import write_design
+
+        draw = partial(write_design, plots=session.plots)
     motion_folder.write_design(designed, session.path("6-excitation") / name, draw)
 
     condition, columns = designed.condition, len(designed.inputs.model.exact.names)
@@ -502,13 +510,15 @@ def identify(session: Session, say: Say) -> list[str | Note]:
 
 def predict(session: Session, say: Say) -> list[str | Note]:
     """Validate a session's identified model on held-out motion, write the verdict, and return notes for the user."""
+    from calib.procedure.report.outputs import write_recordings
+
     training, held_out = _divided(session)
     unseen = session.brought("unseen")
     notes = []
     cuts = {}
     for path in unseen:
         cuts[path.name], recording_notes = check_recording(session, path, "validation")
-        notes += recording_notes
+        notes += recording_notes  # ty: ignore[unsupported-operator]
     say("predicting unseen motion")
     gathered = _gathered(session, training, [*held_out, *_cut_paths(unseen, cuts)], say)
     folder = session.identification
@@ -517,6 +527,8 @@ def predict(session: Session, say: Say) -> list[str | Note]:
     folder.unseen.write(gathered, assessment)
     assessment = replace(assessment, verdict=_as_delivered(session, gathered, assessment))
     folder.unseen.write(gathered, assessment)
+    if session.plots:
+        write_recordings(gathered, assessment, folder.unseen)
     earlier = folder.metrics().warnings
     new_warnings = [warning for warning in assessment.warnings if warning not in earlier]
     carried = {label for case in gathered.unseen for label in case.carried}

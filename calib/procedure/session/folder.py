@@ -3,7 +3,7 @@
 session.toml     what is to be calibrated, with what, how; written by `calib new`, edited by people
 1-robot/         the robot's description, copied, so that the folder can move
 2-poses/         poses.csv to measure and fit, in the order of least time, poses_run.csv the ways between them, and
-                 validation_poses.csv to measure and never fit; poses_prediction.json and predicted.png what they are
+                 validation_poses.csv to measure and never fit; poses_prediction.json and predicted.html what they are
                  predicted to identify
 3-measured/      what people bring: measured.csv (any name), files whose name starts with validation, and drift.csv,
                  some of the poses measured once more at the end (never fitted); columns: `calib formats measurements`.
@@ -38,7 +38,7 @@ from pathlib import Path
 
 from calib import files
 from calib.config import parse
-from calib.config_types import Text
+from calib.config_types import Plots, Text
 from calib.data.poses import CORNERS, is_image_folder
 from calib.errors import Busy, SessionError, command_line, refused_as
 from calib.folders import PARAMETERS, STATE, write_staged
@@ -52,7 +52,6 @@ from calib.result_kinds import refusal
 from calib.robot import tables
 from calib.robot.calibrated import ROBOT
 from calib.robot.formats.urdf_tree import converter, is_urdf, text
-from calib.workers.extras import available
 
 FOLDERS = ("1-robot", "2-poses", "3-measured", "4-fit", "5-validation")
 DYNAMIC = ("6-excitation", "7-recorded", "8-dynamics")
@@ -67,7 +66,7 @@ AS_GIVEN = "1-robot/as_given"
 CHECKED, VERDICT = "checked.txt", "verdict.json"
 SUMMARY, SELECTION, CUTS = "1-robot/summary.txt", "2-poses/selection.json", "7-recorded/cuts.json"
 # sigma of the tool over the workspace, and what the poses will tell: calib fit --selection
-PREDICTED = "2-poses/predicted.png"
+PREDICTED = "2-poses/predicted.html"
 PREDICTION = "2-poses/poses_prediction.json"
 # as planned, in 2-poses
 POSES, UNSEEN, WAYS = "poses.csv", "validation_poses.csv", "poses_run.csv"
@@ -131,11 +130,11 @@ class StateFile:
 
 @dataclass(frozen=True)
 class Session:
-    """An open session: its folder, its settings, and whether figures are drawn."""
+    """An open session: its folder, its settings, and which figures are written (`Plots`)."""
 
     folder: Path
     settings: SessionSettings
-    plots: bool = True
+    plots: Plots = True
 
     def path(self, name: str) -> Path:
         """Return the path of a file by its name relative to the session's folder.
@@ -326,12 +325,12 @@ def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Ma
         write_staged(folder, (), fill)
 
 
-def open_session(folder: Path, plots: bool = True) -> Session:
+def open_session(folder: Path, plots: Plots = True) -> Session:
     """Read the settings of the session in a folder.
 
     Args:
         folder: the folder.
-        plots: whether the session's steps draw figures.
+        plots: which figures the session's steps write.
 
     Raises:
         SessionError: if the folder is not a session, was made by a newer version, or has a damaged ``session.toml``.
@@ -339,7 +338,7 @@ def open_session(folder: Path, plots: bool = True) -> Session:
     path = folder / SETTINGS
     if not path.exists():
         raise SessionError(refusal(folder, "session"))
-    return Session(folder, read_settings(path), plots=plots and available("matplotlib"))
+    return Session(folder, read_settings(path), plots=plots)
 
 
 def read_state(session: Session) -> StateFile:

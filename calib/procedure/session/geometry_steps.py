@@ -120,11 +120,7 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
         write_prediction(choice.prediction, session.path(f"2-poses/{folder.POSES}"))
     outlook = choice.outlook.poses
     if session.plots and np.isfinite(outlook.rms):
-        from calib.procedure.report.charts import picture
-        from calib.procedure.report.geometry_figures import predicted_map
-
-        chart = predicted_map(outlook.points, outlook.spread)
-        files.write(session.path(folder.PREDICTED), picture(chart, "").image)
+        _write_predicted(session, outlook.points, outlook.spread)
 
     # a condition number is the better the smaller it is, other indices the larger
     gain = poses.value / poses.random_baseline
@@ -142,7 +138,7 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
         notes.append(f"{validation} random poses for validation")
     notes += choice.kept()
     notes += [f"{quantity}: {value}" for quantity, value in selection.predicted_rows(choice)]
-    notes += record["notes"]
+    notes += record["notes"]  # ty: ignore[unsupported-operator]
     return notes
 
 
@@ -411,6 +407,20 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
         settings=_fit_settings(session),
         **links,
     )
+
+
+def _write_predicted(session: Session, points: np.ndarray, sigma: np.ndarray) -> None:
+    """Write the page with the map of the predicted σ (m,) [m] of the tool's position at workspace points (m, 3) [m]."""
+    from calib.procedure.report.figures import figure_files
+    from calib.procedure.report.geometry_figures import predicted_map
+    from calib.procedure.report.outputs import figures_page
+
+    chart = predicted_map(points, sigma)
+    caption = "How well the tool's position will be known over the workspace."
+    page = session.path(folder.PREDICTED)
+    files.write(page, figures_page(f"Poses for {session.settings.name}", [], {"predicted": (chart, caption)}))
+    if isinstance(session.plots, str):
+        files.write(page.with_suffix(f".{session.plots}"), figure_files.drawn(chart, session.plots))
 
 
 def fit(session: Session, say: Say) -> list[Note]:

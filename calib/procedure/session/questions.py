@@ -427,7 +427,7 @@ def _obstacles(text: str) -> list[dict[str, object]]:
         name, kind, sizes, position = parts
         size = [length.read(part) for part in sizes.split(",")]
         tables.append({"name": name, "kind": kind, "size": size, "xyz": _lengths(position, 3, MAX_WIDE)})
-    return tables
+    return tables  # ty: ignore[invalid-explicit-return]
 
 
 def _mounting(text: str) -> str:

@@ -214,6 +214,8 @@ class DynamicsSection:
         torques: motor, link (sensors behind the gears), or both
         friction: or standard, or one step of the ladder; see `calib formats identify-options`
         method: or ols, irls, tls, …; see calib study --list-methods
+        with_geometry: true: joint offsets, lengths and the direction of gravity are estimated again from torques,
+            together with the dynamics
         options: a TOML file next to this one; see `calib formats identify-options`; for methods with a [loop] the
             designed motion is the reference of recordings without columns q_ref
         holdout: share at the end of each recording that is held out if there is no validation recording; 0:
@@ -244,6 +246,7 @@ class DynamicsSection:
     torques: Torques = "motor"
     friction: Annotated[str, OneOf(FRICTION)] = IdentificationSettings.friction
     method: Annotated[str, OneOf(tuple(METHODS))] = IdentificationSettings.method
+    with_geometry: Flag = False
     options: Beside = ""
     holdout: Holdout = 0.0
     tolerance_percent: NotNegative = 0.0

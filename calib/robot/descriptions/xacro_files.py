@@ -124,7 +124,7 @@ def _packages_for(file: Path) -> Iterator[None]:
     from unittest.mock import patch  # slow to load
 
     index = ModuleType("ament_index_python.packages")
-    index.get_package_share_directory = lambda name: str(package_folder(name, file))  # type: ignore[attr-defined]
+    index.get_package_share_directory = lambda name: str(package_folder(name, file))  # ty: ignore[missing-attribute]
     with patch.dict(sys.modules, {"ament_index_python": ModuleType("ament_index_python"), index.__name__: index}):
         yield
 

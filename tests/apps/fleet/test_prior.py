@@ -64,6 +64,7 @@ def test_rare_parameter_has_family_deviation() -> None:
         arm_distribution.spread([replace(one, covariance=None) for one in robots])
 
 
+@pytest.mark.slow
 def test_ten_poses_are_enough_with_a_prior(tmp_path) -> None:
     """Without, they are refused. The prior is read from its folder, as the command does."""
     true, robots = arms(9, 5)

@@ -76,9 +76,9 @@ def test_base_and_tool_count_only_where_told(fits):
 def test_command_exits_1_and_writes_folder(fits, tmp_path, capsys):
     """The command exits with 1 beyond the tolerance and writes a folder."""
     pair = [str(fits / "first"), str(fits / "crashed")]
-    assert cli.run(["diff", *pair, "--tolerance", "0.1", "--out", str(tmp_path / "out")]) == 1
+    assert cli.run(["diff", *pair, "--tolerance", "0.1", "--plots", "svg", "--out", str(tmp_path / "out")]) == 1
     assert "verdict: fail: not within the tolerance of 0.1 mm" in capsys.readouterr().out
-    assert {"report.html", "changes.csv", "metrics.json", "plot_map.png", "plot_parameters.png"} <= {
+    assert {"report.html", "changes.csv", "metrics.json", "plot_map.svg", "plot_parameters.svg"} <= {
         each.name for each in (tmp_path / "out").iterdir()
     }
     assert cli.run(["diff", *pair, "--tolerance", "0.3"]) == 0

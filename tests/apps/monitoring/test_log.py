@@ -59,9 +59,9 @@ def test_session_without_verdict_is_refused(sessions):
 def test_command_writes_page_table_figure(sessions, tmp_path, capsys):
     """The command writes page, table and figure."""
     pair = [str(sessions / name) for name in ("old", "new")]
-    assert cli.run(["log", *pair, "--out", str(tmp_path / "out")]) == 0
+    assert cli.run(["log", *pair, "--plots", "svg", "--out", str(tmp_path / "out")]) == 0
     assert "Calibrations of".lower() in capsys.readouterr().out.lower()
-    assert {"report.html", "log.csv", "metrics.json", "plot_log.png"} == {
+    assert {"report.html", "log.csv", "metrics.json", "plot_log.svg"} == {
         each.name for each in (tmp_path / "out").iterdir()
     }
     rows = list(csv.DictReader((tmp_path / "out/log.csv").open()))

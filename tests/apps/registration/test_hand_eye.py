@@ -14,6 +14,8 @@ from calib.apps.registration.settings import PlacementSettings
 from calib.cli import run
 from calib.data.poses.fit_options import CameraOptions, FitOptions
 from calib.errors import CalibError, UsageError
+from calib.geometry.checks import pose_steps
+from calib.geometry.first_guess import place_pose
 
 CASE = DATA / "cases/13_hand_eye_pose_pairs"
 
@@ -218,6 +220,63 @@ def test_camera_turned_halfway_is_named_with_its_row(tmp_path):
     assert "what the arm carries was turned by 180°" in text
 
 
+def small_step(robot: np.ndarray, measured: np.ndarray) -> pose_steps.Step | None:
+    return pose_steps.small_step(robot, measured, place_pose(robot, measured))
+
+
+def turned_later(seed: int, count: int, angle: float, first: int, end: int | None = None) -> tuple:
+    """Return poses whose camera was turned by an angle [rad] from the row `first` on, and back at the row `end`."""
+    robot, seen = sampled(seed, count)
+    turn = motion(Rotation.from_rotvec([0, 0, -angle]), np.zeros(3))
+    seen[first:end] = turn @ seen[first:end]
+    return robot, inv(seen)
+
+
+def test_small_turns_are_steps_and_sound_sets_have_none():
+    """A turn of 0.6° is a step with its σ; sets without a turn have no step."""
+    step = small_step(*turned_later(2, 24, 0.01, 12))
+    assert (step.cut, step.part) == (12, "tool")
+    assert abs(step.angle - 0.01) < 4 * step.angle_sigma < 2e-3 and step.shift < 4 * step.shift_sigma
+    for seed in range(10):
+        assert small_step(*turned_later(seed, 15, 0.0, 8)) is None
+
+
+def test_drift_and_errors_of_the_arm_are_no_steps():
+    """A camera that turns slowly, and an arm whose error depends on its pose, are not called steps."""
+    for seed in range(5):
+        robot, seen = sampled(seed, 24)
+        turns = Rotation.from_rotvec(np.linspace(0.0, 0.02, 24)[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+        drifted = seen.copy()
+        drifted[:, :3] = turns @ seen[:, :3]
+        assert small_step(robot, inv(drifted)) is None
+        order = np.argsort(robot[:, 0, 3])
+        bent = robot[order]
+        bent[:, :3, 3] += 0.02 * (bent[:, :3, 3] - bent[:, :3, 3].mean(axis=0))[:, ::-1]
+        assert small_step(bent, inv(seen[order])) is None
+
+
+def test_first_of_two_turns_is_named(tmp_path):
+    """Of two turns, the first is named with its rows."""
+    robot, camera = turned_later(3, 24, np.pi / 2, 8, 16)
+    text = str(calib.hand_eye(None, table(tmp_path / "pairs.csv", robot, inv(camera))))
+    assert "rows 1–8 and 9–" in text
+
+
+@pytest.mark.parametrize(("lag", "first"), [(3, 0), (-1, 8)])
+def test_rows_that_lag_are_named_with_the_first_of_them(tmp_path, lag, first):
+    """Camera rows that lag behind the robot's, or lead them, are named with lag and row, whichever the mounting."""
+    robot, seen = sampled(10, 24, in_hand=lag > 0)
+    lost = range(first, first + abs(lag))
+    if lag > 0:
+        robot, seen = robot[:-lag], np.delete(seen, lost, axis=0)
+    else:
+        robot, seen = np.delete(robot, lost, axis=0), seen[:lag]
+    fit = calib.hand_eye(None, table(tmp_path / "pairs.csv", robot, seen))
+    assert fit.verdict == "fail"
+    rows = f"{abs(lag)} row{'s' * (abs(lag) > 1)} further {'down' if lag > 0 else 'up'} from row {first + 1} on"
+    assert f"with the robot's poses {rows}" in str(fit)
+
+
 def test_mounting_that_nothing_says_is_asked_for(tmp_path):
     """Poses that agree as they are may be of a board on the arm, or of a camera in the board: it is asked."""
     path = table(tmp_path / "pairs.csv", *sampled(7, in_hand=False))
@@ -237,9 +296,30 @@ def test_too_few_pairs_are_refused(tmp_path):
             calib.hand_eye(None, table(tmp_path / "pairs.csv", robot[:count], seen[:count]))
 
 
-def test_turns_about_one_axis_leave_positions_open(tmp_path):
+def test_failed_frames_are_not_for_use(tmp_path, capsys):
+    """With the verdict fail no frame is written for a controller or into a URDF; the verdict states an error once."""
+    robot, seen = sampled(6, 14)
+    path = table(tmp_path / "pairs.csv", robot, seen[np.random.default_rng(0).permutation(14)])
+    urdf = tmp_path / "with_camera.urdf"
+    options = tmp_path / "options.toml"
+    options.write_text('[camera]\nmounting = "in hand"')
+    command = ["hand-eye", "ur5", str(path), "--for", "krl", "--urdf", str(urdf), "--options", str(options)]
+    assert run(command) == 1
+    text = capsys.readouterr().out
+    assert "no frames are printed or written for use: the verdict is fail" in text
+    assert "KUKA" not in text and not urdf.exists() and "nominal" not in text
+    with pytest.raises(UsageError, match="the verdict is fail"):
+        calib.hand_eye(None, path).urdf()
+    table(path, robot[:1], seen[:1])
+    assert run(["hand-eye", str(path)]) == 2 and "1 pair of poses" in capsys.readouterr().err
+
+
+def test_turns_about_one_axis_leave_positions_open(tmp_path, capsys):
     """With turns about one axis only, positions are not identifiable, and no frame is offered for use."""
     path = table(tmp_path / "pairs.csv", *sampled(8, turns=(0.0, 0.0, 1.0)))
+    assert run(["hand-eye", str(path), "--for", "krl"]) == 3
+    text = capsys.readouterr().out
+    assert "x y z not identifiable, not identifiable, not identifiable mm" in text and "KUKA" not in text
     fit = calib.hand_eye(None, path)
     assert "about one axis only" in str(fit) and "URDF:" not in str(fit)
     for frame in fit.transforms:

@@ -17,6 +17,7 @@ from urllib.parse import quote
 
 import numpy as np
 import pytest
+from browsers import chromium
 from sessions import begin, go_on
 from starlette.testclient import TestClient
 
@@ -25,6 +26,8 @@ from calib.apps.serve import pages, received
 from calib.apps.serve.pages import application
 from calib.apps.serve.work import CHECK, NEXT, Work
 from calib.errors import UsageError
+from calib.procedure.report.figures import figure_data
+from calib.procedure.report.figures.charts import Chart, Line, Panel
 from calib.procedure.session import commands, steps
 from calib.procedure.session.folder import Session, open_session
 from calib.procedure.session.geometry_steps import chain_of, read_measured
@@ -141,7 +144,7 @@ def test_mistakes_in_files_are_shown_with_their_cure(session: Session, client: T
     """What cannot be read is no measurement; the page says why, and what to do."""
     names = ",".join(f"joint{k}" for k in range(1, 8))
     for name, content, words in (
-        ("book.xlsx", b"PK\x03\x04" + bytes(range(256)), "save a spreadsheet as CSV"),
+        ("book.xlsx", b"PK\x03\x04" + bytes(range(256)), "save the sheet as CSV"),
         ("far.csv", b"x,y,z\n1000,2,3\n1100,2,3\n", "[mm]"),
         ("deg.csv", f"{names}\n0,0,0,0,0,0,0\n90,0,0,0,0,0,0\n".encode(), "[deg]"),
         ("<i>.csv", b"u,v\n1,2\n", "say below which of them is what"),
@@ -247,6 +250,16 @@ def test_who_may_ask(session: Session) -> None:
     assert served.state.work.current.task == NEXT
 
 
+def test_figures_of_a_step_are_a_page_that_runs_its_own_scripts(session: Session, client: TestClient) -> None:
+    chart = Chart([Panel([Line([0.0, 1.0], [1.0, 2.0])])], 2.0)
+    session.path("4-fit").mkdir(exist_ok=True)
+    figure_data.write(session.path("4-fit"), {"joints": (chart, "errors by joint")})
+    assert '<a href="/figures/4-fit/figures.json">' in client.get("/").text
+    answer = client.get("/figures/4-fit/figures.json")
+    assert "errors by joint" in answer.text and "script-src 'sha256-" in answer.headers["content-security-policy"]
+    assert client.get("/figures/session.toml").status_code == client.get("/figures/5-validation").status_code == 404
+
+
 def test_only_the_sessions_files_are_served(session: Session, client: TestClient, tmp_path: Path) -> None:
     (tmp_path / "secret.txt").write_text("mine")
     session.path("link.txt").symlink_to(tmp_path / "secret.txt")
@@ -257,19 +270,9 @@ def test_only_the_sessions_files_are_served(session: Session, client: TestClient
 
 @pytest.fixture
 def browser() -> Iterator[Any]:
-    from selenium import webdriver
-
-    programs = [shutil.which(name) for name in ("chromium", "chromedriver")]
-    if None in programs:
-        pytest.skip("chromium or chromedriver is not installed (Debian: apt-get install chromium chromium-driver)")
-    options = webdriver.ChromeOptions()
-    options.binary_location = str(programs[0])
-    for word in ("--headless=new", "--no-sandbox", "--disable-dev-shm-usage"):
-        options.add_argument(word)
-    driver = webdriver.Chrome(options, webdriver.ChromeService(programs[1]))
-    driver.implicitly_wait(10)
-    yield driver
-    driver.quit()
+    with chromium() as driver:
+        driver.implicitly_wait(10)
+        yield driver
 
 
 def split(path: Path, joints: int) -> list[Path]:

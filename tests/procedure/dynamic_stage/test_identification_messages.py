@@ -23,7 +23,8 @@ from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import TorqueCurves
 from calib.procedure.dynamic_stage.recorded_gains import FoundGains
 from calib.procedure.dynamic_stage.replay import Replay
-from calib.procedure.report import charts, dynamics_figures, dynamics_section, page
+from calib.procedure.report import dynamics_figures, dynamics_section, page
+from calib.procedure.report.figures import drawing
 from calib.robot.calibrated import CalibratedChain
 from calib.units import motion_units
 
@@ -83,7 +84,7 @@ def test_figures_have_units_at_their_axes():
         fit={"train": SimpleNamespace(raw=PredictionErrors(RelativeErrors(5.0, np.full(3, 5.0)), np.zeros(3)))},
         validation={}, rows=MOTOR.titles(arm.chain.joint_names), units=inputs.row_units,
     )  # fmt: skip
-    figure = charts.figure(dynamics_figures.recorded(TorqueCurves.of(one, np.asarray(one.target)), report)[0])
+    figure = drawing.figure(dynamics_figures.recorded(TorqueCurves.of(one, np.asarray(one.target)), report)[0])
     units = [f"{joint.name} [{unit}]: 5 % unexplained" for joint, unit in zip(joints, ("N", "N m", "N m"))]
     assert [axis.get_title(loc="left") for axis in figure.axes] == units
     assert not any(axis.get_legend() for axis in figure.axes), "a legend inside would cover the curve"

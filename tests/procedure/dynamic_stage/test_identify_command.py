@@ -16,10 +16,11 @@ def run(*arguments: object) -> int:
     return without_figures.run("identify", *arguments)
 
 
+@pytest.mark.slow
 def test_the_folder_keeps_its_contract(robot, tmp_path, capsys):
     train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
     out = tmp_path / "out"
-    drawn = ("--out", out, "--friction", "standard", "--plots")
+    drawn = ("--out", out, "--friction", "standard", "--plots", "svg")
     assert run(robot, f"{train}@0:18", "--validate", other, f"{train}@18.5:", *drawn) == 0
     found = json.loads((out / "metrics.json").read_text())
     assert list(found["identification"]) == ["train.npz@0:18"]
@@ -46,12 +47,12 @@ def test_the_folder_keeps_its_contract(robot, tmp_path, capsys):
         "sigma_geometry",
     ]
     assert any("YY2" in row["expression"] for row in rows if row["name"] == "ZZ1R")
-    assert {"dynamics.json", "covariance.csv", "robot.toml", "plot_torque_1.png", "plot_friction.png"} <= {
+    assert {"dynamics.json", "covariance.csv", "robot.toml", "plot_torque_1.svg", "plot_friction.svg"} <= {
         path.name for path in out.iterdir()
     }
     assert "verdict: pass" in capsys.readouterr().out
-    assert run(robot, train, *drawn[:-1]) == 0, "an own folder may be written again"
-    assert not (out / "plot_torque_3.png").exists(), "plots of the earlier run are gone"
+    assert run(robot, train, *drawn[:-2]) == 0, "an own folder may be written again"
+    assert not (out / "plot_torque_3.svg").exists(), "plots of the earlier run are gone"
 
 
 def test_a_repeat_is_no_evidence(robot, tmp_path, capsys):

@@ -352,6 +352,7 @@ def panda(data) -> tuple[Chain, Case]:
     return load(robot), case
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("joint", "way"), [(1, 1.0), (2, 1.0), (2, -1.0), (4, -1.0)])
 def test_panda_coupled_joint_is_named(panda, joint, way):
     """A joint of a Panda that counts from the one before it is named."""
@@ -363,6 +364,7 @@ def test_panda_coupled_joint_is_named(panda, joint, way):
     assert found.changes[0].values["way"] == ("+" if way > 0 else "-") and found.factor < 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("joint", range(7))
 def test_a_reversed_sign_of_a_panda_is_named(panda, joint):
     robot, case = panda

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio
 import pytest
 
+import calib
 from calib import cli
 from calib.errors import MeasurementError
 from calib.procedure.dynamic_stage.standing.gravity_result import identify_gravity
@@ -333,8 +334,40 @@ def test_options_of_motions_are_not_used(tmp_path, arm, capsys):
     assert "--friction nonsense: expected" in capsys.readouterr().err
     assert cli.run([*words, "--method", "wls"]) in (0, 1)
     assert "not used for standing poses: --method" in capsys.readouterr().out
-    assert cli.run(["export", str(tmp_path / "out"), "--into", str(tmp_path / "new")]) == 2
-    assert "use robot.urdf in it" in capsys.readouterr().err
+    out = str(tmp_path / "out")
+    verbs = [
+        ["export", out, "--into", str(tmp_path / "new")],
+        ["diff", out, out],
+        ["view", out, "--save", "s.rrd"],
+        ["certificate", out],
+        ["deliver", out, "--for", "krl"],
+        ["status", out],
+        ["excite", out, "--out", "e"],
+    ]
+    for verb in verbs:
+        assert cli.run(verb) == 2
+        assert "is the gravity of standing poses; " in capsys.readouterr().err
+    assert calib.open_result(out).verdict == identify_gravity(urdf, [poses]).verdict
+
+
+def test_a_slope_under_the_arm_is_named(tmp_path, arm):
+    """On a slope of 20°, free masses do not explain the torques with gravity as stated, but along another direction."""
+    urdf, _, model = arm
+    q = drawn(60)
+    tilted = model.copy()
+    tilted.gravity.linear = 9.81 * np.array([np.sin(0.35), 0.0, -np.cos(0.35)])
+    result = identify_gravity(urdf, [write(tmp_path / "p.csv", q, held(tilted, q))])
+    assert result.verdict == "fail" and "stand on a slope of some 2" in result.verdict.advice
+
+
+def test_a_tie_with_the_description_does_not_fail(tmp_path, arm):
+    """Torques of the description itself: whether the model is a little better or worse is chance."""
+    urdf, _, _ = arm
+    described = pinocchio.buildModelFromXML(urdf.read_text())
+    q = drawn(40)
+    result = identify_gravity(urdf, [write(tmp_path / "p.csv", q, held(described, q))])
+    assert result.unexplained() > result.unexplained(described=True)
+    assert result.verdict == "marginal" and "no better than the description" in result.verdict.reason
 
 
 def test_poses_mixed_with_a_motion_are_said(tmp_path, arm, capsys):

@@ -55,11 +55,12 @@ QUICK = ("--starts", 1, "--evaluations", 60, "--period", 16, "--harmonics", 4, "
 SHORT = ExcitationSettings(starts=1, evaluations=45, period=16.0, harmonics=4, rate=100.0, samples=120)
 
 
+@pytest.mark.slow
 def test_motion_is_written_within_its_limits(cell, calib):
     """The motion keeps its limits, and is written for a controller."""
     Path("limits.toml").write_text(LIMITS)
     stands = "-0.8,-1.0,-1.0,-1.2,0.2,-1.5,0.3"
-    played = ("--start", stands, "--repeat", 2, "--slower", 3, "--plots")
+    played = ("--start", stands, "--repeat", 2, "--slower", 3, "--plots", "png")
     code, out, err = calib("excite", "lwr4plus", "--limits", "limits.toml", "--out", "e", *QUICK, *played)
     assert code == 0, err
     assert "self-collision (capsules" in out and "NOT checked: walls of the cell (not known), obstacles" in out
@@ -289,8 +290,8 @@ def test_a_shorter_period():
 @pytest.mark.slow
 @pytest.mark.parametrize("whom", ["the terminal's group", "the command alone"])
 def test_ctrl_c_in_worker_processes(tmp_path, whom):
-    words = ["excite", "lwr4plus", "--out", str(tmp_path / "e"), "--starts", "20", "--workers", "2"]
-    for patience in (15, 30, 60):  # [s] until the workers of a busy machine have found something
+    words = ["excite", "tx40", "--out", str(tmp_path / "e"), "--starts", "20", "--workers", "2"]
+    for patience in (7, 15, 30, 60):  # [s] until the workers of a busy machine have found something
         run = subprocess.Popen(
             [sys.executable, "-m", "calib", *words], stdout=subprocess.PIPE, text=True, start_new_session=True
         )

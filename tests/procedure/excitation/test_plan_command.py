@@ -46,8 +46,9 @@ def plan(*more: str) -> int:
     return run("plan", "lwr4plus", *given, *(() if "--out" in more else ("--out", "out")))
 
 
+@pytest.mark.slow
 def test_an_identified_model_is_planned_with(room, capsys):
-    assert plan("--model", "model", "--start", "0,0,0,0,0,0,0", "--slower", "2", "--plots") == 0
+    assert plan("--model", "model", "--start", "0,0,0,0,0,0,0", "--slower", "2", "--plots", "png") == 0
     table = json.loads((room / "out" / "metrics.json").read_text())
     motion = read_setpoints(room / "out" / "motion.csv")
     assert motion["t"][-1] == pytest.approx(table["duration"], abs=1e-9)

@@ -375,6 +375,7 @@ def test_targets_in_a_program_are_rewritten(cell, fitted, here, calib):
     np.testing.assert_allclose(found.joints(), numbers(commands(), Q), atol=2e-8)
 
 
+@pytest.mark.slow
 def test_unreached_target_has_its_line(cell, fitted, here, calib):
     """A target of a program that is not reached is named with its line."""
     q = np.degrees(drawn(cell, 20, 5)[0])

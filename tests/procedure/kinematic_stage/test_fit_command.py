@@ -158,6 +158,7 @@ def test_two_files_have_two_stations(cell, calib):
     assert installation.read("tools").tool_names == ("a tool", "b tool")
 
 
+@pytest.mark.slow
 def test_one_station_of_a_moved_instrument(cell, calib):
     """One station for an instrument that was moved is said."""
     moved = from_xyz_rpy([1.8, -0.8, 0.5], [0.1, -0.2, 2.2])
@@ -295,6 +296,7 @@ def test_fixed_parameters_stay(cell, calib):
     assert values["theta4"] != before["theta4"]
 
 
+@pytest.mark.slow
 def test_gross_rows_stay_out_of_deliverables(cell, calib):
     """The loss that auto takes for them counts for all that comes of the fit, not for the calibrated arm alone."""
 
@@ -415,6 +417,7 @@ def reflectors(cell, q, generator) -> list[dict]:
     return rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("measure", "count", "nature", "poses"),
     [(distances, 240, "distance_mm", 192), (bars, 160, "distance_mm", 128), (reflectors, 60, "position_mm", 48)],

@@ -303,7 +303,7 @@ def test_encoder_counts_are_told_by_the_arm(arm, tmp_path, per_turn, zero):
     (block,) = read_file(path, chain, FitOptions())
     np.testing.assert_allclose(block.q, q, atol=np.pi / per_turn + 1e-6)
     assert f"counts/{per_turn}@{zero}" in block.notes[0]
-    with pytest.raises(MeasurementError, match="encoder counts.*one line|encoder counts.*One line"):
+    with pytest.raises(MeasurementError, match=r"encoder counts.*one line|encoder counts.*One line"):
         read_measurements(path, chain.joint_names)
     odd = written(tmp_path / "odd.csv", [*numbered("q{} [ticks]"), "x", "y", "z"], [counts + per_turn // 10, position])
     with pytest.raises(MeasurementError, match="joint by joint: units = "):

@@ -50,6 +50,7 @@ def test_sound_poses_are_not_remarked_upon(cell, calib):
     assert (code, *verdict()) == (0, "not judged", "", []), err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change, name",
     [

@@ -173,6 +173,7 @@ def test_unrelated_file_stays(cell, calib) -> None:
     assert (code, "suffix .csv" in err) == (2, True)
 
 
+@pytest.mark.slow
 def test_a_command_replaces_its_own_files(cell, calib) -> None:
     given = ("select", "ur5", "--candidates", "40", "--out", "p.csv", "--run", "run.csv")
     for more in (("-m", "5"), ("-m", "6")):

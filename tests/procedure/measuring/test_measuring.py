@@ -128,11 +128,11 @@ def test_selection_is_drawn_beside_its_poses(tmp_path, capsys):
     given = ["select", "lwr4plus", "-m", "12", "--candidates", "150", "--out"]
     assert run([*given, str(tmp_path / "a.csv")]) == 0
     written = {path.name for path in tmp_path.iterdir() if not path.name.startswith(".")}
-    assert written == {"a.csv", "a_prediction.json", "a_predicted.png", "a_outlook.png"}
-    assert run([*given, str(tmp_path / "b.csv"), "--no-plots"]) == 0 and not (tmp_path / "b_predicted.png").exists()
-    (tmp_path / "a.csv").rename(tmp_path / "c_outlook.png")
-    assert run([*given, str(tmp_path / "c.csv"), "--existing", str(tmp_path / "c_outlook.png")]) == 2
-    assert "c_outlook.png is an input" in capsys.readouterr().err
+    assert written == {"a.csv", "a_prediction.json", "a_figures.html"}
+    assert run([*given, str(tmp_path / "b.csv"), "--no-plots"]) == 0 and not (tmp_path / "b_figures.html").exists()
+    (tmp_path / "a.csv").rename(tmp_path / "c_figures.html")
+    assert run([*given, str(tmp_path / "c.csv"), "--existing", str(tmp_path / "c_figures.html")]) == 2
+    assert "c_figures.html is an input" in capsys.readouterr().err
     assert run([*given, str(tmp_path / "d.csv"), "--run", str(tmp_path / "d.csv")]) == 2
     assert "written twice" in capsys.readouterr().err and not (tmp_path / "d.csv").exists()
 

@@ -62,14 +62,14 @@ def test_hard_arm_says_what_marginal_means(tmp_path: Path, capsys: pytest.Captur
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["ur10e", "rv2sq"])
 def test_demo_of_other_robots(robot: str, tmp_path: Path) -> None:
-    assert run("demo", "--out", tmp_path / "demo", "--plots", "--robot", robot, "--seed", "3") == 0
+    assert run("demo", "--out", tmp_path / "demo", "--plots", "png", "--robot", robot, "--seed", "3") == 0
 
 
 @pytest.mark.slow
 def test_demo_by_camera_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """To the end, and again by `calib view`: validation images measure no positions, which are empty cells."""
     out = tmp_path / "cell"
-    assert run("demo", "--instrument", "camera", "--geometry-only", "--plots", "--out", out) == 0
+    assert run("demo", "--instrument", "camera", "--geometry-only", "--plots", "png", "--out", out) == 0
     truth = errors(out)
     assert truth["urdf_alone"] < truth["nominal"] / 5.0
     pytest.importorskip("rerun")

@@ -98,8 +98,10 @@ def test_drift_needs_repeated_poses(cell, tmp_path):
 def test_command_writes_page_table_figure(cell, tmp_path, capsys):
     """The command writes page, table and figure."""
     path = measured(cell, tmp_path, MOVES)
-    assert cli.run(["drift", "ur5", str(path), "--sigma", "0.06", "--out", str(tmp_path / "out")]) == 0
+    assert (
+        cli.run(["drift", "ur5", str(path), "--sigma", "0.06", "--plots", "svg", "--out", str(tmp_path / "out")]) == 0
+    )
     assert "the target drifts with time by" in capsys.readouterr().out
-    assert {"report.html", "trends.csv", "metrics.json", "plot_drift.png"} == {
+    assert {"report.html", "trends.csv", "metrics.json", "plot_drift.svg"} == {
         each.name for each in (tmp_path / "out").iterdir()
     }

@@ -302,6 +302,7 @@ def test_massless_robot_gets_no_dynamics(tmp_path: Path, capsys: pytest.CaptureF
     assert not session.dynamic and not session.path("7-recorded").exists()
 
 
+@pytest.mark.slow
 def test_front_motion_is_picked(waiting: Session, capsys: pytest.CaptureFixture) -> None:
     """A picked motion becomes the training motion, its step stays done; recorded motions are not exchanged."""
     path = waiting.path("session.toml")

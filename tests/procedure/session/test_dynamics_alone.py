@@ -80,6 +80,7 @@ def test_ampere_torques_only_predict(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert run("next", session.folder) == 0 and "no robot was exported" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_files_say_the_delivered_verdict(session: Session) -> None:
     """No file says another verdict than that of what is delivered."""
     for tolerance, exports, verdict, why in (

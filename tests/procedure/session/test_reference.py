@@ -23,6 +23,7 @@ def planned(folder, reference: bool) -> Session:
     return session
 
 
+@pytest.mark.slow
 def test_base_frame_runs_through_a_session(tmp_path):
     """The second frame is planned, asked for, simulated, fitted, and stated on the certificate."""
     session, plain = (planned(tmp_path / f"reference {value}", value) for value in (True, False))

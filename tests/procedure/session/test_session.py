@@ -237,6 +237,7 @@ def test_poses_are_held_out_by_default(measured: Session) -> None:
     assert json.loads(measured.path("4-fit/metrics.json").read_text())["fit"]["poses"] == 15
 
 
+@pytest.mark.slow
 def test_failed_robot_says_so_in_its_files(finished: Session, capsys: pytest.CaptureFixture) -> None:
     """A failed robot's files say so until it no longer fails."""
     place, settings = finished.path("6-export"), finished.path("session.toml")

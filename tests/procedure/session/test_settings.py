@@ -55,7 +55,7 @@ def test_session_before_typed_settings_opens(old: Path) -> None:
     then["instrument"] |= {"reference": False}
     then["fit"] |= {"deliverable": "urdf", "holdout": 0.0, "rounds": 3}
     then["dynamics"] |= {"holdout": 0.0, "goals": [], "hard": [], "front": 0, "sigma_percent": 0.0}
-    then["dynamics"] |= {"tolerance_torque": []}
+    then["dynamics"] |= {"tolerance_torque": [], "with_geometry": False}
     then["certificate"] = dict.fromkeys(vars(CertificateSection()), "")
     assert tomllib.loads(written(found)) == then, "nothing else is added, lost or spelled otherwise"
 

@@ -37,6 +37,7 @@ def test_methods_are_ranked_by_unseen_motion(robot: Path, tmp_path: Path):
     assert set(taken.warnings) <= set(caveats(given, found))
 
 
+@pytest.mark.slow
 def test_learnt_motion_ranks_nothing(robot: Path, tmp_path: Path):
     """Samples in both are refused; a copy of the motion under another name, here of other noise, is no evidence."""
     train, other = recorded(tmp_path, 20.0)
@@ -108,6 +109,7 @@ def test_the_command_writes_what_it_shows(
     assert "[loop]" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_failed_identification_is_not_taken(robot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """One joint's torque is doubled in the unseen file: better than no model, and yet none of this robot."""
     train, other = recorded(tmp_path)

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.special import chdtrc, ndtri
 
 from calib.toolkit.result_folders import limit
 
@@ -79,15 +79,15 @@ class ChangeTest:
         if self.freedom == 0:
             return 1.0
         explained = [parameter.explained for parameter in self.parameters if parameter.explained]
-        of_one = max(len(explained), 1) * chi2.sf(max(explained, default=0.0), 1)
-        of_all = chi2.sf(self.chi2, self.freedom)
+        of_one = max(len(explained), 1) * chdtrc(1, max(explained, default=0.0))
+        of_all = chdtrc(self.freedom, max(self.chi2, 0.0))
         # two tests, of which the less likely one counts
         return min(2.0 * float(min(of_all, of_one)), 1.0)
 
     @property
     def sigmas(self) -> float:
         """Significance of the change: the deviation, in σ, of a normal variable with the same p value, at most 37."""
-        return float(norm.isf(max(self.probability, 1e-300) / 2.0))
+        return -float(ndtri(max(self.probability, 1e-300) / 2.0))
 
     @property
     def changed(self) -> bool:
@@ -124,7 +124,7 @@ class ChangeTest:
         """
         residual = max(self.chi2 - explained, 0.0)
         freedom = max(self.freedom - count, 1)
-        return bool(chi2.sf(residual, freedom) > CHANCE)
+        return bool(chdtrc(freedom, residual) > CHANCE)
 
 
 @dataclass(frozen=True, eq=False)

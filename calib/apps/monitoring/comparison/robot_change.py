@@ -19,6 +19,7 @@ from calib.apps.monitoring.comparison.torque_change import DynamicsChange
 from calib.apps.monitoring.comparison.torque_part import TorquePart
 from calib.apps.monitoring.settings import DEFAULT_DIFF, DiffSettings
 from calib.arguments import checked
+from calib.config_types import Plots
 from calib.errors import Finding, UsageError, require
 from calib.records import plain
 from calib.result_kinds import BY_NAME
@@ -105,7 +106,7 @@ class RobotChange(ChartedResult, ReportedResult):
         return charts
 
     @checked
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, *, plots: Plots = True) -> Path:
         """Write the comparison into a folder and return its path.
 
         The folder contains report.html, tables of all parameters, metrics.json, and the figures as PNG.
@@ -123,7 +124,9 @@ class RobotChange(ChartedResult, ReportedResult):
             parts.append(report_folder.ResultPart(part.section(), charts, part.captions, parameters))
         earlier, later, robot = self._names
         setup = {"earlier": earlier, "later": later}
-        return report_folder.save(Path(out), "comparison", f"Change of {robot}", setup, parts, self.to_dict(), TABLES)
+        return report_folder.save(
+            Path(out), "comparison", f"Change of {robot}", setup, parts, self.to_dict(), TABLES, plots
+        )
 
     @property
     def _names(self) -> tuple[str, str, str]:
@@ -204,6 +207,6 @@ def _torque_parts(before: Place, after: Place, settings: DiffSettings) -> list[C
         motions[name] = states  # type: ignore[assignment]
     message = f"neither {earlier.name} nor {later.name} contains a motion without payload; give one with --motion"
     require(motions, message, UsageError)
-    change = torque_change.compare(earlier, later, motions)
+    change = torque_change.compare(earlier, later, motions)  # ty: ignore[invalid-argument-type]
     tolerance = settings.torque_tolerance or later.tolerance or earlier.tolerance or None
     return [TorquePart(earlier, later, change, tolerance)]

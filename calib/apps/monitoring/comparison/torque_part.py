@@ -155,16 +155,16 @@ class TorquePart(ChangePart):
         return text
 
     def charts(self) -> dict[str, Chart]:
-        from calib.toolkit.report_charts import AFTER, QUIET, Chart, Panel, line
+        from calib.toolkit.report_charts import AFTER, QUIET, Chart, Line, Panel
 
         change = self.judged
         panels = []
         for j, name in enumerate(self.after.rows):
             two_sigmas = 2.0 * change.expected[:, j]
             layers = [
-                line(change.t, change.change[:, j], "-", AFTER, 0.7),
-                line(change.t, -two_sigmas, "--", QUIET, 0.6),
-                line(change.t, two_sigmas, "--", QUIET, 0.6),
+                Line(change.t, change.change[:, j], "-", AFTER, 0.7),
+                Line(change.t, -two_sigmas, "--", QUIET, 0.6),
+                Line(change.t, two_sigmas, "--", QUIET, 0.6),
             ]
             panels.append(Panel(layers, f"{name} [{self.unit}]", "time [s]", xlim=(change.t[0], change.t[-1])))
         rows_of_panels = -(-len(panels) // 2)

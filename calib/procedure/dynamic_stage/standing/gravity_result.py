@@ -33,7 +33,7 @@ from calib.robot.formats.urdf_tree import is_urdf
 from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.formats.urdf_tree import text as description_text
 from calib.robot.library import load_calibrated, resolve
-from calib.units import motion_units
+from calib.units import DEG, motion_units
 
 # rows of torques per parameter, and held-out poses, below which nothing passes: errors of so few tell little
 FEW_ROWS, FEW_HELD_OUT = 4.0, 5
@@ -71,8 +71,17 @@ EXPLAINED = 0.35
 SNAP = 0.985
 
 
-# torques that hold less than this share of the described masses' gravity hold none
-ABSENT = 0.1
+# torques that hold less than this share of the described masses' gravity, and vary less than that share of it, hold
+# none; torques that vary more have other columns
+ABSENT, SMALL = 0.1, 0.5
+
+
+# largest chance of such errors at held-out poses if the model is as good as the description, to call it worse
+WORSE_CHANCE = 0.01
+
+
+# smallest angle [rad] between stated gravity and another direction that is tried with free masses
+TILTED = 3.0 * DEG
 
 
 NAMES = (URDF, "gravity.csv", "friction_at_rest.csv", "payload.csv", GRAVITY_SUMMARY)
@@ -144,7 +153,7 @@ class GravityResult:
             return None
         direction = np.linalg.lstsq(W, torque, rcond=None)[0]
         scale = np.linalg.norm(direction)
-        if scale < ABSENT * size:
+        if scale < ABSENT * size and np.linalg.norm(torque) < SMALL * np.linalg.norm(expected):
             reason = f"the torques vary by {100 * scale / size:.2g} % of the described masses' gravity"
             return Verdict("fail", reason, "", "are they compensated for gravity already? Log them before compensation")
         believed = direction / scale * size
@@ -166,10 +175,46 @@ class GravityResult:
         misfit, reason, advice = min(causes)
         if misfit < BETTER * before and misfit <= EXPLAINED:
             return Verdict("fail", reason, "", advice)
+        tilt = np.arccos(np.clip(direction @ assumed / (scale * size), -1.0, 1.0))
+        if tilt > TILTED:
+            before = self._unexplained_in_training(assumed)
+            share = self._unexplained_in_training(believed)
+            if share < BETTER * before and share <= EXPLAINED:
+                option = ", ".join(f"{component:.2g}" for component in np.round(believed, 1) + 0.0)
+                reason = (
+                    f"with gravity along ({option}) {100 * share:.2g} % of the fitted torques are unexplained, "
+                    f"with the stated {100 * before:.2g} %"
+                )
+                advice = f"does the arm stand on a slope of some {tilt / DEG:.0f}°? State its gravity in the options"
+                return Verdict("fail", reason, "", advice)
         if turned and np.linalg.norm(torque - W @ direction) < BETTER * before * np.linalg.norm(torque):
             advice = "compare joints, signs, units and mounting with the description"
             return Verdict("fail", "the torques contradict gravity of the described masses", "", advice)
         return None
+
+    def _unexplained_in_training(self, direction: np.ndarray) -> float:
+        """Return the share of the fitted torques that free masses do not explain with gravity (3,) [m/s²]."""
+        gravity = self.gravity
+        model = replace(gravity.model, bodies=gravity.model.bodies.with_gravity(direction))
+        columns = np.concatenate([gravity_regressor(model, block) for block in self.training])
+        torque = np.concatenate([block.torque - gravity.held(block) for block in self.training])
+        _, _, residual, _ = least_squares_of(columns, torque)
+        return float(np.linalg.norm(residual) / np.linalg.norm(varying_part(torque)))
+
+    def is_worse(self) -> bool:
+        """Return whether the description predicts the held-out poses better, by more than chance.
+
+        Squared errors are compared pose by pose (Diebold and Mariano, 1995).
+        """
+        # slow to load
+        from scipy.stats import t
+
+        excess = np.sum(self.errors() ** 2 - self.errors(described=True) ** 2, axis=1)
+        count = len(excess)
+        if count < 2:
+            return False
+        deviation = max(float(excess.std(ddof=1)), 1e-12) / np.sqrt(count)
+        return bool(excess.mean() > t.ppf(1.0 - WORSE_CHANCE, count - 1) * deviation)
 
     @property
     def verdict(self) -> Verdict:
@@ -188,12 +233,18 @@ class GravityResult:
             reason += f"; {doubt.reason}"
         if self.gravity.chain.inertias is not None and share > self.unexplained(True):
             advice = "use the description as it is" if doubt is None else doubt.advice
-            return Verdict("fail", reason + "; the description is better", "", advice)
+            if self.is_worse():
+                return Verdict("fail", reason + "; the description is better", "", advice)
+            reason += "; no better than the description"
+            if doubt is None:
+                doubt = Verdict("marginal", "", "", "use the description as it is, or measure more poses")
         if share <= FAIL and doubt is not None:
             return Verdict(doubt.level, reason, "", doubt.advice)
         if share <= PASS:
             return Verdict("pass", reason)
         advice = "are torques those of the motors at rest, and are joints, signs and units the description's?"
+        if doubt is not None:
+            advice = doubt.advice
         if share <= FAIL:
             return Verdict("marginal", reason, "", advice)
         return Verdict("fail", reason, "", advice)

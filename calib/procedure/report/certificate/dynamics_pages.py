@@ -9,17 +9,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib.config_types import Plots
 from calib.folders import METRICS
 from calib.procedure.excitation import coefficients
 from calib.procedure.findings import sentence
 from calib.procedure.report.certificate.record import StageRecord
 from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of, rms_words, warnings_of
-from calib.procedure.report.page import Picture, Pictures, ReportTable, Section, Text
+from calib.procedure.report.page import ChartPicture, Picture, Pictures, ReportTable, Section, Text
 from calib.records import read_json
 from calib.robot.chain import Joint
 
 if TYPE_CHECKING:
-    from calib.procedure.report.charts import Captioned
+    from calib.procedure.report.figures.charts import Captioned
 
 UNCERTAINTY = ("torque-interval-coverage", "outside-training-range")
 # torques in the table
@@ -34,7 +35,7 @@ NOTE = (
 )
 
 
-def stage(report: DynamicReport, section: Section, plots: bool, has_tolerance: bool = False) -> StageRecord:
+def stage(report: DynamicReport, section: Section, plots: Plots, has_tolerance: bool = False) -> StageRecord:
     """Return the content of report and certificate on an identification.
 
     Args:
@@ -118,7 +119,6 @@ def _curves(report: DynamicReport, order: np.ndarray) -> Iterator[Picture]:
         report: stored results of the identification.
         order: indices of the torque rows, the row with the largest error first.
     """
-    from calib.procedure.report.charts import vector
     from calib.procedure.report.dynamics_figures import torques
 
     unseen = report.unseen
@@ -137,7 +137,8 @@ def _curves(report: DynamicReport, order: np.ndarray) -> Iterator[Picture]:
     filtered = ""
     if np.isfinite(curves.band):
         filtered = f", low-passed at {curves.band:.3g} Hz"
-    yield vector(chart, f"{subject}: measured, predicted, and the difference{filtered}. All: see report.html.")
+    caption = f"{subject}: measured, predicted, and the difference{filtered}. All: see report.html."
+    yield ChartPicture(chart, caption).vector()
 
 
 def _uncertainty(report: DynamicReport) -> Iterator[str]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib.config_types import Plots
 from calib.procedure.findings import sentence
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.validation import ARM
@@ -18,7 +19,7 @@ from calib.procedure.report.geometry_section import (
     meanings,
     report_section,
 )
-from calib.procedure.report.page import Block, Picture, Pictures, Text
+from calib.procedure.report.page import Block, ChartPicture, Picture, Pictures, Text
 from calib.units import ERRORS, JOINT
 
 # findings that belong to the uncertainty
@@ -31,7 +32,7 @@ NO_ISO = (
 )
 
 
-def stage(report: Report, drawn: Mapping[str, Picture]) -> StageRecord:
+def stage(report: Report, drawn: Mapping[str, ChartPicture]) -> StageRecord:
     """Return the content of report and certificate on a fit.
 
     Args:
@@ -45,7 +46,7 @@ def stage(report: Report, drawn: Mapping[str, Picture]) -> StageRecord:
     return StageRecord(report_section(report, drawn), blocks, list(_unchecked(report)), findings)
 
 
-def _blocks(report: Report, plots: bool) -> Iterator[Block]:
+def _blocks(report: Report, plots: Plots) -> Iterator[Block]:
     metrics = report.metrics
     proof, row_errors = deciding(report)
     label = f"{proof.poses} fitted poses: none were held out"
@@ -90,9 +91,9 @@ def _figures(report: Report, row_errors: RowErrors, label: str) -> Iterator[Pict
         row_errors: errors on the rows to show.
         label: text that names these rows in captions.
     """
-    from calib.procedure.report.charts import text, vector
+    from calib.procedure.report.figures.charts import Label
+    from calib.procedure.report.figures.style import MARK
     from calib.procedure.report.geometry_figures import error_histogram, error_map
-    from calib.procedure.report.style import MARK
 
     deliverable = report.metrics.deliverable
     remaining = row_errors.judged(deliverable)
@@ -102,7 +103,7 @@ def _figures(report: Report, row_errors: RowErrors, label: str) -> Iterator[Pict
         chart = error_histogram(before, after, nature, report.noise.get(nature), arm)
         name = report.metrics.fit.words(nature).capitalize()
         caption = f"{name} errors, {label}; lines: rms, and the instrument's own error where it is stated."
-        yield vector(replace(chart, height=2.0), caption)
+        yield ChartPicture(replace(chart, height=2.0), caption).vector()
     if not row_errors.points or not row_errors.rows:
         return
     nature, errors = next(iter(remaining.items()))
@@ -114,10 +115,11 @@ def _figures(report: Report, row_errors: RowErrors, label: str) -> Iterator[Pict
     chart = error_map(points, sizes)
     panels = []
     for vertical, panel in zip((1, 2), chart.panels):
-        mark = text("worst", worst[0], worst[vertical], colour=MARK)
+        mark = Label("worst", worst[0], worst[vertical], colour=MARK)
         panels.append(replace(panel, layers=[*panel.layers, mark]))
     name = report.metrics.fit.words(nature).capitalize()
-    yield vector(replace(chart, panels=panels, height=2.4), f"{name} errors that remain, {label}.")
+    drawn = replace(chart, panels=panels, height=2.4)
+    yield ChartPicture(drawn, f"{name} errors that remain, {label}.").vector()
 
 
 def _worst(report: Report, row_errors: RowErrors) -> Iterator[str]:

@@ -8,6 +8,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,10 +17,12 @@ from typing import Any
 from calib import files
 from calib.folders import PAGES
 from calib.procedure.report.certificate.record import MAX_PAGES, Certificate, Page
-from calib.procedure.report.page import Pictures
-from calib.procedure.report.templates import filled, read
+from calib.procedure.report.figures import figure_data
+from calib.procedure.report.figures.charts import Captioned
+from calib.procedure.report.page import ChartPicture, Pictures
+from calib.procedure.report.templates import filled, interactive, read
 from calib.records import plain
-from calib.workers.extras import installed, lacking, needing
+from calib.workers.extras import installed, lacking
 
 PACKAGE = "calib.procedure.report.certificate"
 FONT = "DejaVu Sans"
@@ -35,7 +38,21 @@ def write(folder: Path, certificate: Certificate, report: Page) -> list[str]:
             files.write(folder / name, content)
         else:
             (folder / name).unlink(missing_ok=True)
+    for name, content in figure_data.whole_figures(_charts(report)):
+        files.write(folder / name, content)
     return notes
+
+
+def _charts(page: Page) -> dict[str, Captioned]:
+    """Return the charts of a page with their captions, by name."""
+    charts = {}
+    for section in page.sections:
+        for block in section.blocks:
+            if isinstance(block, Pictures):
+                for picture in block.pictures:
+                    if isinstance(picture, ChartPicture):
+                        charts[picture.name] = picture.chart, picture.caption
+    return charts
 
 
 def write_figures(folder: Path, page: Page) -> int:
@@ -45,17 +62,14 @@ def write_figures(folder: Path, page: Page) -> int:
         folder: the folder.
         page: the report.
     """
-    with needing("matplotlib"):
-        from calib.procedure.report.charts import vector
-
     count = 0
     for section in page.sections:
-        pictures = []
+        pictures: list[ChartPicture] = []
         for block in section.blocks:
             if isinstance(block, Pictures):
-                pictures += block.pictures
+                pictures += [picture for picture in block.pictures if isinstance(picture, ChartPicture)]
         for number, picture in enumerate(pictures, 1):
-            image = vector(picture.chart, picture.caption).image
+            image = picture.vector().image
             files.write(folder / f"{section.title.lower()}_{number}.svg", image)
         count += len(pictures)
     return count
@@ -63,8 +77,10 @@ def write_figures(folder: Path, page: Page) -> int:
 
 def html(page: Page) -> str:
     """Return a certificate or report (`page`) as HTML."""
-    template = "sheet.html" if isinstance(page, Certificate) else "report.html"
-    return filled(PACKAGE, template, page=page)
+    if isinstance(page, Certificate):
+        return filled(PACKAGE, "sheet.html", page=page)
+    sections, figures = interactive(page.sections)
+    return filled(PACKAGE, "report.html", page=replace(page, sections=sections), figures=figures)
 
 
 def pdf(page: Certificate) -> tuple[bytes, list[str]]:

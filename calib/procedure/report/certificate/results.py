@@ -7,13 +7,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
+from calib.config_types import Plots
 from calib.procedure.answers import CertificateSection
 from calib.procedure.report.certificate import rendering
 from calib.procedure.report.certificate.record import NO_DETAILS, Certificate, Entry, Page, records, report
-from calib.procedure.report.page import Picture, Section
+from calib.procedure.report.figures import figure_data
+from calib.procedure.report.page import ChartPicture, Section, chart_pictures
 from calib.procedure.report.templates import versions
 from calib.units import DEG
-from calib.workers.extras import available
 
 if TYPE_CHECKING:
     from calib.procedure.kinematic_stage.metrics import FitMetrics
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from calib.procedure.report.fit_report import Report
 
 
-def write_fit(fit_report: Report, drawn: Mapping[str, Picture], folder: Path) -> None:
+def write_fit(fit_report: Report, drawn: Mapping[str, ChartPicture], folder: Path) -> None:
     """Write certificate and report of a fit into the folder of the fit.
 
     Args:
@@ -32,7 +33,7 @@ def write_fit(fit_report: Report, drawn: Mapping[str, Picture], folder: Path) ->
     rendering.write(folder, *of_fit(fit_report, drawn))
 
 
-def read_fit(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
+def read_fit(folder: Path, plots: Plots, details: CertificateSection) -> tuple[Certificate, Page]:
     """Return certificate and report of the fit in a folder.
 
     Args:
@@ -45,16 +46,15 @@ def read_fit(folder: Path, plots: bool, details: CertificateSection) -> tuple[Ce
 
     fit = fit_report.read(FitFolder(folder).report)
     drawn = {}
-    if plots and available("matplotlib"):
-        from calib.procedure.report.charts import pictures
+    if plots:
         from calib.procedure.report.geometry_figures import captioned
 
-        drawn = pictures(captioned(fit))
+        drawn = chart_pictures(captioned(fit))
     return of_fit(fit, drawn, details)
 
 
 def of_fit(
-    fit_report: Report, drawn: Mapping[str, Picture], details: CertificateSection = NO_DETAILS
+    fit_report: Report, drawn: Mapping[str, ChartPicture], details: CertificateSection = NO_DETAILS
 ) -> tuple[Certificate, Page]:
     """Return certificate and report of a fit.
 
@@ -120,7 +120,7 @@ def measured_range(metrics: FitMetrics) -> str:
     return ", ".join(texts)
 
 
-def write_model(model_report: DynamicReport, drawn: Mapping[str, Picture], folder: Path) -> None:
+def write_model(model_report: DynamicReport, drawn: Mapping[str, ChartPicture], folder: Path) -> None:
     """Write certificate and report of an identification into the folder of the identification.
 
     Args:
@@ -131,7 +131,7 @@ def write_model(model_report: DynamicReport, drawn: Mapping[str, Picture], folde
     rendering.write(folder, *of_model(model_report, drawn))
 
 
-def read_model(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
+def read_model(folder: Path, plots: Plots, details: CertificateSection) -> tuple[Certificate, Page]:
     """Return certificate and report of the identification in a folder.
 
     Args:
@@ -143,16 +143,16 @@ def read_model(folder: Path, plots: bool, details: CertificateSection) -> tuple[
 
     model_report = dynamics_section.read(folder)
     drawn = {}
-    if plots and available("matplotlib"):
-        from calib.procedure.report.charts import pictures
+    if plots:
         from calib.procedure.report.dynamics_figures import captioned
 
-        drawn = pictures(captioned(model_report, folder))
+        # with all samples, which the report's data have not
+        drawn = chart_pictures(captioned(model_report, folder) | figure_data.of_folder(folder))
     return of_model(model_report, drawn, details)
 
 
 def of_model(
-    model_report: DynamicReport, drawn: Mapping[str, Picture], details: CertificateSection = NO_DETAILS
+    model_report: DynamicReport, drawn: Mapping[str, ChartPicture], details: CertificateSection = NO_DETAILS
 ) -> tuple[Certificate, Page]:
     """Return certificate and report of an identification.
 

@@ -1,4 +1,4 @@
-"""Common style of all figures: colours that are distinguishable in greyscale, light axes, PNG with a colour palette.
+"""Sheets of matplotlib in the common style: light axes, PNG with a colour palette.
 
 Margins are those of matplotlib's constrained layout. Text is never interpreted as mathematics, so that a ``$`` in a
 name is printed as a ``$``.
@@ -22,21 +22,15 @@ from matplotlib.ticker import LogLocator, NullLocator
 from PIL import Image
 
 from calib import files
+from calib.procedure.report.figures.style import HALF_WIDTH, INK, QUIET, number
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
 
-BEFORE, AFTER, MARK, QUIET, INK = "#e2a26b", "#17486e", "#b3261e", "#8a8f98", "#22262b"
-# BEFORE, dark enough for letters
-BROWN = "#a8622a"
-# a page's line and half of it [in]
-PAGE_WIDTH, HALF_WIDTH = 7.4, 3.6
 # of print
 DPI = 200
 # of a PNG with a palette, a third as large as one without
 COLOURS = 256
-# stretches of a curve, of which each keeps its smallest and its largest value
-STRETCHES = 700
 STYLE: "dict[RcKeyType, str | float | bool]" = {
     "font.family": "DejaVu Sans",
     "font.size": 7.5,
@@ -117,22 +111,6 @@ def tick_text(value: float, _: object) -> str:
     return number(value)
 
 
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-def number(value: float) -> str:
-    """Return `value` as the label of a tick: plain from about 0.001 to 100 000, otherwise with a power of ten."""
-    if value == 0.0 or 0.99e-3 < abs(value) < 0.99e5:
-        return f"{value:g}"
-    digits, power = f"{value:.0e}".split("e")
-    power_of_ten = f"10{str(int(power)).translate(_RAISED)}"
-    if digits == "1":
-        return power_of_ten
-    if digits == "-1":
-        return f"-{power_of_ten}"
-    return f"{digits}·{power_of_ten}"
-
-
 def legend(figure: Figure, axes: Axes | None, title: str) -> None:
     """Draw a title in the figure's upper left corner, and the legend of `axes` in the upper right corner.
 
@@ -155,26 +133,6 @@ def legend(figure: Figure, axes: Axes | None, title: str) -> None:
             loc="upper right",
             bbox_to_anchor=(1.0 - 0.05 / width, 1.0 - 0.04 / height),
         )
-
-
-def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a curve with fewer points, of which all peaks remain.
-
-    The points are the minimum and maximum of each of `STRETCHES` intervals.
-
-    Args:
-        t: (N,) times [s].
-        values: (N,) values.
-    """
-    size = len(t) // STRETCHES
-    if size < 3:
-        return t, values
-    count = len(t) // size
-    stretches = values[: count * size].reshape(count, size)
-    extremes = np.stack([stretches.argmin(axis=1), stretches.argmax(axis=1)])
-    rows = np.sort(extremes, axis=0) + size * np.arange(count)
-    chosen = np.append(rows.T.ravel(), len(t) - 1)
-    return t[chosen], values[chosen]
 
 
 def png(figure: Figure, dpi: float = DPI) -> bytes:

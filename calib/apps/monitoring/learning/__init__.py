@@ -1,0 +1,1 @@
+"""Update of identified dynamics by the logs of production: `calib update`."""

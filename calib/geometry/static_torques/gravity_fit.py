@@ -1,0 +1,294 @@
+"""Gravity of an arm from the torques that its joints measured at rest: masses, payloads and offsets of the sensors.
+
+    s τ(q) = G(q) (x + x_load) + b + ε
+
+τ are the measured torques of a row, G the gravity regressor by first moments and masses of the bodies, x those of the
+arm, x_load those of what a file's rows carry, b an offset of each sensor. s is -1 for sensors that count the load on
+the joint, not the torque that balances it. The estimate is the most probable one: x is near the description's masses
+(near equal masses in the middle of the links where it has none), b near zero, and the noise ε of each joint is
+estimated. The first file's load is the stated one, or none: the arm's masses then include what it carried.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.poses.measurements import PoseMeasurements
+from calib.errors import Finding, finding
+from calib.geometry.static_torques.column_faults import column_fault
+from calib.robot.chain import Chain
+from calib.robot.kinematics import forward, gravity_torques, joint_frames
+
+# standard deviation of a mass from the described one, as a share of it, and of a centre of mass [m] (our choice)
+MASS_SHARE = 1.0
+CENTRE = 0.15
+# standard deviation of a sensor's offset, as a share of the joint's largest torque (our choice)
+OFFSET = 0.1
+# rounds of weighing the joints by their residuals
+ROUNDS = 8
+# robust sigmas beyond which a row's torque is not that of an arm at rest (our choice)
+MAX_RESIDUAL = 6.0
+# smallest share of the torques' variation that gravity has to explain (our choice)
+MIN_EXPLAINED = 0.7
+# [N m] spread of torques below which a sensor read nothing
+MIN_SPREAD = 1e-3
+# standard deviation of a torque sensor's gain (our choice, as data sheets state it)
+GAIN = 0.01
+# sigmas of its mass from which on a load is stated, and share of the arm's mass below which it is not worth a word
+LOAD_SIGMAS, LEAST_LOAD = 4.0, 0.005
+# share of a stated payload by which torques may differ from it
+STATED_SHARE = 0.15
+# [kg/m²] largest mass of an arm over the square of its length (our choice: four times that of a heavy palletiser)
+MAX_MASS = 800.0
+# described gravity is this many times the measured one where torques are in N·mm (our choice)
+MILLIMETRES = 200.0
+
+
+@dataclass(frozen=True, eq=False)
+class GravityFit:
+    """Gravity of an arm, fitted to the torques its joints measured at rest.
+
+    Attributes:
+        chain: the arm with the fitted masses; single parameters are not right, their torques are.
+        sign: 1.0 where the sensors count the torque that balances the load, -1.0 where they count the load.
+        offset, sigma: (n,) offset of each sensor, and standard deviation of its torques about the model [N m].
+        loads: for each fitted file, its load (4,): first moments [kg m] and mass [kg] in the last body's frame.
+        mass_sigmas: for each fitted file, the standard deviation of the load's mass [kg].
+    """
+
+    chain: Chain
+    sign: float
+    offset: np.ndarray
+    sigma: np.ndarray
+    loads: tuple[np.ndarray, ...] = ()
+    mass_sigmas: tuple[float, ...] = ()
+
+    def balancing(self, block: PoseMeasurements) -> np.ndarray:
+        """Return the measured torques (m, n) of a block as those that balance gravity; NaN where none were measured."""
+        assert block.measured_torque is not None
+        return self.sign * block.measured_torque - self.offset
+
+    def load(self, block: PoseMeasurements) -> tuple[np.ndarray, float]:
+        """Return the load (4,) of a block's rows that explains their torques best, and the sigma of its mass [kg]."""
+        torque = self.balancing(block) - gravity_torques(self.chain, block.q)
+        regressor = gravity_regressor(self.chain, block.q)[..., -4:]
+        deviations = _load_deviations(self.chain)
+        values, covariance = np.zeros(4), np.diag(deviations**2)
+        weights = np.isfinite(torque)
+        for _ in range(ROUNDS):
+            values, covariance = _most_probable(regressor, torque, weights / self.sigma, deviations)
+            residual = torque - regressor @ values
+            spread = np.nanmedian(np.abs(residual), axis=0) / 0.6745
+            weights = np.abs(residual) < MAX_RESIDUAL * np.maximum(spread, self.sigma)
+        return values, _mass_sigma(values, covariance)
+
+
+def gravity_regressor(chain: Chain, q: np.ndarray) -> np.ndarray:
+    """Return the gravity torques (m, n, 4 n) [N m] per unit of each body's first moments [kg m] and mass [kg].
+
+    Args:
+        chain: the arm; its masses do not matter.
+        q: (m, n) joint values [rad or m].
+    """
+    columns = []
+    for body in range(chain.n):
+        for parameter in range(6, 10):
+            unit = np.zeros((chain.n, 10))
+            unit[body, parameter] = 1.0
+            columns.append(gravity_torques(replace(chain, inertias=unit), q))
+    return np.stack(columns, axis=-1)
+
+
+def carried_load(chain: Chain, payload: np.ndarray) -> np.ndarray:
+    """Return payloads (m, 4), mass and centre in the tip's frame, as loads (m, 4) in the last body's frame.
+
+    A centre that is not stated is the tip.
+
+    Args:
+        chain: the arm.
+        payload: mass [kg] and centre of mass [m]; NaN where not stated.
+    """
+    zero = np.zeros((1, chain.n))
+    flange = np.linalg.inv(joint_frames(chain, zero)[-1, 0]) @ forward(chain, zero)[0]
+    mass = np.nan_to_num(payload[:, 0])
+    centre = np.nan_to_num(payload[:, 1:]) @ flange[:3, :3].T + flange[:3, 3]
+    return np.column_stack([mass[:, None] * centre, mass])
+
+
+def reference_masses(chain: Chain) -> np.ndarray:
+    """Return the described standard parameters (n, 10); without masses 1 kg in the middle between successive joints."""
+    if chain.inertias is not None and chain.inertias[:, 9].sum() > 0.0:
+        return np.array(chain.inertias)
+    zero = np.zeros((1, chain.n))
+    frames = joint_frames(chain, zero)[:, 0]
+    ends = np.concatenate([frames[1:, :3, 3], forward(chain, zero)[:, :3, 3]])
+    result = np.zeros((chain.n, 10))
+    for body, (frame, end) in enumerate(zip(frames, ends)):
+        result[body, 6:9] = 0.5 * frame[:3, :3].T @ (end - frame[:3, 3])
+        result[body, 9] = 1.0
+    return result
+
+
+def gravity_fit(chain: Chain, blocks: Sequence[PoseMeasurements]) -> tuple[GravityFit | None, list[Finding]]:
+    """Return the gravity of an arm from the torques measured in blocks, and findings on these torques.
+
+    The result is None where no block has torques, or where gravity does not explain them.
+
+    Args:
+        chain: the arm, with its described masses if they are known.
+        blocks: the blocks of measurements.
+    """
+    measured = [block for block in blocks if block.measured_torque is not None]
+    if not measured or len(chain.driven) != chain.n:
+        return None, []
+    torques = [np.asarray(block.measured_torque) for block in measured]
+    torque = np.concatenate(torques)
+    files = sorted({block.file for block in measured})
+    spread = np.nanmax(np.abs(torque), axis=0, initial=0.0, where=np.isfinite(torque))
+    if spread.max() < MIN_SPREAD:
+        reason, advice = "they are zero in every row", "is the sensors' signal in other columns?"
+        return None, [finding("torques-unused", files=files, reason=reason, cure=advice)]
+    described = reference_masses(chain)
+    regressor = np.concatenate([gravity_regressor(chain, block.q) for block in measured])
+    expected = regressor @ described[:, 6:].ravel()
+    finite = np.isfinite(torque)
+    if finite.any(axis=1).sum() < chain.n:
+        return None, []
+    factor = _factor(expected, torque, finite)
+    if chain.inertias is not None and abs(factor) > MILLIMETRES:
+        reason = f"they are {abs(factor):.0f} times the gravity of the described masses"
+        return None, [finding("torques-unused", files=files, reason=reason, cure="name the columns tau1 [N mm] …")]
+    mass = abs(factor) * float(described[:, 9].sum())
+    heaviest = MAX_MASS * chain.stretched_length() ** 2
+    if mass > heaviest:
+        reason = f"they are the gravity of an arm of {mass:.0f} kg, which is too heavy for its length"
+        return None, [finding("torques-unused", files=files, reason=reason, cure="name the columns tau1 [N mm] …")]
+    fault = column_fault(regressor, np.where(finite, torque, 0.0), finite)
+    if fault is not None:
+        return None, [finding("torques-unused", files=files, reason=fault[0], cure=fault[1])]
+    sign = float(np.sign(factor)) or 1.0
+    prior = abs(factor) * described[:, 6:]
+    fit = _fitted(chain, measured, regressor, sign, prior)
+    explained = 1.0 - _unexplained(fit, measured)
+    if explained < MIN_EXPLAINED:
+        reason = f"gravity explains {100.0 * explained:.0f} % of their variation only"
+        cure = (
+            "were they read at rest, by sensors at the joints (not currents)? Are they of this arm, in its joint order?"
+        )
+        return None, [finding("torques-unused", files=files, reason=reason, cure=cure)]
+    return fit, []
+
+
+def _factor(expected: np.ndarray, torque: np.ndarray, finite: np.ndarray) -> float:
+    """Return the factor by which expected torques (m, n) explain the variation of the measured ones best."""
+    varying = np.where(finite, expected - np.mean(expected, axis=0, where=finite), 0.0)
+    return float(np.sum(varying * np.where(finite, torque, 0.0)) / max(float(np.sum(varying**2)), 1e-12))
+
+
+def _unexplained(fit: GravityFit, measured: Sequence[PoseMeasurements]) -> float:
+    """Return the share of the torques' rms variation that the fitted gravity does not explain."""
+    errors, sizes = [], []
+    for block, load in zip(measured, fit.loads):
+        torque = fit.balancing(block)
+        loads = np.tile(load, (len(block), 1))
+        errors.append(torque - gravity_torques(fit.chain, block.q, loads))
+        sizes.append(torque)
+    torque = np.concatenate(sizes)
+    residual = np.concatenate(errors)
+    varying = torque - np.nanmean(torque, axis=0)
+    return float(np.sqrt(np.nansum(residual**2) / max(float(np.nansum(varying**2)), 1e-12)))
+
+
+def _load_deviations(chain: Chain) -> np.ndarray:
+    """Return the prior standard deviations (4,) of a load: first moments [kg m] and mass [kg], as for the whole arm."""
+    mass = float(reference_masses(chain)[:, 9].sum())
+    lever = CENTRE + float(np.linalg.norm(chain.tail[:3, 3]))
+    return np.array([lever * mass, lever * mass, lever * mass, mass])
+
+
+def _fitted(
+    chain: Chain, measured: Sequence[PoseMeasurements], regressor: np.ndarray, sign: float, prior: np.ndarray
+) -> GravityFit:
+    """Return the most probable gravity.
+
+    Args:
+        chain: the arm.
+        measured: blocks with measured torques.
+        regressor: (m, n, 4 n) gravity regressor of all their rows.
+        sign: sign of the sensors.
+        prior: (n, 4) first moments and masses about which the prior is.
+    """
+    n = chain.n
+    torque = sign * np.concatenate([np.asarray(block.measured_torque) for block in measured])
+    finite = np.isfinite(torque)
+    torque = torque - regressor @ prior.ravel()
+    loads = [np.zeros(4) for _ in measured]
+    columns = [regressor, np.tile(np.eye(n), (len(torque), 1, 1))]
+    masses = np.maximum(prior[:, 3], 1e-3 * prior[:, 3].max())
+    deviations = np.column_stack([*[masses * CENTRE] * 3, masses * MASS_SHARE]).ravel()
+    largest = np.max(np.abs(np.where(finite, torque, 0.0)), axis=0)
+    deviations = np.concatenate([deviations, np.maximum(OFFSET * largest, MIN_SPREAD)])
+    first = 0
+    load_deviations = _load_deviations(replace(chain, inertias=_with_parameters(chain, prior)))
+    for number, block in enumerate(measured):
+        rows = np.arange(first, first + len(block))
+        first += len(block)
+        if number == 0:
+            if block.payload is not None:
+                loads[0] = carried_load(chain, block.payload).mean(axis=0)
+                torque[rows] -= regressor[rows][..., -4:] @ loads[0]
+            continue
+        of_load = np.zeros((len(torque), n, 4))
+        of_load[rows] = regressor[rows][..., -4:]
+        columns.append(of_load)
+        deviations = np.concatenate([deviations, load_deviations])
+    matrix = np.concatenate(columns, axis=2)
+    sigma = np.maximum(np.nanstd(np.where(finite, torque, np.nan), axis=0), MIN_SPREAD)
+    values, covariance = np.zeros(matrix.shape[2]), np.eye(matrix.shape[2])
+    weights = finite.astype(float)
+    for _ in range(ROUNDS):
+        values, covariance = _most_probable(matrix, torque, weights / sigma, deviations)
+        residual = np.where(finite, torque - matrix @ values, np.nan)
+        sigma = np.maximum(np.nanmedian(np.abs(residual), axis=0) / 0.6745, MIN_SPREAD)
+        weights = (np.abs(residual) < MAX_RESIDUAL * sigma).astype(float)
+    masses = prior + values[: 4 * n].reshape(n, 4)
+    sigmas = [0.0]
+    for number in range(1, len(measured)):
+        start = 5 * n + 4 * (number - 1)
+        loads[number] = values[start : start + 4]
+        sigmas.append(_mass_sigma(loads[number], covariance[start : start + 4, start : start + 4]))
+    fitted = replace(chain, inertias=_with_parameters(chain, masses))
+    return GravityFit(fitted, sign, values[4 * n : 5 * n], sigma, tuple(loads), tuple(sigmas))
+
+
+def _with_parameters(chain: Chain, parameters: np.ndarray) -> np.ndarray:
+    """Return the chain's standard parameters (n, 10) with other first moments and masses (n, 4)."""
+    result = np.zeros((chain.n, 10))
+    if chain.inertias is not None:
+        result = np.array(chain.inertias)
+    result[:, 6:] = parameters
+    return result
+
+
+def _most_probable(
+    matrix: np.ndarray, torque: np.ndarray, weights: np.ndarray, deviations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the most probable parameters (p,) and their covariance (p, p).
+
+    Args:
+        matrix: (m, n, p) regressor.
+        torque: (m, n) torques [N m]; of no effect where a weight is 0.
+        weights: (m, n) reciprocal standard deviations of the torques, 0 for a torque that is not used.
+        deviations: (p,) standard deviations of the prior about zero.
+    """
+    weighting = np.broadcast_to(weights, torque.shape)
+    W = (matrix * weighting[..., None] * deviations).reshape(-1, matrix.shape[2])
+    y = (np.where(weighting > 0.0, torque, 0.0) * weighting).ravel()
+    inverse = np.linalg.inv(W.T @ W + np.eye(W.shape[1]))
+    return deviations * (inverse @ (W.T @ y)), inverse * np.outer(deviations, deviations)
+
+
+def _mass_sigma(load: np.ndarray, covariance: np.ndarray) -> float:
+    """Return the standard deviation of a load's mass [kg], with that of the sensors' gain."""
+    return float(np.hypot(np.sqrt(covariance[3, 3]), GAIN * load[3]))

@@ -1,0 +1,154 @@
+"""Torques and loads of blocks of measurements: measured ones, or those of the masses with what the arm carries."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.poses.measurements import PoseMeasurements
+from calib.errors import Finding, finding
+from calib.geometry.static_torques.gravity_fit import (
+    LEAST_LOAD,
+    LOAD_SIGMAS,
+    MAX_RESIDUAL,
+    STATED_SHARE,
+    GravityFit,
+    carried_load,
+)
+from calib.geometry.static_torques.load_errors import SAME_LOAD, load_masses
+from calib.robot.calibrated import BY_TORQUE, Deflection
+from calib.robot.chain import Chain
+from calib.robot.kinematics import gravity_torques
+
+# sources of the torques that drive the compliance
+MEASURED, MODELLED = "measured", "modelled"
+
+
+def gravity_of(chain: Chain, q: np.ndarray, load: np.ndarray | None = None) -> np.ndarray | None:
+    """Return gravity torques (m, n) [N m or N] at joint values q (m, n); None if the robot's masses are unknown.
+
+    Args:
+        chain: the arm with its masses.
+        q: joint values [rad or m].
+        load: (m, 4) load of the last body, as of `gravity_torques`; None for no load.
+    """
+    if chain.inertias is None or len(chain.driven) != chain.n:
+        return None
+    return gravity_torques(chain, q, load)
+
+
+def with_stated_load(chain: Chain, block: PoseMeasurements) -> PoseMeasurements:
+    """Return a block with the stated load, and the torques by masses and load.
+
+    Args:
+        chain: the arm with its masses.
+        block: the measurements.
+    """
+    load = None
+    if block.payload is not None:
+        load = carried_load(chain, block.payload)
+    return replace(block, load=load, torque=gravity_of(chain, block.q, load))
+
+
+def driven(block: PoseMeasurements, gravity: GravityFit, source: str = MEASURED) -> PoseMeasurements:
+    """Return a block with load and torques of an arm whose gravity was fitted.
+
+    Where torques were measured, they tell the load; else it is the stated one. Measured torques of rows in which the
+    arm was not at rest are not used.
+
+    Args:
+        block: the measurements.
+        gravity: the fitted gravity.
+        source: `MEASURED` takes measured torques where there are any, `MODELLED` those of masses and load.
+    """
+    if block.measured_torque is None:
+        return with_stated_load(gravity.chain, block)
+    load, sigma = gravity.load(block)
+    if not _differs(gravity, load[3], sigma, 0.0):
+        load = np.zeros(4)
+    loads = np.tile(load, (len(block), 1))
+    modelled = gravity_torques(gravity.chain, block.q, loads)
+    torque = modelled
+    if source == MEASURED:
+        measured = gravity.balancing(block)
+        torque = np.where(_at_rest(gravity, measured - modelled), measured, modelled)
+    return replace(block, load=loads, torque=torque)
+
+
+def load_findings(block: PoseMeasurements, gravity: GravityFit) -> list[Finding]:
+    """Return what the measured torques of a block say of its load, and of rows in which the arm was not at rest.
+
+    Args:
+        block: the measurements.
+        gravity: the fitted gravity.
+    """
+    if block.measured_torque is None:
+        return []
+    name = Path(block.file).name
+    load, sigma = gravity.load(block)
+    loads = np.tile(load, (len(block), 1))
+    residual = gravity.balancing(block) - gravity_torques(gravity.chain, block.q, loads)
+    moving = np.flatnonzero(~np.all(_at_rest(gravity, residual) | np.isnan(residual), axis=1))
+    findings = []
+    if len(moving):
+        rows = block.rows[moving].tolist()
+        findings.append(finding("torques-of-motion", file=name, count=len(moving), rows=rows))
+    mass = float(load[3])
+    if block.payload is None or np.isnan(block.payload[:, 0]).all():
+        if _differs(gravity, mass, sigma, 0.0):
+            findings.append(finding("payload-found", file=name, mass=mass, sigma=sigma))
+        return findings
+    stated_mass = float(np.nanmean(block.payload[:, 0]))
+    if _differs(gravity, mass, sigma, stated_mass) and abs(mass - stated_mass) > STATED_SHARE * max(stated_mass, mass):
+        findings.append(finding("payload-differs", file=name, stated=stated_mass, mass=mass, sigma=sigma))
+    return findings
+
+
+def torques_used(deflection: Deflection, gravity: GravityFit | None, source: str) -> list[Finding]:
+    """Return a finding on the source of the torques that drive the compliance; none without compliance by torques.
+
+    Args:
+        deflection: the fitted corrections.
+        gravity: the fitted gravity; None without measured torques.
+        source: `MEASURED` or `MODELLED`.
+    """
+    if not any(term.basis in BY_TORQUE for term in deflection.terms):
+        return []
+    if gravity is None:
+        return [finding("torques-used", source="of the described masses", sigma=None, joint=None, worst=None)]
+    texts = {MEASURED: "as measured; elsewhere by the masses that explain these", MODELLED: "of masses fitted to them"}
+    worst = int(np.argmax(gravity.sigma))
+    sigma = float(np.sqrt(np.mean(gravity.sigma**2)))
+    joint = gravity.chain.joint_names[worst]
+    worst_sigma = float(gravity.sigma[worst])
+    return [finding("torques-used", source=texts[source], sigma=sigma, joint=joint, worst=worst_sigma)]
+
+
+def load_changes(fitted: Sequence[PoseMeasurements], unseen: Sequence[PoseMeasurements]) -> list[Finding]:
+    """Return a finding on each block that was measured with another load than all fitted ones.
+
+    Args:
+        fitted: the fitted blocks.
+        unseen: blocks that were not fitted.
+    """
+    masses = load_masses(fitted)
+    findings = []
+    for block in unseen:
+        (mass,) = load_masses([block])
+        nearest = min(masses, key=lambda fitted_mass: abs(fitted_mass - mass), default=mass)
+        if abs(mass - nearest) > SAME_LOAD:
+            findings.append(finding("load-changed", file=Path(block.file).name, mass=mass, fitted=nearest))
+    return findings
+
+
+def _differs(gravity: GravityFit, mass: float, sigma: float, reference: float) -> bool:
+    """Return whether a mass [kg] differs from another one by more than its sigma and more than is worth a word."""
+    assert gravity.chain.inertias is not None
+    smallest = LEAST_LOAD * float(gravity.chain.inertias[:, 9].sum())
+    return abs(mass - reference) > max(LOAD_SIGMAS * sigma, smallest)
+
+
+def _at_rest(gravity: GravityFit, residual: np.ndarray) -> np.ndarray:
+    """Return whether a torque (m, n) was measured, and agrees with gravity [N m] as those of an arm at rest do."""
+    return np.asarray(np.abs(residual) < MAX_RESIDUAL * gravity.sigma)

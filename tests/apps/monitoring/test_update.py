@@ -1,0 +1,182 @@
+"""calib update: logs are predicted, then learnt from; what is not as predicted is named and not averaged in."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import planted_motion as planted
+import pytest
+
+import calib
+from calib.apps.monitoring.learning.dynamics_update import DRIFT, LOG_TABLE, DynamicsUpdate
+from calib.apps.monitoring.learning.logs import common_share, dated, sketch
+from calib.apps.monitoring.learning.update import update_dynamics
+from calib.data.csv_table import read_table
+from calib.errors import MeasurementError, UsageError
+from calib.procedure.report.figures import figure_data
+from calib.result_kinds import kind_of
+from calib.results.result_classes import open_result
+from calib.robot import description
+
+SECONDS = 8.0
+SIGN = np.array([0.0, 1.5, 0.0])  # change of Coulomb friction [N m]
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of the planted arm's identification from 20 s."""
+    folder = tmp_path_factory.mktemp("update")
+    robot = description.write(folder / "planted.toml", planted.arm())
+    first = planted.write(folder, "first.npz", 0)
+    model = calib.identify_dynamics(robot, first, friction="standard")
+    return model.save(folder / "dynamics", plots=False)
+
+
+def log(folder: Path, date: str, seed: int, torque: np.ndarray | float = 0.0, factor: float = 1.0) -> str:
+    """Write a log of 8 s with torques in addition (N, 3) or (3,), times a factor; return its path."""
+    series = planted.series(seed, duration=SECONDS)
+    path = folder / f"log_{date}.npz"
+    np.savez(path, t=series["t"], q=series["q"], tau=factor * (series["tau"] + torque))
+    return str(path)
+
+
+def codes(update: DynamicsUpdate) -> list[str]:
+    """Return the codes of an update's findings."""
+    return [finding.code for finding in update.noticed]
+
+
+def test_logs_in_turn_and_together_give_the_same_model(identified: Path, tmp_path: Path):
+    logs = [log(tmp_path, f"2026-03-{day:02}", day) for day in (1, 3, 8)]
+    together = update_dynamics(identified, logs)
+    folder = update_dynamics(identified, logs[:1]).save(tmp_path / "a", plots=False)
+    folder = update_dynamics(folder, logs[1:2]).save(tmp_path / "b", plots=False)
+    in_turn = update_dynamics(folder, logs[2:])
+    assert codes(together) == codes(in_turn) == []
+    values, covariance = together.state.bank.posterior()
+    sigma = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose((in_turn.state.bank.posterior()[0] - values) / sigma, 0.0, atol=1e-6)
+    assert [record.name for record in in_turn.state.record.logs] == [Path(path).name for path in logs]
+    assert in_turn.state.bank.factors.nbytes == together.state.bank.factors.nbytes
+    assert "3 of 3 logs" in together.verdict.reason
+    assert together.verdict == "not judged"
+
+
+def test_the_folder_is_an_identification_with_the_values_of_today(identified: Path, tmp_path: Path):
+    update = update_dynamics(identified, [log(tmp_path, "2026-03-01", 4), log(tmp_path, "2026-03-02", 5)])
+    folder = update.save(tmp_path / "today")
+    kind = kind_of(folder)
+    assert kind is not None and kind.name == "identification"
+    assert open_result(folder).verdict == "not judged"
+    assert set(figure_data.of_folder(folder)) == {"drift"}
+    assert read_table(folder / DRIFT).numbers("day", None).size == 2
+    assert read_table(folder / LOG_TABLE).numbers("seconds", None).size == 2
+    written = json.loads((folder / "dynamics.json").read_text())
+    values = update.state.model.updated(update.state.bank.posterior()[0]).values
+    assert [entry["value"] for entry in written["terms"]] == pytest.approx(
+        values[update.state.model.dynamics.model.inertial :]
+    )
+    assert str(update)
+
+
+def test_a_load_that_was_not_stated_is_found_and_not_averaged_in(identified: Path, tmp_path: Path):
+    series = planted.series(6, payload=True, duration=SECONDS)
+    path = tmp_path / "log_2026-03-05.npz"
+    np.savez(path, **series)
+    update = update_dynamics(identified, [log(tmp_path, "2026-03-04", 7), str(path)])
+    assert codes(update) == ["log-load"]
+    mass, sigma = update.noticed[0].values["mass"], update.noticed[0].values["sigma"]
+    assert mass == pytest.approx(planted.PAYLOAD[-1], abs=max(3 * sigma, 0.1))
+    assert [record.learnt for record in update.logs] == [True, False]
+    assert update.verdict == "marginal"
+
+
+def test_changed_friction_and_a_changed_gain_are_learnt_anew(identified: Path, tmp_path: Path):
+    velocity = planted.motion(8, duration=SECONDS)[2]
+    update = update_dynamics(identified, [log(tmp_path, "2026-03-05", 8, 3.0 * SIGN * np.sign(velocity))])
+    assert codes(update) == ["log-friction"]
+    k = [update.state.record.names[index] for index in update.state.drifting].index("Fc2")
+    assert update.logs[0].parameters[k] == pytest.approx(planted.DRIVES["Fc"][1] + 4.5, abs=0.3)
+    torque = planted.series(9, duration=SECONDS)["tau"] * [0.0, 0.4, 0.0]
+    update = update_dynamics(identified, [log(tmp_path, "2026-03-06", 9, torque)])
+    assert codes(update) == ["log-gain"]
+    assert update.noticed[0].values["factor"] == pytest.approx(1.4, abs=0.02)
+
+
+def test_torques_in_another_unit_are_not_learnt_from(identified: Path, tmp_path: Path):
+    update = update_dynamics(identified, [log(tmp_path, "2026-03-05", 10, factor=10.0)])
+    assert codes(update) == ["log-unit"]
+    assert update.noticed[0].values["factor"] == pytest.approx(10.0, rel=0.02)
+
+
+def test_torques_that_no_parameters_explain_weigh_less(identified: Path, tmp_path: Path):
+    t = planted.motion(11, duration=SECONDS)[0]
+    waves = 12.0 * np.sin(2 * np.pi * 1.7 * t)[:, None] * [1.0, 0.0, 0.0]
+    update = update_dynamics(identified, [log(tmp_path, "2026-03-05", 11, waves)])
+    assert codes(update) == ["log-motion"]
+
+
+def test_a_log_of_another_arm_is_not_learnt_from(identified: Path, tmp_path: Path):
+    t, q, v, a = planted.motion(12, duration=SECONDS)
+    values = planted.truth()
+    values[:30] *= np.resize([1.6, 0.5, 1.0, 1.3, 0.7], 30)
+    values[30:] *= np.resize([3.0, 0.3, 2.0, -4.0], 12)
+    path = tmp_path / "log_2026-03-05.npz"
+    np.savez(path, t=t, q=q, tau=planted.model().regressor(q, v, a) @ values)
+    update = update_dynamics(identified, [str(path)])
+    assert codes(update) == ["log-unknown"]
+    assert not update.logs[0].learnt
+
+
+def test_the_same_log_is_not_counted_twice(identified: Path, tmp_path: Path):
+    first = log(tmp_path, "2026-03-05", 13)
+    again = tmp_path / "copy_2026-03-09.npz"
+    again.write_bytes(Path(first).read_bytes())
+    update = update_dynamics(identified, [first, f"{again}@2:6"])
+    assert codes(update) == ["log-repeated"]
+    once = update_dynamics(identified, [first])
+    assert update.state.bank.count == once.state.bank.count
+
+
+def test_logs_are_taken_in_the_order_of_their_dates(identified: Path, tmp_path: Path):
+    early, late = log(tmp_path, "2026-03-01", 14), log(tmp_path, "2026-03-09", 15)
+    update = update_dynamics(identified, [late, early])
+    assert codes(update) == ["logs-out-of-order"]
+    folder = update_dynamics(identified, [late]).save(tmp_path / "late", plots=False)
+    with pytest.raises(UsageError, match="older than log_2026-03-09"):
+        update_dynamics(folder, [early])
+    undated = tmp_path / "log_a.npz"
+    undated.write_bytes(Path(early).read_bytes())
+    with pytest.raises(UsageError, match="name all alike"):
+        update_dynamics(folder, [str(undated)])
+    assert codes(update_dynamics(identified, [str(undated)])) == ["logs-undated"]
+
+
+def test_enough_stops_at_the_stated_sigma(identified: Path, tmp_path: Path):
+    logs = [log(tmp_path, f"2026-03-{day:02}", 20 + day) for day in (1, 2, 3)]
+    update = update_dynamics(identified, logs, enough=90.0)
+    assert codes(update) == ["learnt-enough"]
+    assert len(update.logs) == 1
+
+
+def test_half_a_second_at_rest_is_named_and_the_others_are_learnt(identified: Path, tmp_path: Path):
+    short = tmp_path / "log_2026-03-02.npz"
+    t = np.arange(100) / 200.0
+    np.savez(short, t=t, q=np.zeros((100, 3)), tau=np.zeros((100, 3)))
+    update = update_dynamics(identified, [str(short), log(tmp_path, "2026-03-03", 16)])
+    assert codes(update) == ["log-unreadable"]
+    with pytest.raises(MeasurementError):
+        update_dynamics(identified, [str(short)])
+
+
+def test_dates_come_from_the_last_part_of_the_path_that_has_them():
+    texts = [entry.date for entry in dated(["2025-01-01/a_20260314.csv@0:5", "x/2026-03-15_1230/b.csv"], 1)]
+    assert texts == ["2026-03-14", "2026-03-15 12:30"]
+    with pytest.raises(UsageError, match="no date"):
+        dated(["a_2026-03-14.csv", "b.csv"], 1)
+
+
+def test_a_sketch_recognises_a_part_of_a_log():
+    hashes = np.sort(np.random.default_rng(0).integers(0, 2**63, 5000, dtype=np.uint64))
+    assert common_share(hashes, sketch(hashes)) == 1.0
+    assert common_share(hashes[::2], sketch(hashes)) == pytest.approx(0.5, abs=0.05)
+    assert common_share(hashes + np.uint64(1), sketch(hashes)) == 0.0

@@ -1,0 +1,170 @@
+"""Torques that joints measured at rest: gravity, payloads and faults found by them; the arm is Pinocchio's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loaded_arm import GivingArm, urdf
+
+from calib.data.poses.fit_options import parse_options
+from calib.data.poses.pose_files import read_measurements
+from calib.geometry.static_torques.gravity_fit import gravity_fit
+from calib.geometry.static_torques.sources import MODELLED, driven, load_changes, load_findings
+from calib.robot.formats import urdf as urdf_format
+
+JOINTS = [f"joint{number}" for number in range(1, 8)]
+
+
+@pytest.fixture(scope="module")
+def arm():
+    return GivingArm(seed=3)
+
+
+@pytest.fixture(scope="module")
+def chain():
+    return urdf_format.parse(urdf(), "giving.urdf")
+
+
+@pytest.fixture(scope="module")
+def folder(arm, tmp_path_factory):
+    path = tmp_path_factory.mktemp("loads")
+    arm.write(path / "empty.csv", arm.table(80, 1))
+    arm.write(path / "loaded.csv", arm.table(40, 2, 2.5, (0.02, -0.03, 0.12)))
+    return path
+
+
+def block(path, **options):
+    return read_measurements(path, JOINTS, parse_options(options))[0]
+
+
+@pytest.fixture(scope="module")
+def gravity(chain, folder):
+    fit, findings = gravity_fit(chain, [block(folder / "empty.csv")])
+    assert findings == []
+    return fit
+
+
+def faulty(folder, change):
+    measured = block(folder / "empty.csv")
+    torque = np.array(measured.measured_torque)
+    change(torque)
+    return replace(measured, measured_torque=torque)
+
+
+def test_gravity_without_described_masses_predicts_the_torques_of_other_poses(arm, gravity, tmp_path):
+    other = block(arm.write(tmp_path / "other.csv", arm.table(60, 7)))
+    residual = gravity.balancing(other) - driven(other, gravity, MODELLED).torque
+    assert np.abs(residual.mean(axis=0)).max() < 0.1
+    assert residual.std(axis=0).max() < 0.4  # 0.1 N·m of noise, 1 % of gain
+
+
+def test_payload_is_found_with_its_mass(folder, gravity):
+    loaded = block(folder / "loaded.csv")
+    (found,) = load_findings(loaded, gravity)
+    assert found.code == "payload-found"
+    assert abs(found.values["mass"] - 2.5) < 3.0 * found.values["sigma"] < 0.3
+    assert driven(loaded, gravity).load[0, 3] == pytest.approx(found.values["mass"])
+
+
+def test_a_file_of_the_same_load_tells_no_payload(arm, gravity, tmp_path):
+    other = block(arm.write(tmp_path / "other.csv", arm.table(60, 8)))
+    assert load_findings(other, gravity) == []
+    assert not driven(other, gravity).load.any()
+
+
+def test_payload_stated_twice_as_heavy_is_named_and_the_torques_are_believed(folder, gravity):
+    loaded = block(folder / "loaded.csv", payload={"mass": 5.0})
+    (differs,) = load_findings(loaded, gravity)
+    assert differs.code == "payload-differs" and differs.values["stated"] == 5.0
+    assert driven(loaded, gravity).load[0, 3] == pytest.approx(2.5, abs=0.1)
+    assert load_findings(block(folder / "loaded.csv", payload={"mass": 2.5}), gravity) == []
+
+
+def test_stated_payload_drives_a_file_without_torques(folder, gravity):
+    stated = replace(block(folder / "loaded.csv", payload={"mass": 2.5, "centre": [0.02, -0.03, 0.12]}))
+    silent = driven(replace(stated, measured_torque=None), gravity)
+    assert np.abs(silent.torque - driven(stated, gravity, MODELLED).torque).max() < 1.5
+    assert silent.load[0, 3] == 2.5
+
+
+def test_two_files_of_different_loads_are_fitted_together(chain, folder):
+    blocks = [block(folder / "empty.csv"), block(folder / "loaded.csv")]
+    fit, _ = gravity_fit(chain, blocks)
+    assert fit.loads[1][3] == pytest.approx(2.5, abs=0.1) and not fit.loads[0].any()
+    (changed,) = load_changes([driven(blocks[0], fit)], [driven(blocks[1], fit)])
+    assert changed.code == "load-changed" and changed.values["fitted"] == 0.0
+
+
+def test_torques_in_one_of_two_files_drive_both(chain, folder):
+    silent = replace(block(folder / "loaded.csv"), measured_torque=None)
+    fit, _ = gravity_fit(chain, [silent, block(folder / "empty.csv")])
+    assert driven(silent, fit).torque.shape == (40, 7)
+    assert load_findings(silent, fit) == []
+
+
+def test_sensors_that_count_the_load_are_recognised(chain, folder, gravity):
+    turned, _ = gravity_fit(chain, [faulty(folder, lambda torque: np.negative(torque, out=torque))])
+    assert turned.sign == -gravity.sign
+    assert np.allclose(turned.chain.inertias, gravity.chain.inertias, atol=1e-6)
+
+
+def reverse(torque):
+    torque[:, 1] *= -1.0
+
+
+def exchange(torque):
+    torque[:, [1, 3]] = torque[:, [3, 1]]
+
+
+def shuffle(torque):
+    np.random.default_rng(0).shuffle(torque)
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        (reverse, "tau2 reversed"),
+        (exchange, "tau2 and tau4 exchanged"),
+        (lambda torque: torque.fill(0.0), "zero in every row"),
+        (lambda torque: np.multiply(torque, 1e3, out=torque), "kg"),
+        (shuffle, "of their variation only"),
+    ],
+)
+def test_torques_that_contradict_gravity_are_not_used(chain, folder, change, says):
+    fit, (unused,) = gravity_fit(chain, [faulty(folder, change)])
+    assert fit is None
+    assert unused.code == "torques-unused" and says in unused.values["reason"]
+
+
+def test_described_masses_tell_newton_millimetres(folder):
+    chain = urdf_format.parse(urdf(masses=True), "giving.urdf")
+    _, (unused,) = gravity_fit(chain, [faulty(folder, lambda torque: np.multiply(torque, 1e3, out=torque))])
+    assert "N mm" in unused.values["cure"]
+
+
+def test_rows_of_a_swinging_arm_are_named_and_replaced(chain, folder):
+    def swing(torque):
+        torque[[4, 9]] += 15.0
+        torque[20:23] = np.nan
+
+    measured = faulty(folder, swing)
+    fit, _ = gravity_fit(chain, [measured])
+    (moving,) = load_findings(measured, fit)
+    assert moving.code == "torques-of-motion" and list(moving.values["rows"]) == [5, 10]
+    torque = driven(measured, fit).torque
+    assert np.isfinite(torque).all()
+    assert np.abs(torque - driven(block(folder / "empty.csv"), fit).torque)[[4, 9, 20]].max() < 1.0
+
+
+def test_friction_at_rest_is_smoothed_by_the_masses(chain, tmp_path):
+    """Torques of motors: friction of either sign is in each; those of the fitted masses are nearer to gravity."""
+    arm = GivingArm(seed=3, friction=0.08)
+    measured = block(arm.write(tmp_path / "motors.csv", arm.table(80, 1)))
+    fit, findings = gravity_fit(chain, [measured])
+    clean, _ = gravity_fit(
+        chain, [block(GivingArm(seed=3).write(tmp_path / "clean.csv", GivingArm(seed=3).table(80, 1)))]
+    )
+    assert findings == []
+    truth = driven(measured, clean, MODELLED).torque
+    errors = [np.abs(driven(measured, fit, source).torque - truth).mean() for source in ("measured", MODELLED)]
+    assert errors[1] < 0.5 * errors[0]
