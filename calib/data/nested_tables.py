@@ -202,7 +202,7 @@ def _spreadsheet(path: Path) -> NestedTable | None:
             sheets = sorted(filter(_SHEET.fullmatch, names), key=_sheet_number)
             tables = {name: _sheet_rows(ET.fromstring(archive.read(name)), shared) for name in sheets}
     except (OSError, zipfile.BadZipFile, ET.ParseError, ValueError, IndexError, RuntimeError) as error:
-        raise MeasurementError(f"cannot be read as a spreadsheet ({error}): save a spreadsheet as CSV", path) from error
+        raise MeasurementError(f"cannot be read as a spreadsheet ({error}): save the sheet as CSV", path) from error
     filled = [name for name, rows in tables.items() if rows]
     if not filled:
         refuse_data(path, "has no sheet with cells")
