@@ -36,6 +36,8 @@ PENDANTS = (
 )
 # first words of columns that are no joints
 TARGET_WORDS = frozenset(("x", "y", "z", "t", "time", "nr", "no", "row", "tag", "name", "point", "punkt"))
+# units as words of names; a rail is in m beside turning joints in deg
+UNIT_WORDS = frozenset(("mm", "m", "cm", "deg", "degrees", "rad"))
 _BREAK = re.compile(r"(?<=[a-zäöü])(?=[A-ZÄÖÜ])")
 _WORD = re.compile(r"[^\W\d_]+|\d+")
 
@@ -226,6 +228,7 @@ def _by_names(header: Sequence[str], names: Sequence[tuple[str, ...]]) -> list[J
         for name in longest:
             remainder = _without(terms, name)
             if remainder is not None:
+                remainder = tuple(filterfalse(UNIT_WORDS.__contains__, remainder))
                 by_words.setdefault(remainder, {}).setdefault(name, column)
                 break
     result = []

@@ -57,7 +57,7 @@ def translated(path: str | Path) -> NestedTable | None:
     path = Path(path)
     with open(path, "rb") as file:
         head = file.read(HEAD)
-    if head[:2] == b"PK":
+    if head[:2] == b"PK" and (path.suffix.lower() == ".xlsx" or zipfile.is_zipfile(path)):
         return _spreadsheet(path)
     text = head.decode("utf-8-sig", errors="replace").lstrip()
     if re.match(r"<(\?xml|[A-Za-z])", text):

@@ -494,6 +494,10 @@ def with_shapes(sheet: Sheet, robot: Joints) -> Sheet:
         return sheet
     unread = {*joints, *sheet.options.columns.values()}
     names = [name for name in sheet.table.header if name not in unread]
+    # X1 Y1 Z1, X2 …: several targets
+    capitals = {name.lower(): name for name in names if _TARGET.fullmatch(name.lower()) and name.isupper()}
+    if len(capitals) > 3:
+        sheet = replace(sheet, options=replace(sheet.options, columns={**capitals, **sheet.options.columns}))
     targets, *_ = _find_targets(sheet)
     matrices = matrices_by_shape(sheet.table, names)
     if not targets:

@@ -115,7 +115,7 @@ def translated(path: str | Path) -> InstrumentExport | None:
             return None
         names, units, differs = _columns(grid)
         has_commas = grid.mark == "," and bool(names)
-        if not recognises(names) and not _is_ours(names) and not has_commas:
+        if not recognises(names) and not _is_ours(names) and not has_commas and not _has_title(lines, grid, names):
             return None
         preset = _preset(lines)
         is_plain = not preset and grid.mark == "." and encoding != "utf-16" and not differs
@@ -146,6 +146,18 @@ def translated(path: str | Path) -> InstrumentExport | None:
     left_out = () if preset else _left_out(lines, grid)
     export.notes = (f"{note}: columns {', '.join(filter(None, names))}", *left_out)
     return export
+
+
+def _has_title(lines: Sequence[str], grid: Grid, names: Sequence[str]) -> bool:
+    """Return whether a line of one cell stands above a complete row of names: as CSV the file cannot be read.
+
+    Args:
+        lines: the text's lines.
+        grid: position of its numbers.
+        names: names of the columns.
+    """
+    first = _first_content(lines)
+    return first < grid.first - 1 and all(names) and bool(names) and len(_split(lines[first], grid.separator)) == 1
 
 
 def unnamed_table(path: str | Path) -> Table | None:

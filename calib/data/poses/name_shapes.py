@@ -212,7 +212,9 @@ def _named_angles(names: Sequence[str], angle_names: tuple[str, ...]) -> list[Sh
     by_words: dict[tuple[str, ...], Mapped] = {}
     for name in names:
         terms = words_of(name)
-        if len(angle_names[0]) == 1 and not (len(terms) == 1 and name.isupper()):
+        # A B C, or a_deg b_deg c_deg
+        bare = list(filterfalse(UNIT_WORDS.__contains__, terms))
+        if len(angle_names[0]) == 1 and not (len(bare) == 1 and (name.isupper() or len(bare) < len(terms))):
             continue
         for angle in angle_names:
             if terms.count(angle) == 1:

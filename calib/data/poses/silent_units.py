@@ -75,7 +75,10 @@ def _ask_for_counts(sheet: Sheet, layout: Layout, robot: Joints) -> None:
     units = {sheet.unit(name, "joints").lower() for name in turning}
     if not turning or not units <= {"", *COUNT_WORDS}:
         return
-    counts = np.column_stack([sheet.table.numbers(name, None, gaps=True) for name in turning])
+    cells = [sheet.table.cells[sheet.table.index(name)] for name in turning]
+    if any(column.dtype != float for column in cells):
+        return
+    counts = np.column_stack(cells)
     if (counts % 1.0 != 0.0).any() or _share_above(sheet, turning, MAX_DEGREES) <= MOST_ROWS:
         return
     encoders = [f"counts/{per_turn}@{zero}" for per_turn in COUNTS_PER_TURN for zero in (0, per_turn // 2)]

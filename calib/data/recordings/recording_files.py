@@ -11,6 +11,7 @@ their own: ``calib join``.
 """
 
 import logging
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -21,7 +22,7 @@ import numpy as np
 
 from calib.controllers.axes import as_described, named_joints
 from calib.controllers.table import motors_as_described
-from calib.data.csv_table import Table, read_header, read_table
+from calib.data.csv_table import Table, encoding_of, read_header, read_table
 from calib.data.joint_columns import words_of
 from calib.data.recordings import log_columns
 from calib.data.recordings.archives import read_archive
@@ -485,8 +486,24 @@ def _values(table: Table, column: int, series: str, options: RecordingOptions) -
         options: options for reading the file, which may state a unit.
     """
     unit = options.units.get(series, "")
+    if not unit and not table.units[column] and series != "t":
+        unit = _unit_of_name(table.header[column], series)
     factor = table.factor(column, SCALES[series], unit)
     return (table.numbers(table.header[column], None, gaps=True) - table.zero(column, unit)) * factor
+
+
+def _unit_of_name(name: str, series: str) -> str:
+    """Return the unit in which a column's name ends (``i1_mA``, ``dq1_deg_s``); "" without one.
+
+    Args:
+        name: the column's name; units of one letter are not told from it.
+        series: the toolkit's name of the series, which determines the accepted units.
+    """
+    terms = re.split(r"[\W_]+", name.lower())
+    for unit in ("/".join(terms[-2:]), terms[-1]):
+        if len(unit) > 1 and unit in SCALES[series]:
+            return unit
+    return ""
 
 
 def _stamps(table: Table, columns_of: dict[str, list[int]], options: RecordingOptions) -> tuple[np.ndarray, list[str]]:
@@ -647,7 +664,8 @@ def _reader(path: Path, ends: Ends, companions: Sequence[Path]) -> Reader:
         return partial(read_archive, ends=ends)
     if head and path.suffix == ".npz":
         refuse_data(path, "is not a NumPy archive despite its name: was it written by np.savez?")
-    if not head or (b"\0" in head and head[:2] != b"PK"):
+    is_text = b"\0" not in head or encoding_of(head) == "utf-16"
+    if not head or (not is_text and head[:2] != b"PK"):
         fault = "is neither a NumPy archive, a bag nor text" if head else "is empty"
         refuse_data(path, f"{fault}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder")
     if len(head) == 1 << 16 and b"\n" not in head and head[:2] != b"PK":

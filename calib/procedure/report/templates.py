@@ -56,7 +56,8 @@ def read(package: str, file: str) -> str:
 def filled(package: str, file: str, **values: object) -> str:
     """Return a template filled with values.
 
-    Templates may import ``blocks.html`` and print the variable ``style``, which contains the common style sheet.
+    Templates may import ``blocks.html``, extend another one of their package, and print the variable ``style``, which
+    contains the common style sheet.
 
     Args:
         package: package that contains the template.
@@ -119,7 +120,10 @@ def _template(package: str, file: str) -> jinja2.Template:
     """Return the compiled template in a file of a package; templates are cached within a process."""
     import jinja2  # slow to load, and not needed to write the rest
 
-    loader = jinja2.FunctionLoader(lambda name: read(HERE, name))
+    def template_text(name: str) -> str:
+        return read(package if resources.files(package).joinpath(name).is_file() else HERE, name)
+
+    loader = jinja2.FunctionLoader(template_text)
     undefined = jinja2.StrictUndefined
     environment = jinja2.Environment(autoescape=True, undefined=undefined, trim_blocks=True, loader=loader)
     environment.filters["data_uri"] = lambda image: f"data:{_kind(image)};base64,{base64.b64encode(image).decode()}"

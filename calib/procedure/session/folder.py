@@ -75,7 +75,7 @@ OLDER = {f"2-poses/{UNSEEN}": "2-poses/validation.csv"}
 POSES_CHECKED, MOTION_CHECKED = f"3-measured/{CHECKED}", f"7-recorded/{CHECKED}"
 # of further motions: round2, round3 …
 ROUND = "round"
-LOGS = (".csv", ".npz", ".mcap", ".bag", ".db3")
+LOGS = (".csv", ".npz", ".mcap", ".bag", ".db3", ".parquet", ".xlsx")
 # what people bring: where to, and how its name begins
 BROUGHT = {
     "measured": ("3-measured", ""),

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from calib.data.csv_table import as_column
+from calib.data.joint_columns import joint_series
 from calib.data.poses.name_shapes import orientations_by_shape
 from calib.data.poses.pose_files import read_measurements
 from calib.data.schema import Joints
@@ -77,3 +78,25 @@ def test_row_of_german_units(tmp_path):
     (block,) = read_measurements(path, ROBOT)
     np.testing.assert_allclose(block.position[0], [0.1005, 0.2005, 0.3005])
     np.testing.assert_allclose(block.q[0], np.deg2rad([90.5, 45.5]))
+
+
+def test_units_as_words_of_names(tmp_path):
+    """A_deg B_deg C_deg are three angles; joints of a rail in m and of turning joints in deg are one series."""
+    (shape,) = orientations_by_shape(["a_deg", "b_deg", "c_deg"])
+    assert shape.columns == {"rx": "a_deg", "ry": "b_deg", "rz": "c_deg"}
+    assert not orientations_by_shape(["a", "b", "c"])
+    (series,) = joint_series(["lift_m", "elbow_deg", "wrist_deg"], ["lift", "elbow", "wrist"])
+    assert series.columns == ("lift_m", "elbow_deg", "wrist_deg")
+
+
+def test_a_title_above_the_names(tmp_path):
+    """Names by shape below titles of one cell are found as ours are; X1 … Z2 are two targets."""
+    rows = "0.1,0.2,1.0,2.0,3.0\n" * 2 + "0.3,-0.2,1.5,2.0,3.0\n" * 2
+    (tmp_path / "m.csv").write_text(f"Protocol of Monday\n\nq1,q2,tvec_x,tvec_y,tvec_z\n{rows}")
+    (block,) = read_measurements(tmp_path / "m.csv", ROBOT)
+    assert len(block) == 4 and block.position[0].tolist() == [1.0, 2.0, 3.0]
+    header = "q1,q2,X1,Y1,Z1,X2,Y2,Z2"
+    rows = "0.1,0.2,1,2,3,4,5,6\n0.2,0.1,1,2,4,4,5,7\n0.3,0.1,1,2,5,4,5,8\n"
+    (tmp_path / "two.csv").write_text(f"{header}\n{rows}")
+    (block,) = read_measurements(tmp_path / "two.csv", ROBOT)
+    assert len(block.tool_names) == 2 and block.position[1].tolist() == [4.0, 5.0, 6.0]

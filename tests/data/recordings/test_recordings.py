@@ -15,6 +15,7 @@ from calib.errors import MeasurementError, UsageError
 
 LIMITS = {"lower": np.full(3, -3.0), "upper": np.full(3, 3.0), "effort": np.full(3, 100.0)}
 ROBOT = Joints(("a", "b", "c"), **LIMITS)
+NAMED = (("q", "_deg"), ("dq", "_deg_s"), ("i", "_mA"))
 
 
 def refused(path: Path | str, pattern: str, joints: Joints | None = ROBOT, **options) -> MeasurementError:
@@ -330,3 +331,16 @@ def test_encoder_counts(archive, tmp_path, series):
     refused(path, r"\[ticks\] is not one of .*\[counts/4096@2048\]")
     with pytest.raises(UsageError, match="unit 'counts/0' of q is unknown"):
         RecordingOptions(units={"q": "counts/0"})
+
+
+def test_units_at_the_end_of_names(tmp_path, series):
+    """``q1_deg``, ``dq1_deg_s`` and ``i1_mA`` are read in these units; a header's unit comes first; UTF-16 is text."""
+    header = ",".join(["t", *(f"{head}{j}{unit}" for head, unit in NAMED for j in (1, 2, 3))])
+    columns = [series["t"], np.degrees(series["q"]), np.degrees(series["dq"]), 1e3 * series["tau"]]
+    path = tmp_path / "log.csv"
+    np.savetxt(path, np.column_stack(columns), delimiter=",", comments="", header=header, encoding="utf-16")
+    recording = read_recording(path, ROBOT)
+    np.testing.assert_allclose(recording.q, series["q"], atol=1e-12)
+    np.testing.assert_allclose(recording.v, series["dq"], atol=1e-12)
+    np.testing.assert_allclose(recording.effort, series["tau"], atol=1e-12)
+    assert recording.kind == "current"
