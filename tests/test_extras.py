@@ -86,18 +86,20 @@ def test_the_core_alone_selects_fits_and_exports(tmp_path):
     np.savetxt(tmp_path / "measured.csv", rows, delimiter=",", header=",".join(header), comments="")
     absent = ",".join([*PACKAGES, *BEHIND])
 
-    def run(*arguments: str) -> str:
+    def run(*arguments: str, code: int = 0) -> str:
         script = ROOT / "tests/support/without_packages.py"
         command = [sys.executable, str(script), absent, *arguments]
         finished = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert finished.returncode == 0, finished.stdout + finished.stderr
+        assert finished.returncode == code, finished.stdout + finished.stderr
         return finished.stdout + finished.stderr
 
     said = run("select", "tx40", "-m", "12", "--out", "poses.csv")
-    assert "left out: matplotlib, for figures, is not installed" in said and ".png" not in said
-    said = run("fit", "tx40", "measured.csv", "--holdout", "0.25", "--out", "fit")
-    assert "[plots]" in said
+    assert "matplotlib" not in said and (tmp_path / "poses_figures.html").exists()
+    run("fit", "tx40", "measured.csv", "--holdout", "0.25", "--plots", "svg", "--out", "fit")
+    assert (tmp_path / "fit/plot_position.svg").exists() and "data-figure" in (tmp_path / "fit/report.html").read_text()
     assert (tmp_path / "fit/certificate.html").exists() and not (tmp_path / "fit/certificate.pdf").exists()
+    said = run("fit", "tx40", "measured.csv", "--plots", "png", "--out", "drawn", code=2)
+    assert "armature-calib[plots]" in said and "without it: --plots svg" in said
     said = run("certificate", "fit")
     assert "certificate.pdf was not written; typst, for the certificate as PDF, is not installed" in said
     said = run("export", "fit", "--into", "export")

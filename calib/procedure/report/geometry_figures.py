@@ -398,6 +398,8 @@ def errors_by_row(report: Report, nature: str) -> Chart:
         title = "fitted rows"
         if errors.unseen:
             title = f"unseen rows of {errors.name}"
+        if errors.worst is not None:
+            title = f"{len(sizes)} of the {title}, at random"
         points = Line(np.array(errors.rows), sizes, ".", AFTER, size=4.5)
         panels.append(Panel([points], title, "row", f"error [{unit}]", grid="y"))
     return Chart(panels or [Panel([])], 0.5 + 1.2 * max(1, len(panels)))

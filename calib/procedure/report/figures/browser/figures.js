@@ -985,6 +985,9 @@
           for (const row of link.dataset.rows.split(",")) marked.add(+row);
           draw(document.getElementById("figure-" + target[0]));
           for (const figure of drawn) figure.redraw();
+          const rows = drawn.find(one => one.name === target[0]);
+          const present = rows.panels.some(panel => panel.layers.some(layer => layer.x && layer.x.some(row => marked.has(row))));
+          rows.note(present ? "" : `None of ${match[0]} is among the points drawn; residuals.csv has every row.`);
         });
         parts.push(node.data.slice(last, match.index), link);
         last = match.index + match[0].length;
