@@ -4,8 +4,7 @@ from calib.estimation.recursive import DriftBank
 from calib.identification.identify import Identification, common_decimator, identify
 from calib.identification.identify_options import IdentifyOptions
 from calib.identification.identify_options import read_options as read_identify_options
-from calib.identification.model_file import from_table
-from calib.identification.production import (
+from calib.identification.methods.production import (
     FRICTION,
     GAIN,
     Cause,
@@ -16,6 +15,7 @@ from calib.identification.production import (
     log_rows,
     torque_shares,
 )
+from calib.identification.model_file import from_table
 from calib.procedure.dynamic_stage.identify import judged, overlaps, repeated_motion
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.inputs import gather as gather_recordings

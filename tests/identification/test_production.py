@@ -7,7 +7,15 @@ import planted_motion as planted
 import pytest
 
 from calib.identification.identify import identify
-from calib.identification.production import Cause, LogRows, WorkingModel, absorbed, judge, log_rows, torque_shares
+from calib.identification.methods.production import (
+    Cause,
+    LogRows,
+    WorkingModel,
+    absorbed,
+    judge,
+    log_rows,
+    torque_shares,
+)
 from calib.identification.settings import IdentificationSettings
 from calib.identification.uncertainty.learned_torque_errors import learn_torque_errors
 from calib.identification.uncertainty.torque_errors import estimated_columns
