@@ -4,7 +4,7 @@ from calib.estimation.recursive import DriftBank
 from calib.identification.identify import Identification, common_decimator, identify
 from calib.identification.identify_options import IdentifyOptions
 from calib.identification.identify_options import read_options as read_identify_options
-from calib.identification.methods.production import (
+from calib.identification.learning.production import (
     FRICTION,
     GAIN,
     Cause,

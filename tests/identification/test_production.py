@@ -7,7 +7,7 @@ import planted_motion as planted
 import pytest
 
 from calib.identification.identify import identify
-from calib.identification.methods.production import (
+from calib.identification.learning.production import (
     Cause,
     LogRows,
     WorkingModel,

@@ -1,0 +1,1 @@
+"""Identified dynamics that learn from further logs."""
