@@ -49,8 +49,8 @@ def measured_pairs(pairs: PosePairs, mounting: str, robot: Chain | None) -> tupl
     if count < MIN_PAIRS:
         refuse_data(
             pairs.file,
-            f"{counted(count, 'pair')} of poses: two placements need at least {MIN_PAIRS}, a calibration about 12, with "
-            "the wrist turned by 90° and more about two axes between them",
+            f"{counted(count, 'pair')} of poses: two placements need at least {MIN_PAIRS}, a calibration about 12, "
+            "with the wrist turned by 90° and more about two axes between them",
         )
     reading, notes = agreed(pairs)
     if not mounting and pairs.in_hand is not None:
