@@ -3,8 +3,8 @@
 ===================================  ==================================================================================
 ``.xlsx``                            the first sheet with cells, others are named; formulas by their last result
 ``<point name="P1" x="0.47" …/>``    XML: the elements that occur most often, with attributes or elements inside
-``rostopic echo``, ``ros2 topic      YAML of several documents, or a list of tables; JSON alike. Nested names are joined
-echo`` into a file                   by points (``pose.position.x``), stamps become ``t``; ``name`` beside ``position``,
+``rostopic echo`` or                 YAML of several documents, or a list of tables; JSON alike. Nested names are joined
+``ros2 topic echo`` into a file      by points (``pose.position.x``), stamps become ``t``; ``name`` beside ``position``,
                                      ``velocity``, ``effort`` (joint states) become ``q_elbow``, ``v_elbow``,
                                      ``tau_elbow``
 ===================================  ==================================================================================
