@@ -11,7 +11,8 @@ with ĝ and Σ the result of the geometric fit, i.e. all that measured poses say
 bodies (`calib.identification.physical_consistency.solve`) to second order, ε the gains of the torque rows, and m the
 mass and first moments of payloads whose values are stated. The method is Gauss-Newton with rows [W, W χ, ∂(W χ)/∂g];
 its start is the result of the two stages. All standard parameters are estimated, not base parameters, since their
-regrouping depends on the geometry: with bodies that cannot exist, small changes of lengths would have large effects.
+regrouping depends on the geometry: without the prior of physically consistent inertias, small changes of lengths would
+have large effects.
 
 If the fit has joint corrections (compliance, gears, encoders), the geometry is that fitted with them; their
 coefficients follow its change by the correlations of the fit.
@@ -90,9 +91,12 @@ MIN_DATA_SHARE = 0.5
 """Share of the prior variance by which the torques reduce that of an element that they show (our choice)."""
 FIRST_MOMENTS = slice(6, 10)
 """MX, MY, MZ and M among the ten standard parameters of a body."""
-
 FIXED = 1e12
 """Precision of a parameter that the identification fixes, relative to that of its data."""
+LEAST_SCALE = 1e-9
+"""Least diagonal of a precision, relative to that of the data, by which its rows and columns are scaled."""
+SINGULAR = 1e-10
+"""Relative eigenvalue of a correlation matrix below which its inverse leaves a combination out."""
 
 Progress = Callable[[str], None]
 
@@ -108,7 +112,7 @@ class JointEstimate(Frozen):
         prior, covariance: (K, K) covariance of the values before and after.
         widening: factor by which the variance of the torques was raised, as groups of rows ask for; median over
             combinations of elements.
-        held_out: squared torque errors on held-out blocks of time, over those with the geometry before.
+        held_out: ratio of squared torque errors on held-out blocks of time to those with the geometry before.
         rounds: number of linearisations.
         gains, gain_sigma: (rows,) gains of the torque rows, measured over true torques, and their standard deviations.
     """
@@ -467,6 +471,15 @@ def estimate_jointly(
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
+    """Solution of one linearisation.
+
+    Attributes:
+        change: (K,) change of the elements from the geometry before the torques [m or rad].
+        values: (p,) parameters of bodies and drives, then the gains' deviations from 1.
+        covariance: (K, K) covariance of the change.
+        gain_sigma: (rows,) standard deviations of the gains.
+    """
+
     change: np.ndarray
     values: np.ndarray
     covariance: np.ndarray
@@ -475,6 +488,18 @@ class _Solution:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
+    """Rows and priors of a joint estimate about an identification.
+
+    Attributes:
+        identification: the identification whose weights and prior are used.
+        settings: its settings, with the direction of gravity before the torques.
+        chain: the arm before the torques.
+        cases: training recordings.
+        free: (K,) indices of the estimated elements and tilts.
+        prior: (K, K) their covariance before the torques.
+        doubted: labels of payloads whose stated mass and centre are not used.
+    """
+
     identification: Identification
     settings: IdentificationSettings
     chain: Chain
@@ -504,7 +529,7 @@ class _Problem:
     def beforehand(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Most probable parameters (p,) of the identification, and precision (p, p) and pull (p,) of their prior.
 
-        The parameters are those of bodies that can exist. Their prior is quadratic about them.
+        The inertias are physically consistent; their prior is quadratic about them.
         """
         identification = self.identification
         base = identification.base
@@ -717,7 +742,7 @@ class _Problem:
         return np.asarray(half @ turns)
 
     def held_out(self, products: np.ndarray) -> float:
-        """Return squared errors on held-out time with the geometry estimated, over those with it unchanged."""
+        """Return the ratio of squared errors on held-out time, with the geometry estimated to with it unchanged."""
         fold = (np.arange(len(products)) * PIECES // len(products)) % FOLDS
         squares = np.zeros(2)
         for number in range(FOLDS):
@@ -748,13 +773,13 @@ def payload_information(payload: Payload) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nonnegative(matrix: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Return the nearest positive semidefinite matrix, nearest with rows and columns scaled.
+    """Return the positive semidefinite matrix that is nearest once rows and columns are scaled.
 
     Args:
         matrix: (p, p) symmetric.
         scale: (p,) sizes that its diagonal is compared with.
     """
-    diagonal = np.maximum(np.abs(np.diag(matrix)), 1e-9 * scale)
+    diagonal = np.maximum(np.abs(np.diag(matrix)), LEAST_SCALE * scale)
     unit = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
     half = vectors * np.sqrt(np.clip(values, 0.0, None)) * unit[:, None]
@@ -765,4 +790,4 @@ def _inverse(covariance: np.ndarray) -> np.ndarray:
     """Return the (pseudo-)inverse of a covariance, with rows scaled to unit variance."""
     unit = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(unit, unit)
-    return np.linalg.pinv(correlation, rcond=1e-10, hermitian=True) / np.outer(unit, unit)
+    return np.linalg.pinv(correlation, rcond=SINGULAR, hermitian=True) / np.outer(unit, unit)
