@@ -2,7 +2,7 @@
 
 Each log is predicted before it is learnt from, so that its error is one on unseen motion. A log whose torques are not
 as predicted is not averaged into the model: its cause is named, and the log is left out unless the cause is a change of
-friction or of a drive's gain, after which these are learnt anew.
+friction or of a drive's gain, after which these are estimated anew.
 """
 
 from __future__ import annotations
