@@ -539,10 +539,12 @@ class _Problem:
         drives = base.kept[self.columns[self.columns < base.b]]
         index = np.concatenate([self.computed, drives, friction]).astype(int)
         values = possible.dynamics.values
+        # data of the identification alone, and the slope of their cost at the most probable values
         factor = information.factor[:, :-1] @ information.transform / possible.doubt
         target = information.factor[:, -1] / possible.doubt
         slope = factor.T @ (factor @ values - target)
         covariance = possible.covariance[np.ix_(index, index)]
+        # precision of the prior: of the estimate, less that of the data
         free = np.diag(covariance) > 0.0
         precision = np.zeros_like(covariance)
         data = factor[:, index].T @ factor[:, index]
@@ -552,10 +554,10 @@ class _Problem:
         precision[fixed, fixed] += FIXED * (1.0 + np.diag(data)[fixed])
         values = values[index]
         pull = precision @ values + np.where(free, slope[index], 0.0)
-        richer = np.arange(len(index) - len(friction), len(index))
-        if len(richer) and identification.fitted.beforehand is not None:
+        of_friction = np.arange(len(index) - len(friction), len(index))
+        if len(of_friction) and identification.fitted.beforehand is not None:
             ridges = np.sum(identification.fitted.beforehand**2, axis=0)[base.b :]
-            precision[richer, richer] += ridges
+            precision[of_friction, of_friction] += ridges
         return values, precision, pull
 
     @cached_property
@@ -691,6 +693,7 @@ class _Problem:
         project = selection.T @ directions
         solution = np.concatenate([values, change, [-1.0]])
         decimator = common_decimator(self.cases, self.settings)
+        # scores of each direction: derivatives of the cost by row
         scores = []
         for matrix in self.whitened_rows(change, values):
             residual = matrix @ solution
@@ -700,6 +703,7 @@ class _Problem:
         positions = np.concatenate([case.motion.q[k] for case, k in zip(self.cases, index)])
         velocities = np.concatenate([case.motion.v[k] for case, k in zip(self.cases, index)])
 
+        # groups: number of the group of each row and sample
         count = len(all_scores)
         groupings = []
         for blocks in BLOCK_COUNTS:
@@ -710,6 +714,7 @@ class _Problem:
             ranks = np.argsort(np.argsort(states, axis=0), axis=0)
             bins = (ranks * BINS // count)[:, joints]
             groupings.append(bins + BINS * np.arange(len(joints)))
+        # squared sums of scores over groups: on average the stated variance, if rows are independent
         ratio = np.ones(len(variance))
         effective = variance > 0.0
         for groups in groupings:

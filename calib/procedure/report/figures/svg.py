@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import singledispatch
 from itertools import pairwise
+from math import isfinite
 from operator import attrgetter, itemgetter
 from xml.sax.saxutils import escape
 
@@ -88,6 +89,8 @@ class _Margins:
         x, y: scales of the axes.
         xlabel, ylabel: labels of the axes; empty where another panel of the grid has them.
         xticks, yticks: ticks as (value, text).
+        xtexts, ytexts: texts of the ticks; empty where another panel of the grid has them.
+        upright: whether the texts along x are vertical.
         left, right, top, bottom: the space around the panel.
     """
 
@@ -180,6 +183,7 @@ def _even_ticks(low: float, high: float, max_ticks: int) -> Iterator[float]:
 
 
 def _step(least: float) -> float:
+    """Return the smallest 1, 2 or 5 times a power of ten that is not below a number."""
     power = 10.0 ** np.floor(np.log10(max(least, 1e-300)))
     for factor in (1.0, 2.0, 5.0):
         if factor * power >= least * (1.0 - 1e-9):
@@ -315,7 +319,9 @@ class _Frame:
 
     Attributes:
         left, top, right, bottom: the rectangle [pt].
+        panel: the panel.
         clip: name of its clipping path.
+        xscale, yscale: scales of the axes.
     """
 
     def __init__(self, left: float, top: float, right: float, bottom: float, panel: Panel, clip: str):
@@ -466,7 +472,7 @@ def _curve(x: np.ndarray, y: np.ndarray) -> str:
     steps = []
     begin = "M"
     for px, py in zip(x.tolist(), y.tolist()):
-        if px - px != 0.0 or py - py != 0.0:
+        if not (isfinite(px) and isfinite(py)):
             begin = "M"
             continue
         steps.append(f"{begin}{px:.1f} {py:.1f}")
@@ -550,7 +556,7 @@ def _bars(bars: Bars, frame: _Frame) -> Iterator[str]:
     ends, begin = along(values), float(along(bars.base))
     sides = across(positions - bars.thick / 2.0), across(positions + bars.thick / 2.0)
     for end, side, far_side, colour in zip(ends.tolist(), sides[0].tolist(), sides[1].tolist(), colours):
-        if end - end != 0.0:
+        if not isfinite(end):
             continue
         corners = (side, far_side, begin, end) if bars.upright else (begin, end, side, far_side)
         yield _rectangle(*corners, colour)
