@@ -19,6 +19,7 @@ from calib.config import Tables
 from calib.config_types import Plots
 from calib.data.poses.fit_options import FitOptions, read_options
 from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.pose_lists import PAYLOAD
 from calib.errors import TaskLost, UsageError, as_ours, require
 from calib.estimation.estimate import Estimate
 from calib.estimation.robust import Loss, check_loss
@@ -140,7 +141,11 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
     def to_dataframe(self) -> DataFrame:
         """Return the joint values as a pandas DataFrame, one row per pose."""
         header = [f"{joint.name} [{joint.unit}]" for joint in self.chain.joints]
-        return data_frame(self.q.tolist(), header)
+        values = self.q
+        if self.loads is not None:
+            header.append(PAYLOAD)
+            values = np.column_stack([values, self.loads.masses])
+        return data_frame(values.tolist(), header)
 
     def __repr__(self) -> str:
         return f"<PoseSelection: {len(self.q)} poses of {self.chain.name}>"

@@ -272,14 +272,19 @@ class Observation:
 
     def __call__(self, q: np.ndarray) -> np.ndarray:
         rows = []
+        bases = self.bases(q)
         for number in range(len(self.cell.tools)):
-            seen = see(self.cell, q, 0, number)
-            jacobian = target_jacobian(self.cell, seen, self.free, 0, np.full(len(q), number))
+            seen = see(self.cell, q, 0, number, bases)
+            jacobian = target_jacobian(self.cell, seen, self.free, 0, np.full(len(q), number), bases)
             sigma = self._sigma(seen.point)
             rows.append(jacobian[:, :3] / sigma[:3])
             if self.full:
                 rows.append(jacobian[:, 3:] / sigma[3:])
         return np.concatenate(rows, axis=1).transpose(2, 1, 0)
+
+    def bases(self, q: np.ndarray) -> np.ndarray | None:
+        """Return the basis functions (E, m) of the cell's joint corrections at q (m, n); None: it has none."""
+        return None
 
     def _sigma(self, point: np.ndarray) -> np.ndarray:
         """Return the standard deviations (6, m) of positions [m] and orientations [rad] of a target.
@@ -302,7 +307,7 @@ class Observation:
         Args:
             q: (m, n) joint values [rad or m].
         """
-        point = see(self.cell, q).point
+        point = see(self.cell, q, bases=self.bases(q)).point
         sigma = self._sigma(point)[:3]
         return point.T, self(q)[:, :3] * sigma.T[:, :, None]
 

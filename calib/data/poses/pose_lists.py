@@ -59,6 +59,8 @@ from calib.records import frozen, shaped
 from calib.units import ANGLES, JOINT, LENGTHS
 
 SUFFIXES = ("", "_target")
+# header of the mass that the tip carries in planned poses
+PAYLOAD = "payload [kg]"
 # Read-back and commanded joints of one pose differ by less [rad or m] (our choice).
 MAX_JOINT_DIFFERENCE = 0.02
 # Share of the rows that most rows are (our choice).
@@ -67,7 +69,13 @@ HALF = 0.5
 REVERSED_COST = 1e-9
 
 
-def write_poses(path: str | Path, q: ArrayLike, joint_names: Sequence[str], kinds: Sequence[str] | None = None) -> Path:
+def write_poses(
+    path: str | Path,
+    q: ArrayLike,
+    joint_names: Sequence[str],
+    kinds: Sequence[str] | None = None,
+    payload: np.ndarray | None = None,
+) -> Path:
     """Write joint values to a CSV file in deg or mm, with headers such as ``joint1 [deg]``, and return its path.
 
     Args:
@@ -75,10 +83,15 @@ def write_poses(path: str | Path, q: ArrayLike, joint_names: Sequence[str], kind
         q: (m, n) joint values [rad or m].
         joint_names: names of the joints.
         kinds: URDF type of each joint; None: all revolute.
+        payload: (m,) mass at the tip in each pose [kg], a further column; None for no such column.
     """
     values = shaped(q, (None, len(joint_names)), "q")
     header, factors = joint_columns(joint_names, kinds or ["revolute"] * len(joint_names))
-    return files.write_numbers(path, header, values * factors)
+    values = values * factors
+    if payload is not None:
+        header.append(PAYLOAD)
+        values = np.column_stack([values, payload])
+    return files.write_numbers(path, header, values)
 
 
 def joint_columns(names: Sequence[str], kinds: Sequence[str]) -> tuple[list[str], np.ndarray]:
@@ -105,9 +118,12 @@ def filled_in(path: Path, joints: int) -> bool:
         joints: number of joint columns.
     """
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
+    planned = joints
+    if lines and re.split("[,;\t]", lines[0])[joints : joints + 1] == [PAYLOAD]:
+        planned += 1
     for line in lines[1:]:
         cells = re.split("[,;\t]", line)
-        if any(cell.strip() for cell in cells[joints:]):
+        if any(cell.strip() for cell in cells[planned:]):
             return True
     return False
 

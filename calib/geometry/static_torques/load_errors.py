@@ -78,6 +78,16 @@ def _compliance(cell: Installation) -> tuple[np.ndarray, bool]:
             compliance[table[term.element]] += coefficient
     if compliance.any():
         return compliance, False
+    return usual_compliance(chain), True
+
+
+def usual_compliance(chain: Chain) -> np.ndarray:
+    """Return the prior standard deviation (K,) of each element's compliance [rad/N m]; 0 where none is fitted.
+
+    Args:
+        chain: the arm, with the largest torques of its joints where they are stated.
+    """
+    compliance = np.zeros(len(chain.elements))
     usual = USUAL_EFFORT * chain.stretched_length() ** 2
     for number, element in enumerate(chain.elements):
         if element.axis[0] != "r" or element.owner >= chain.n:
@@ -88,4 +98,4 @@ def _compliance(cell: Installation) -> tuple[np.ndarray, bool]:
         compliance[number] = TURN / effort
         if element.joint is None:
             compliance[number] *= 0.5
-    return compliance, True
+    return compliance

@@ -28,6 +28,14 @@ from calib.poses.indices import observability
 from calib.poses.select import SearchSettings, Selection, select_poses
 from calib.poses.space import SearchSpace, is_feasible
 from calib.procedure.kinematic_stage.inputs import load_robot
+from calib.procedure.kinematic_stage.loads import (
+    LoadedCandidates,
+    LoadOutlook,
+    load_outlook,
+    loaded_candidates,
+    loaded_run,
+    without_masses,
+)
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
 from calib.procedure.measuring import prediction as forecast
 from calib.procedure.measuring.measuring_run import Drivable, Exchange, MeasuringRun, RunSettings, drivable
@@ -90,6 +98,7 @@ class Chosen:
         run: order of the poses, which is that of `selection.q`, and the paths between them.
         driven: speed and dwell time of the run.
         by_images: whether a camera measures by images of a board.
+        loads: loads of the poses, and what they tell of compliance; None without loads to choose from.
     """
 
     chain: Chain
@@ -103,6 +112,7 @@ class Chosen:
     run: MeasuringRun
     driven: RunSettings
     by_images: bool
+    loads: LoadOutlook | None = None
 
     @property
     def prediction(self) -> SelectionPrediction | None:
@@ -123,6 +133,8 @@ class Chosen:
     def kept(self) -> list[str]:
         """Return lines of text on the checked constraints, the unchecked constraints, and the run."""
         lines = []
+        if self.loads is not None:
+            lines.append(self.loads.line())
         if self.checked:
             lines.append(f"respected: {', '.join(self.checked)}")
         if self.unchecked:
@@ -188,7 +200,7 @@ def choose(
 
     # `select_poses` checks it
     index = cast(Any, settings.index)
-    existing_jacobian = existing_value = None
+    existing_jacobian = existing_value = existing_q = None
     if existing is not None:
         existing_q = read_poses(existing, joints_of(chain))
         existing_jacobian = jacobian(existing_q)
@@ -197,9 +209,17 @@ def choose(
         if infeasible:
             notes.append(f"{infeasible} of the {len(existing_q)} existing poses break the constraints")
     search = _search_settings(settings)
-    selection = select_poses(
-        None, m, search, q=possible, space=space, existing=existing_jacobian, map=map, progress=progress
-    )
+    pairs = None
+    if settings.loads:
+        require(settings.method in METHODS_BY_CANDIDATES, "--loads: give --method detmax", UsageError)
+        require(view is None, "--loads: with a [camera] loads are not chosen; leave one of them out", UsageError)
+        assert isinstance(jacobian, Observation)
+        pairs = loaded_candidates(jacobian, limits, possible, settings.loads, existing_q)
+        selection = select_poses(pairs.jacobians, m, search, existing=pairs.before, map=map, progress=progress)
+    else:
+        selection = select_poses(
+            None, m, search, q=possible, space=space, existing=existing_jacobian, map=map, progress=progress
+        )
     # the selection without sight limits is not polished: the start of a polished one compares with it
     comparable = selection.value
     if settings.method == "polish":
@@ -212,10 +232,23 @@ def choose(
             progress(0, 1, stage)
 
     exchange = Exchange(space.jacobian, possible, existing_jacobian, index)
-    driven = drivable(chain, selection.joints, exchange, limits, settings.run, settings.seed, progress_of_run)
+    if pairs is not None:
+        driven = loaded_run(chain, pairs, selection, limits, settings.run, settings.seed, progress_of_run)
+    else:
+        driven = drivable(chain, selection.joints, exchange, limits, settings.run, settings.seed, progress_of_run)
     if driven.replaced:
         notes.append(driven.words)
     selection = _in_driving_order(selection, driven)
+    outlook = loads = None
+    if pairs is not None:
+        assert selection.indices is not None and isinstance(jacobian, Observation)
+        outlook, loads = _loaded_outlook(jacobian, limits, search, selection, pairs)
+        notes += [remark for remark in (without_masses(chain),) if remark]
+        if loads.excluded:
+            notes.append(f"{loads.excluded} pairs of pose and load exceed a joint's largest torque and were left out")
+        selection = replace(selection, indices=pairs.pose[selection.indices])
+    else:
+        outlook = _outlook(jacobian, limits, search, driven.q, exchange, comparable, numbers is None)
     if numbers is not None and selection.indices is not None:
         selection = replace(selection, indices=numbers[selection.indices])
     return Chosen(
@@ -226,10 +259,11 @@ def choose(
         checked=limits.checked,
         unchecked=limits.unchecked,
         notes=tuple(notes),
-        outlook=_outlook(jacobian, limits, search, driven.q, exchange, comparable, numbers is None),
+        outlook=outlook,
         run=driven.run,
         driven=settings.run,
         by_images=view is not None,
+        loads=loads,
     )
 
 
@@ -407,6 +441,30 @@ def _outlook(
     return PoseOutlook(predicted(q), others, blind, comparable)
 
 
+def _loaded_outlook(
+    jacobian: Observation, limits: Limits, search: SearchSettings, selection: Selection, pairs: LoadedCandidates
+) -> tuple[PoseOutlook, LoadOutlook]:
+    """Return the predicted accuracy with the selected poses and loads, of the tool and of compliance.
+
+    Args:
+        jacobian: observation Jacobian by the geometry.
+        limits: limits of poses.
+        search: settings of the search.
+        selection: the chosen pairs, in the order of the run.
+        pairs: the pairs of pose and load to choose from.
+    """
+    assert selection.indices is not None
+    space = limits.space(jacobian, sight=False)
+    stream = np.random.default_rng([search.seed, 2])
+    typical = draw_candidates(space.lower, space.upper, TYPICAL, partial(is_feasible, space), seed=stream)
+    masses = pairs.masses[pairs.load[selection.indices]]
+    jacobians = pairs.jacobians_of(selection.joints, masses)
+    unloaded = pairs.unloaded(jacobian, limits, len(masses), search)
+    loads = load_outlook(pairs, jacobians, masses, typical, unloaded)
+    others = forecast.by_count(pairs.observations[-1], pairs.jacobians, typical, pairs.before)
+    return PoseOutlook(loads.loaded, others, None, selection.value), loads
+
+
 def beside_poses(out: Path, plots: Plots, chosen: Chosen | None = None) -> dict[str, Path]:
     """Return the paths of the files next to a selection's CSV: the prediction, and the figures by name.
 
@@ -453,7 +511,8 @@ def write(chosen: Chosen, path: Path) -> Path:
     else:
         # an earlier selection's
         forecast.beside(path).unlink(missing_ok=True)
-    return write_poses(path, chosen.selection.joints, chosen.chain.joint_names, joint_kinds(chosen.chain))
+    masses = None if chosen.loads is None else chosen.loads.masses
+    return write_poses(path, chosen.selection.joints, chosen.chain.joint_names, joint_kinds(chosen.chain), masses)
 
 
 def bound_words(selection: Selection) -> str:
@@ -499,6 +558,7 @@ def record(chosen: Chosen) -> dict[str, object]:
         "efficiency_covers": bound_words(selection),
         "tool_sigma": rms if np.isfinite(rms) else None,
         "run_seconds": chosen.run.seconds,
+        "loads": None if chosen.loads is None else chosen.loads.record(),
     }
 
 
@@ -537,6 +597,8 @@ def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
     """
     outlook = chosen.outlook
     rows = forecast.table(outlook.poses, outlook.others)
+    if chosen.loads is not None:
+        rows += chosen.loads.rows()
     if outlook.blind is None:
         return rows
     blind_index, blind = outlook.blind

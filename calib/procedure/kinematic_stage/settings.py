@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from calib.arguments import checked
-from calib.config_types import Expect, Flag, Holdout, OneOf, Positive, Real, Seed, Text, Tolerance, Whole
+from calib.config_types import Expect, Flag, Holdout, OneOf, Positive, Real, Seed, Text, Tolerance, Typed, Whole
 from calib.data.poses import MIN_SIGMA, Loss, Model
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
 
@@ -15,6 +15,7 @@ Coordinate = Annotated[float, Real(least=-100.0, most=100.0, unit="m", quantity=
 Point = Annotated[tuple[Coordinate, Coordinate, Coordinate], Expect("x,y,z [m]")]
 Sigma = Annotated[float, Real(above=0.0, least=MIN_SIGMA, most=10.0, unit="m or rad", quantity="1")]
 Stations = Annotated[str, OneOf(("each", "one"))]
+Load = Annotated[float, Real(least=0.0, most=1000.0, unit="kg", quantity="1")]
 Deliverable = Annotated[str, OneOf(DELIVERABLES)]
 Index = Annotated[str, OneOf("calib.poses.indices:Index")]
 Method = Annotated[str, OneOf("calib.poses.select:Method")]
@@ -69,6 +70,7 @@ class SelectionSettings:
         index: observability index to maximise (O1 to O5), or cond to minimise
         method: search method: detmax, polish, local, multistart, mlsl (NLopt's, global) or tabu
         candidates: number of poses to choose from
+        loads: masses at the tip [kg], 0 for none, e.g. 0,2.5: the poses and their loads are to tell compliance, too
         sigmas: measurement σ of a position [m] and an orientation [rad], e.g. 1e-4,1e-4; default equal ones
         reference: a frame on the robot's base is measured beside the target, with the same σ: the noise of both counts
         seed: reproduces everything random
@@ -85,6 +87,7 @@ class SelectionSettings:
     index: Index = "O1"
     method: Method = "detmax"
     candidates: Annotated[int, Whole(1, 1_000_000)] = 2000
+    loads: Annotated[tuple[Load, ...], Typed("--loads")] = ()
     sigmas: tuple[Sigma, Sigma] | None = None
     reference: Flag = False
     seed: Seed = 0
