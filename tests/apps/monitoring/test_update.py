@@ -187,6 +187,8 @@ def test_half_a_second_at_rest_is_named_and_the_others_are_learnt(identified: Pa
 def test_dates_come_from_the_last_part_of_the_path_that_has_them():
     texts = [entry.date for entry in dated(["2025-01-01/a_20260314.csv@0:5", "x/2026-03-15_1230/b.csv"], 1)]
     assert texts == ["2026-03-14", "2026-03-15 12:30"]
+    (unix_time,) = dated(["log_1720201115.csv"], 1)  # no 2020-11-15
+    assert not unix_time.date
     with pytest.raises(UsageError, match="no date"):
         dated(["a_2026-03-14.csv", "b.csv"], 1)
 

@@ -12,8 +12,8 @@ import numpy as np
 from calib.errors import UsageError, listing, require
 from calib.toolkit.recordings import Recording, parse_cut
 
-DATE = re.compile(r"(20\d\d)[-_]?(\d\d)[-_]?(\d\d)(?:[T_ -]?(\d\d)[-:_h]?(\d\d)(?:[-:_]?(\d\d))?)?")
-"""Date in a file's name, with or without a time."""
+DATE = re.compile(r"(?<!\d)(20\d\d)[-_]?(\d\d)[-_]?(\d\d)(?:[T_ -]?(\d\d)[-:_h]?(\d\d)(?:[-:_]?(\d\d))?)?")
+"""Date in a file's name, with or without a time; digits inside a longer number, such as a Unix time, are none."""
 SECONDS_PER_DAY = 86_400.0
 EPOCH = datetime(1970, 1, 1)
 SKETCH = 64
