@@ -201,9 +201,14 @@ class ChartPicture:
         """The figure as PNG, drawn by matplotlib."""
         return figure_files.drawn(self.chart, "png")
 
+    @property
+    def still(self) -> bytes:
+        """The figure as SVG, for viewers that run no scripts."""
+        return figure_files.drawn(self.chart, "svg")
+
     def vector(self) -> Picture:
         """Return the figure as a vector picture (SVG) for print."""
-        return Picture(figure_files.drawn(self.chart, "svg"), self.caption, self.wide)
+        return Picture(self.still, self.caption, self.wide)
 
     @property
     def summary(self) -> str:

@@ -237,6 +237,7 @@ def test_page_is_narrow_dark_printed_and_told(browser, tmp_path):
 def test_page_without_scripts_says_where_the_numbers_are(tmp_path):
     page = written(tmp_path, geometry()).read_text(encoding="utf-8")
     assert page.count("The tables hold the numbers; <code>--plots png</code>") == len(geometry())
+    assert page.count('<noscript><img alt="" src="data:image/svg+xml;base64,') == len(geometry())
     assert not re.search(r"<script[^>]*src|<link|@import|https?://(?!www\.w3\.org)", re.sub(r"/\*.*?\*/", "", page))
 
 
