@@ -3,8 +3,8 @@
 ===================================  ==================================================================================
 ``.xlsx``                            the first sheet with cells, others are named; formulas by their last result
 ``<point name="P1" x="0.47" …/>``    XML: the elements that occur most often, with attributes or elements inside
-``rostopic echo``, ``ros2 topic      YAML of several documents, or a list of tables; JSON alike. Nested names are joined
-echo`` into a file                   by points (``pose.position.x``), stamps become ``t``; ``name`` beside ``position``,
+``rostopic echo`` or                 YAML of several documents, or a list of tables; JSON alike. Nested names are joined
+``ros2 topic echo`` into a file      by points (``pose.position.x``), stamps become ``t``; ``name`` beside ``position``,
                                      ``velocity``, ``effort`` (joint states) become ``q_elbow``, ``v_elbow``,
                                      ``tau_elbow``
 ===================================  ==================================================================================
@@ -18,6 +18,7 @@ import csv
 import io
 import re
 import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,12 +27,18 @@ from xml.etree import ElementTree as ET
 from calib.data.trees import read_tree
 from calib.errors import MeasurementError, listing, refuse_data
 
-# first bytes by which files are told
+# first bytes of a file, by which its form is recognised
 HEAD = 4096
+ZIP = b"PK"
+_XML = re.compile(r"<(\?xml|[A-Za-z])")
+# first line of ``rostopic echo``: a name alone
+_ECHO = re.compile(r"(---\s+)?[A-Za-z_]\w*:[ ]*\r?\n")
 YAML_SUFFIXES = (".yaml", ".yml", ".json")
-# the letters of our columns of quantities in a joint state
+# letters before the joint's name in the columns of a joint state's quantities
 QUANTITIES = {"position": "q", "velocity": "v", "effort": "tau"}
-SECONDS, NANOSECONDS = ("secs", "sec"), ("nsecs", "nanosec")
+# fields of a stamp in ROS 1 and in ROS 2
+STAMPS = (("secs", "nsecs"), ("sec", "nanosec"))
+PER_SECOND = 10**9
 # rows that make a table
 MIN_ROWS = 2
 # largest size of an unpacked spreadsheet [byte]
@@ -57,13 +64,12 @@ def translated(path: str | Path) -> NestedTable | None:
     path = Path(path)
     with open(path, "rb") as file:
         head = file.read(HEAD)
-    if head[:2] == b"PK" and (path.suffix.lower() == ".xlsx" or zipfile.is_zipfile(path)):
+    if head.startswith(ZIP) and (path.suffix.lower() == ".xlsx" or zipfile.is_zipfile(path)):
         return _spreadsheet(path)
     text = head.decode("utf-8-sig", errors="replace").lstrip()
-    if re.match(r"<(\?xml|[A-Za-z])", text):
+    if _XML.match(text):
         return _of_rows(_xml_rows(path), "rows of XML")
-    is_echo = re.match(r"(---\s+)?[A-Za-z_]\w*:[ ]*\r?\n", text) is not None
-    if path.suffix.lower() not in YAML_SUFFIXES and not is_echo:
+    if path.suffix.lower() not in YAML_SUFFIXES and not _ECHO.match(text):
         return None
     content = read_tree(path)
     if not isinstance(content, list):
@@ -122,16 +128,18 @@ def _flat_row(document: Mapping[str, object]) -> Row:
 
 
 def _leaves(value: object, name: str = "") -> Iterator[tuple[str, object]]:
-    """Yield names and values of nested tables and lists; a stamp is one number ``t`` [s].
+    """Yield names and values of nested tables and lists; a stamp of whole numbers is one number ``t`` [s].
 
     Args:
         value: a table, a list or a value.
         name: its name.
     """
     if isinstance(value, Mapping):
-        for seconds, nanoseconds in zip(SECONDS, NANOSECONDS):
-            if {seconds, nanoseconds} <= value.keys():
-                yield "t", f"{int(value[seconds])}.{int(value[nanoseconds]):09d}"
+        for fields in STAMPS:
+            seconds, nanoseconds = map(value.get, fields)
+            if isinstance(seconds, int) and isinstance(nanoseconds, int):
+                whole_seconds, fraction = divmod(seconds * PER_SECOND + nanoseconds, PER_SECOND)
+                yield "t", f"{whole_seconds}.{fraction:09d}"
                 return
         for key, content in value.items():
             yield from _leaves(content, f"{name}.{key}" if name else str(key))
@@ -149,10 +157,10 @@ def _xml_rows(path: Path) -> list[Row]:
         path: the file.
     """
     try:
-        text = path.read_bytes()
-        if b"<!ENTITY" in text:
+        content = path.read_bytes()
+        if b"<!ENTITY" in content:
             refuse_data(path, "defines entities, which are not read: save it without a DTD")
-        root = ET.fromstring(text.lstrip())
+        root = ET.fromstring(content.lstrip())
     except (OSError, ET.ParseError) as error:
         raise MeasurementError(f"cannot be read as XML ({error})", path) from error
     rows_of: dict[str, list[Row]] = {}
@@ -201,7 +209,7 @@ def _spreadsheet(path: Path) -> NestedTable | None:
                 shared = ["".join(item.itertext()) for item in ET.fromstring(archive.read("xl/sharedStrings.xml"))]
             sheets = sorted(filter(_SHEET.fullmatch, names), key=_sheet_number)
             tables = {name: _sheet_rows(ET.fromstring(archive.read(name)), shared) for name in sheets}
-    except (OSError, zipfile.BadZipFile, ET.ParseError, ValueError, IndexError, RuntimeError) as error:
+    except (OSError, zipfile.BadZipFile, zlib.error, ET.ParseError, ValueError, IndexError, RuntimeError) as error:
         raise MeasurementError(f"cannot be read as a spreadsheet ({error}): save the sheet as CSV", path) from error
     filled = [name for name, rows in tables.items() if rows]
     if not filled:

@@ -34,6 +34,8 @@ NEGLIGIBLE = 1e-5
 """Probability of a filter below which its part in mean and covariance is not computed."""
 STILL = -1
 """Group of the parameters that do not drift."""
+ROUNDING = 1e-12
+"""Rounding of a sum of probabilities."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +109,7 @@ class DriftBank:
         """Return quantiles of the drift rate of a group [1/√day], by the filters' probabilities."""
         order = np.argsort(self.rates[:, group], kind="stable")
         cumulated = np.cumsum(self.weights[order])
-        index = np.searchsorted(cumulated, np.array(levels) - 1e-12)
+        index = np.searchsorted(cumulated, np.array(levels) - ROUNDING)
         rates = self.rates[order, group]
         return tuple(float(rates[min(k, len(rates) - 1)]) for k in index)
 
@@ -187,7 +189,7 @@ def start(
 def widened(factor: np.ndarray, deviations: np.ndarray) -> np.ndarray:
     """Return the R factor (p + 1, p + 1) of x + w with w ~ N(0, diag deviations²), from the R factor of x.
 
-    The rows of w and x_old = x - w are triangulated with w in front, whose rows are then left out (Bierman 1977,
+    The rows of w and x_old = x - w are triangulated with w in front, whose rows are then dropped (Bierman 1977,
     eq. VI.2.27).
 
     Args:

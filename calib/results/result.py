@@ -230,7 +230,7 @@ class StoredResult:
 
         Args:
             details: certificate entries made by a person.
-            plots: whether to include figures.
+            plots: whether to include figures; a format writes them as files into the result's folder, too.
             svg: folder for the SVG figures; None: no SVG figures.
 
         Returns:
@@ -238,9 +238,11 @@ class StoredResult:
         """
         from calib.folders import PAGES
         from calib.procedure.report.certificate import rendering
+        from calib.procedure.report.figures import figure_data, figure_files
 
         certificate, report = self.pages(details, plots)
         remarks = rendering.write(self.path, certificate, report)
+        figure_files.write(self.path, figure_data.of_folder(self.path), plots, paged=True)
         written = [str(self.path / name) for name in PAGES if (self.path / name).exists()]
         lines = [*remarks, f"written: {', '.join(written)}"]
         if svg is not None:

@@ -59,6 +59,22 @@ def test_spreadsheets(tmp_path):
         read_table(spreadsheet(tmp_path / "empty.xlsx", []))
 
 
+def test_damaged_compression_of_a_spreadsheet_is_named(tmp_path):
+    lines = [NAMES, *([f"P{number}", 0.37 * number, 1.1 * number] for number in range(400))]
+    with zipfile.ZipFile(spreadsheet(tmp_path / "m.xlsx", lines)) as source:
+        contents = {name: source.read(name) for name in source.namelist()}
+    path = tmp_path / "compressed.xlsx"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content)
+    damaged = bytearray(path.read_bytes())
+    start = damaged.find(b"sheet1.xml") + 60
+    damaged[start : start + 300] = b"\xff" * 300
+    path.write_bytes(damaged)
+    with pytest.raises(MeasurementError, match="cannot be read as a spreadsheet"):
+        read_table(path)
+
+
 def test_rows_of_xml(tmp_path):
     """Attributes or elements inside are cells; lists of other elements stand beside."""
     attributes = "".join(f'<p pose="{name}" q1="{q}" x="{x}"/>' for name, q, x in ROWS)
@@ -80,6 +96,14 @@ def test_documents(tmp_path):
     (tmp_path / "echo.txt").write_text(echo * 3)
     table = read_table(tmp_path / "echo.txt")
     assert table.numbers("t")[0] == 17.005 and table.numbers("point.x")[2] == 1.5
+
+
+@pytest.mark.parametrize("seconds", ["", "abc", "12.5"])
+def test_stamps_of_other_than_whole_numbers_are_no_time(tmp_path, seconds):
+    message = f"stamp:\n  sec: {seconds}\n  nanosec: 5\nx: 1.5\n---\n"
+    (tmp_path / "m.yaml").write_text(message * 3)
+    table = read_table(tmp_path / "m.yaml")
+    assert "t" not in table.header and table.numbers("x")[2] == 1.5
 
 
 def test_joint_states_of_rostopic_echo(tmp_path):

@@ -1,6 +1,7 @@
 """Torques that joints measured at rest: gravity, payloads and faults found by them; the arm is Pinocchio's."""
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ from loaded_arm import HEAD, GivingArm, urdf
 
 from calib.data.poses.fit_options import parse_options
 from calib.data.poses.pose_files import read_measurements
-from calib.geometry.static_torques.gravity_fit import gravity_fit
+from calib.geometry.static_torques.column_faults import column_fault
+from calib.geometry.static_torques.gravity_fit import gravity_fit, gravity_regressor
 from calib.geometry.static_torques.load_errors import load_masses
 from calib.geometry.static_torques.sources import MODELLED, driven, load_changes, load_findings
 from calib.robot.formats import urdf as urdf_format
@@ -135,6 +137,16 @@ def test_torques_that_contradict_gravity_are_not_used(chain, folder, change, say
     fit, (unused,) = gravity_fit(chain, [faulty(folder, change)])
     assert fit is None
     assert unused.code == "torques-unused" and says in unused.values["reason"]
+
+
+def test_exchanged_columns_are_named_however_different_their_torques(chain, folder):
+    measured = block(folder / "empty.csv")
+    regressor = gravity_regressor(chain, measured.q)
+    for first, second in combinations(range(1, 7), 2):
+        torque = np.array(measured.measured_torque)
+        torque[:, [first, second]] = torque[:, [second, first]]
+        reason, _ = column_fault(regressor, torque, np.isfinite(torque))
+        assert f"tau{first + 1} and tau{second + 1} exchanged" in reason
 
 
 def test_described_masses_tell_newton_millimetres(folder):

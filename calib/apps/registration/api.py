@@ -6,7 +6,7 @@ geometry is not changed. The three differ in the frames that are printed.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -30,8 +30,10 @@ from calib.transforms import invert
 Arm = str | Path | CalibratedChain
 # of a quick calibration (our choice)
 USUAL_POSES = 12
+# what the arm carries where neither names nor options say it
+OPEN = "camera or board"
 # what stands beside an arm that carries the camera, or the board
-STANDING = {"camera": "board", "board": "camera", "camera or board": "board or camera"}
+STANDING = {"camera": "board", "board": "camera", OPEN: "board or camera"}
 CARRIED = {IN_HAND: "camera", TO_HAND: "board"}
 
 
@@ -130,15 +132,14 @@ class HandEye(Placements):
         mounting = getattr(block, "mounting", "")
         if not mounting and getattr(block, "lever", None) is not None:
             mounting = IN_HAND
-        return CARRIED.get(mounting, "camera or board")
+        return CARRIED.get(mounting, OPEN)
 
     @property
     def transforms(self) -> tuple[Placed, ...]:
         """Camera and board: the carried one in the arm's tip, the standing one in its base."""
         standing = STANDING[self.carried]
         frames = [frame for frame in self.placed if frame.frame in (self.carried, standing)]
-        is_open = any(bool(np.isnan(frame.sigma).any()) for frame in frames)
-        if is_open:
+        if _are_open(frames):
             # what is not identifiable of one position moves the other
             unknown = np.array([*np.full(3, np.nan), *np.zeros(3)])
             frames = [replace(frame, sigma=frame.sigma + unknown) for frame in frames]
@@ -147,7 +148,7 @@ class HandEye(Placements):
     @property
     def is_open(self) -> bool:
         """Whether a component of a placement is not identifiable, so that numbers of both frames depend on a choice."""
-        return any(bool(np.isnan(frame.sigma).any()) for frame in self.transforms)
+        return _are_open(self.transforms)
 
     @property
     def defect(self) -> str:
@@ -199,7 +200,7 @@ class HandEye(Placements):
             UsageError: the frames are not for use, it is not known what the arm carries, or the robot has no URDF.
         """
         self._check_use()
-        if "or" in self.carried.split():
+        if self.carried == OPEN:
             raise UsageError(
                 "it is not known whether the arm carries the camera or the board: state [camera] mounting = "
                 f"'{IN_HAND}' (camera) or '{TO_HAND}' (board) in the options, then write the URDF"
@@ -226,7 +227,7 @@ class HandEye(Placements):
                 yield f"ROS: {frame.ros_command}"
         if self.defect:
             yield f"no frames are printed or written for use: {self.defect}"
-        if "or" in self.carried.split():
+        if self.carried == OPEN:
             tip = self.robot.chain.tip
             yield (
                 f"the poses do not say what {tip} carries: the board if they are poses of the board in the camera, as "
@@ -234,6 +235,11 @@ class HandEye(Placements):
                 f"= '{TO_HAND}' (board) or '{IN_HAND}' (camera) in the options"
             )
         yield from self._on_residual()
+
+
+def _are_open(frames: Iterable[Placed]) -> bool:
+    """Return whether a component of a frame is not identifiable."""
+    return any(bool(np.isnan(frame.sigma).any()) for frame in frames)
 
 
 def _turned(pose: np.ndarray) -> np.ndarray:

@@ -35,8 +35,18 @@ from calib.apps.studies.summary import (
 from calib.apps.studies.trial import TrialRow
 from calib.config_types import Plots
 from calib.errors import UsageError, require
-from calib.toolkit.report_charts import AFTER, BEFORE, MARK, Box, Chart, Label, Layer, Line, Panel
-from calib.toolkit.report_pages import Block, ChartPicture, Pictures, RecordColumn, ReportTable, Section, Text, table
+from calib.toolkit.report_charts import AFTER, BEFORE, MARK, Box, Chart, Label, Layer, Line, Panel, write_figures
+from calib.toolkit.report_pages import (
+    Block,
+    ChartPicture,
+    Pictures,
+    RecordColumn,
+    ReportTable,
+    Section,
+    Text,
+    read_figures,
+    table,
+)
 from calib.workers import workers
 
 # Height of one method in a box plot [in].
@@ -446,7 +456,8 @@ def run_study(
     conditions = tuple(summarise(study, counted))
     notes += reasons(conditions)
     files.write_table(out / SUMMARY, *summary_table(conditions))
-    files.write(out / REPORT, make_page(study, conditions, counted, notes, plots))
+    page = files.write(out / REPORT, make_page(study, conditions, counted, notes, plots))
+    write_figures(out, read_figures(page), plots, paged=True)
     return StudyOutcome(conditions, progress, tuple(notes), out, stored)
 
 

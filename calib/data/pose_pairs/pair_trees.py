@@ -90,7 +90,7 @@ def _lists_of(node: object, path: Path) -> list[PoseList]:
         counts = {len(_poses_in(sample)) for sample in samples}
         if len(samples) >= MIN_SAMPLES and counts == {2}:
             return _of_samples(samples, path)
-        return _of_parallel(node)
+        return _of_parallel(node, path)
     if isinstance(node, list) and len(node) >= MIN_SAMPLES and len(_poses_in(node[0])) == 2:
         return _of_samples(node, path)
     return []
@@ -130,7 +130,7 @@ def _joined(name: str, poses: Sequence[Raw], path: Path) -> PoseList:
     return PoseList(name, np.array(positions), np.array(turns), conventions[0])
 
 
-def _of_parallel(node: Mapping[str, object]) -> list[PoseList]:
+def _of_parallel(node: Mapping[str, object], path: Path) -> list[PoseList]:
     """Return the lists of poses of a table: one key per list, or one for positions and one for orientations."""
     table = _without_numbers(node)
     lists = []
@@ -146,7 +146,7 @@ def _of_parallel(node: Mapping[str, object]) -> list[PoseList]:
             continue
         complete = list(filter(None, map(pose_of, value)))
         if len(complete) == len(value):
-            lists.append(_joined(key, complete, Path(key)))
+            lists.append(_joined(key, complete, path))
             continue
         part = _part(key, value)
         if part is not None:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.data.poses.fit_options import EULER
 from calib.data.poses.plausible import from_angles
-from calib.errors import MeasurementError, refuse_data
+from calib.errors import MeasurementError, counted, refuse_data
 from calib.transforms import from_quaternion
 from calib.units import ANGLES, LENGTHS
 
@@ -165,7 +165,9 @@ class PoseList:
         finite = np.isfinite(self.position).all(axis=1) & np.isfinite(self.turn).all(axis=1)
         if not finite.all():
             row = int(np.argmin(finite)) + 1
-            refuse_data(file, f"'{self.name}' has a pose with an empty or infinite number: remove this sample", row=row)
+            refuse_data(
+                file, f"'{self.title}' has a pose with an empty or infinite number: remove this sample", row=row
+            )
         if self.kind == QUATERNION:
             defect = np.abs(np.linalg.norm(self.turn, axis=1) - 1.0)
             says = "the quaternion's norm differs from 1"
@@ -179,7 +181,7 @@ class PoseList:
             return
         row = int(np.argmax(defect))
         if defect[row] > MAX_DEFECT:
-            refuse_data(file, f"'{self.name}': {says} by {defect[row]:.2g}", row=row + 1)
+            refuse_data(file, f"'{self.title}': {says} by {defect[row]:.2g}", row=row + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,7 +222,7 @@ def paired(lists: Sequence[PoseList], file: str, rows: np.ndarray, in_hand: bool
     """
     first, second = lists
     if len(first) != len(second):
-        counts = f"{len(first)} poses '{first.name}' and {len(second)} poses '{second.name}'"
+        counts = f"{counted(len(first), 'pose')} '{first.title}' and {counted(len(second), 'pose')} '{second.title}'"
         raise MeasurementError(f"has {counts}: every sample needs both", file)
     for poses in lists:
         poses.check(file)
@@ -228,7 +230,7 @@ def paired(lists: Sequence[PoseList], file: str, rows: np.ndarray, in_hand: bool
     if second.is_robot or first.is_robot is False:
         first, second = second, first
     elif not first.is_robot and second.is_robot is None:
-        note = f"'{first.name}', first in the file, is taken for the robot's poses, '{second.name}' for the camera's"
+        note = f"'{first.title}', first in the file, is taken for the robot's poses, '{second.title}' for the camera's"
         notes = (note,)
     return PosePairs(first, second, file, rows, in_hand, notes)
 

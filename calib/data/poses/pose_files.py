@@ -24,7 +24,7 @@ distance            ``distance`` with ``pair`` (two rows share a label), or with
 sockets, plane      ``socket`` (grouped together with ``tool_position``), ``plane``
 tool                ``tool``: label of the reflector that a row saw
 torques             ``tau1`` to ``taun`` [N m] (or ``tau_<joint name>``): what the joints' sensors read at rest; empty
-                    where they read nothing. They drive the compliance, and tell a payload that nobody stated
+                    where they read nothing. They drive the compliance, and show a payload that nobody stated
 payload             ``payload`` [kg]: mass that the tip carries; its centre: options, ``payload``
 ==================  ===================================================================================================
 

@@ -18,11 +18,11 @@ from calib.units import ANGLES, COUNT_WORDS
 
 # share of rows that must be impossible in SI (our choice)
 MOST_ROWS = 0.5
-# units that are told from a word of a name; single letters are not
 # encoders' usual counts per turn: powers of two, and thousands of lines or of degrees (our choice)
 COUNTS_PER_TURN = (*(2**bits for bits in range(10, 25)), 1000, 2000, 4000, 8000, 10_000, 20_000, 36_000, 360_000)
 # largest value of a joint in deg: two turns
 MAX_DEGREES = 720.0
+# units that are recognised as a word of a name; single letters are not
 WORD_UNITS = ("mm", "cm", "um", "deg", "degrees", "rad", "mrad")
 SI = {"deg": "rad", "mm": "m"}
 

@@ -9,7 +9,7 @@ or a shift of rows does not hide the direction.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,7 +32,7 @@ MAX_SHARE = 0.1
 # Fewest rows of which both directions are tried, and of a part of the rows.
 MIN_ROWS = 4
 MIN_PART = 5
-# The same of positions: the two placements take nine of their numbers.
+# Fewest positions of a part: the two placements take nine of their numbers.
 MIN_PART_OF_POSITIONS = 8
 # Smallest misfit of positions, as a share of the arm's motion, at which a change is searched for: smaller ones are for
 # `calib.geometry.checks.row_changes`.
@@ -45,7 +45,7 @@ PARTS = (2, 3, 5)
 BEGINNINGS = (0.8, 0.65, 0.5)
 # Largest number of rows in which a change is searched for.
 MAX_ROWS = 150
-# Largest misfit of two parts, as a share of the misfit of all rows.
+# Largest misfit of two parts by themselves, as a share of the misfit of all rows together.
 MAX_LEFT = 0.2
 # Smallest changes that are named: angle [rad] and distance [m].
 MIN_TURN = 0.5 * DEG
@@ -144,7 +144,7 @@ def as_seen_by_instrument(chain: Chain, block: PoseMeasurements) -> PoseMeasurem
 
     Args:
         chain: the nominal arm.
-        block: measurements of any kind; only full poses are tried both agreement.
+        block: measurements of any kind; only full poses are tried in both directions.
     """
     if not isinstance(block, Poses) or block.lever is not None or block.base is not None:
         return block
@@ -224,17 +224,9 @@ def _parted_positions(block: Positions, arm: np.ndarray) -> list[Finding]:
     together = _rms_of_positions(arm, block.position)
     if together < MIN_SHARE_OF_POSITIONS * _motion(arm):
         return []
-    cuts = range(MIN_PART_OF_POSITIONS, len(arm) - MIN_PART_OF_POSITIONS + 1)
-    squares = []
-    for cut in cuts:
-        before = _rms_of_positions(arm[:cut], block.position[:cut])
-        after = _rms_of_positions(arm[cut:], block.position[cut:])
-        squares.append(cut * before**2 + (len(arm) - cut) * after**2)
-    best = int(np.argmin(squares))
-    parted = float(np.sqrt(squares[best] / len(arm)))
+    cut, parted = _best_cut(arm, block.position, MIN_PART_OF_POSITIONS, _rms_of_positions)
     if parted > MAX_LEFT * together or parted > MAX_SHARE * _motion(arm):
         return []
-    cut = cuts[best]
     station, tool = place_position(arm[:cut], block.position[:cut], None, None)
     later_station, later_tool = place_position(arm[cut:], block.position[cut:], None, None)
     part, change = "tool", invert(tool) @ later_tool
@@ -278,7 +270,7 @@ def _parted(
 
 
 def _large_step(arm: np.ndarray, measured: np.ndarray) -> pose_steps.Step | None:
-    """Return the row after which the set-up was another, by placing the rows before and after it by themselves.
+    """Return the step that shows when the rows before and after it are placed by themselves; None without one.
 
     Args:
         arm: (m, 4, 4) poses of the tip in the base.
@@ -287,22 +279,36 @@ def _large_step(arm: np.ndarray, measured: np.ndarray) -> pose_steps.Step | None
     if len(arm) < 2 * MIN_PART:
         return None
     together = _rms_misfit(arm, measured)
-    cuts = range(MIN_PART, len(arm) - MIN_PART + 1)
-    squares = []
-    for cut in cuts:
-        before = _rms_misfit(arm[:cut], measured[:cut])
-        after = _rms_misfit(arm[cut:], measured[cut:])
-        squares.append(cut * before**2 + (len(arm) - cut) * after**2)
-    best = int(np.argmin(squares))
-    parted = float(np.sqrt(squares[best] / len(arm)))
+    cut, parted = _best_cut(arm, measured, MIN_PART, _rms_misfit)
     if parted > MAX_LEFT * together or parted > MAX_SHARE * _motion(arm):
         return None
-    cut = cuts[best]
     first = place_pose(arm[:cut], measured[:cut])
     step = pose_steps.step_at(arm, measured, cut, first)
     if step.angle < MIN_TURN and step.shift < MIN_SHIFT:
         return None
     return step
+
+
+def _best_cut(
+    arm: np.ndarray, measured: np.ndarray, min_part: int, rms: Callable[[np.ndarray, np.ndarray], float]
+) -> tuple[int, float]:
+    """Return the index of the row before which two parts of the rows fit best, and the rms misfit [m] of both.
+
+    Args:
+        arm: (m, 4, 4) poses of the tip in the base.
+        measured: (m, 4, 4) poses or (m, 3) positions of the target in the instrument's frame.
+        min_part: fewest rows of a part.
+        rms: rms misfit [m] of a part by its best placements.
+    """
+    count = len(arm)
+    cuts = range(min_part, count - min_part + 1)
+    squares = []
+    for cut in cuts:
+        before = rms(arm[:cut], measured[:cut])
+        after = rms(arm[cut:], measured[cut:])
+        squares.append(cut * before**2 + (count - cut) * after**2)
+    best = int(np.argmin(squares))
+    return cuts[best], float(np.sqrt(squares[best] / count))
 
 
 def _rms_misfit(arm: np.ndarray, measured: np.ndarray) -> float:

@@ -31,7 +31,7 @@ PLACED = 12
 # Largest probability of such a gain by noise, all steps considered; small, since an arm's errors are not white (our
 # choice, judged on simulated sets without a step).
 MAX_CHANCE = 1e-4
-# Largest variance with the step, as a share of that without it (our choice).
+# Largest squares with the step, as a share of those without it (our choice).
 MAX_LEFT = 0.85
 # Smallest likelihood ratio, as -2 log, of the step to one over rows in the order of a coordinate, which an error of the
 # arm resembles (our choice: a chance of 1e-4 at 3 degrees of freedom).
@@ -50,6 +50,8 @@ ITERATIONS = 6
 MAX_TURN = 0.1
 # Smallest standard deviation of poses [m, rad].
 MIN_NOISE = 1e-7
+# Smallest sum of whitened squares: rows without any error have it.
+MIN_SQUARES = 1e-12
 SUBJECTS = ("tool", "station")
 
 
@@ -199,7 +201,7 @@ def small_step(arm: np.ndarray, measured: np.ndarray, start: Placements) -> Step
     search = Search(_twists(arm, measured, *placements, scale), _arm_errors(arm, scale))
     rows = np.arange(m)
     gain, part, cut = search.best_gain(rows)
-    remaining = max(search.cost - gain, 1e-12)
+    remaining = max(search.cost - gain, MIN_SQUARES)
     dof = max(search.dof - TWIST, 1.0)
     chance = float(f.sf(gain / TWIST / (remaining / dof), TWIST, dof))
     hypotheses = len(SUBJECTS) * (m - 2 * MIN_PART + 1)
@@ -292,13 +294,13 @@ def _estimated(arm: np.ndarray, measured: np.ndarray, cut: int, part: str, first
     size = twists.error * scale
     rms = np.sqrt(np.mean(np.sum(size[:, :3] ** 2, axis=1) + LEVER**2 * np.sum(size[:, 3:] ** 2, axis=1)))
     return Step(
-        cut,
-        part,
-        float(rms),
-        float(np.linalg.norm(turn)),
-        _sigma_along(turn, covariance[3:, 3:]),
-        float(np.linalg.norm(shift)),
-        _sigma_along(shift, covariance[:3, :3]),
+        cut=cut,
+        part=part,
+        misfit=float(rms),
+        angle=float(np.linalg.norm(turn)),
+        angle_sigma=_sigma_along(turn, covariance[3:, 3:]),
+        shift=float(np.linalg.norm(shift)),
+        shift_sigma=_sigma_along(shift, covariance[:3, :3]),
     )
 
 

@@ -3,6 +3,7 @@
 All joints feel the same masses. A reversed column therefore contradicts the others, whatever the masses are.
 """
 
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -12,6 +13,41 @@ import numpy as np
 EXPLAINED, BETTER = 0.95, 0.5
 # relative ridge that lets base parameters be fitted by all parameters
 RIDGE = 1e-9
+# least spread by which a column is divided, as a share of the largest: smaller torques are noise (our choice)
+MIN_SPREAD_SHARE = 0.02
+# effect of gravity on a joint, relative to its torque's spread, below which its axis is vertical
+NO_GRAVITY = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class _GravitySums:
+    """Products of regressor G and torques τ over the rows, both without their means, by joint.
+
+    Attributes:
+        squares: (n, p, p) Σ G_jᵀ G_j of each joint j.
+        cross: (n, n, p) Σ G_jᵀ τ_k of joint j and column k.
+        spread: (n,) standard deviation by which a column is divided [N m].
+        total: sum of squares of the divided columns of joints that feel gravity.
+    """
+
+    squares: np.ndarray
+    cross: np.ndarray
+    spread: np.ndarray
+    total: float
+
+    def unexplained(self, order: np.ndarray, signs: np.ndarray) -> float:
+        """Return the share of the torques' squares that gravity does not explain.
+
+        Args:
+            order: (n,) column that is the torque of each joint.
+            signs: (n,) 1.0, or -1.0 for a reversed column.
+        """
+        weights = self.spread[order] ** -2.0
+        square = np.einsum("j,jpq->pq", weights, self.squares)
+        ridge = RIDGE * np.trace(square) * np.eye(len(square))
+        projected = (signs * weights) @ self.cross[np.arange(len(order)), order]
+        explained = float(projected @ np.linalg.solve(square + ridge, projected))
+        return max(self.total - explained, 0.0) / self.total
 
 
 def column_fault(regressor: np.ndarray, torque: np.ndarray, finite: np.ndarray) -> tuple[str, str] | None:
@@ -19,53 +55,44 @@ def column_fault(regressor: np.ndarray, torque: np.ndarray, finite: np.ndarray) 
 
     Args:
         regressor: (m, n, p) gravity regressor of the rows.
-        torque: (m, n) measured torques; zero where none was measured.
+        torque: (m, n) measured torques [N m]; zero where none was measured.
         finite: (m, n) whether a torque was measured.
     """
     rows = finite.all(axis=1)
     if rows.sum() < regressor.shape[2]:
         return None
     torques = torque[rows] - torque[rows].mean(axis=0)
-    spread = np.maximum(torques.std(axis=0), 0.02 * torques.std(axis=0).max())
-    matrix = (regressor[rows] - regressor[rows].mean(axis=0)) / spread[:, None]
-    torques = torques / spread
-    n = torques.shape[1]
-    # a vertical axis feels no gravity
-    feels = np.abs(matrix).max(axis=(0, 2)) > 1e-9
-    square = np.einsum("mjp,mjq->pq", matrix, matrix)
-    ridge = RIDGE * np.trace(square) * np.eye(len(square))
-    inverse = np.linalg.inv(square + ridge)
-    # of regressor row j with torque k
-    cross = np.einsum("mjp,mk->jkp", matrix, torques)
-    total = float(np.sum(torques[:, feels] ** 2))
-
-    def unexplained(order: np.ndarray, signs: np.ndarray) -> float:
-        projected = np.sum(signs[:, None] * cross[np.arange(n), order], axis=0)
-        return max(total - float(projected @ inverse @ projected), 0.0) / total
-
-    order, signs = np.arange(n), np.ones(n)
-    recorded = unexplained(order, signs)
+    matrix = regressor[rows] - regressor[rows].mean(axis=0)
+    spread = torques.std(axis=0)
+    spread = np.maximum(spread, MIN_SPREAD_SHARE * spread.max())
+    feels_gravity = np.abs(matrix).max(axis=(0, 2)) > NO_GRAVITY * spread
+    sums = _GravitySums(
+        squares=np.einsum("mjp,mjq->jpq", matrix, matrix),
+        cross=np.einsum("mjp,mk->jkp", matrix, torques),
+        spread=spread,
+        total=float(np.sum((torques / spread)[:, feels_gravity] ** 2)),
+    )
+    order, signs = np.arange(len(spread)), np.ones(len(spread))
+    recorded = sums.unexplained(order, signs)
     if recorded < (1.0 - EXPLAINED) ** 2:
         return None
-    best, fault = BETTER * recorded, None
-    for joint in np.flatnonzero(feels):
+    smallest, fault = BETTER * recorded, None
+    for joint in np.flatnonzero(feels_gravity):
         reversed_signs = signs.copy()
         reversed_signs[joint] = -1.0
-        misfit = unexplained(order, reversed_signs)
-        if misfit < best:
+        share = sums.unexplained(order, reversed_signs)
+        if share < smallest:
+            smallest = share
             name = f"tau{joint + 1}"
-            best = misfit
-            fault = (
-                f"with {name} reversed gravity explains them, as recorded it does not",
-                f"reverse the sign of {name}",
-            )
-    for first, second in combinations(np.flatnonzero(feels), 2):
+            reason = f"with {name} reversed gravity explains them, as recorded it does not"
+            fault = reason, f"reverse the sign of {name}"
+    for first, second in combinations(np.flatnonzero(feels_gravity), 2):
         exchanged = order.copy()
         exchanged[[first, second]] = second, first
-        misfit = unexplained(exchanged, signs)
-        if misfit < best:
+        share = sums.unexplained(exchanged, signs)
+        if share < smallest:
+            smallest = share
             names = f"tau{first + 1} and tau{second + 1}"
-            best = misfit
             reason = f"with {names} exchanged gravity explains them, as recorded it does not"
             fault = reason, f"exchange the names of {names} in the header"
     return fault

@@ -132,7 +132,10 @@ def torques_used(deflection: Deflection, gravity: GravityFit | None, source: str
         return []
     if gravity is None:
         return [finding("torques-used", source="of the described masses", sigma=None, joint=None, worst=None)]
-    texts = {MEASURED: "as measured; elsewhere by the masses that explain these", MODELLED: "of masses fitted to them"}
+    texts = {
+        MEASURED: "as measured, elsewhere of masses fitted to these",
+        MODELLED: "of masses fitted to the measured ones",
+    }
     worst = int(np.argmax(gravity.sigma))
     sigma = float(np.sqrt(np.mean(gravity.sigma**2)))
     joint = gravity.chain.joint_names[worst]

@@ -45,12 +45,22 @@ BEYOND = 2.0
 """Ratio of a joint's errors to those predicted, rms, from which on they are not as predicted (our choice)."""
 MIN_COVERED = 0.90
 """Share of a joint's errors within 1.96 standard deviations below which they are not as predicted (our choice)."""
+OUTSIDE_SHARE = 0.05
+"""Share of normally distributed errors beyond 1.96 standard deviations."""
 CHANCE_SIGMAS = 3.0
 """Standard deviations of chance by which this share may be lower."""
 SURE_SIGMAS = 3.0
 """Standard deviations from which on a change is one (our choice)."""
 STEADY_SHAPES = ("acceleration",)
 """Shapes of drive terms that do not drift: the motors' inertia."""
+LOAD_PARAMETERS = 10
+"""Number of the standard parameters of a load."""
+UNOBSERVED = 1e-6
+"""Relative singular value below which a log says nothing of a combination of a cause's columns."""
+DEPENDENT = 1e-8
+"""Relative singular value below which columns of a log count as dependent."""
+MIN_TORQUE = 1e-12
+"""Least torque that others are divided by [N m or N]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +217,7 @@ def log_rows(model: WorkingModel, case: Case, decimator: Decimator) -> LogRows:
         matrix[:, row, model.k + row] = first_torque[:, row]
     bodies = _bodies_alone(dynamics.model)
     last_body = int(np.flatnonzero(bodies.bodies.coordinates >= 0)[-1])
-    load_columns = 10 * last_body + np.arange(10)
+    load_columns = LOAD_PARAMETERS * last_body + np.arange(LOAD_PARAMETERS)
     return LogRows(
         matrix=matrix,
         load=observe(bodies, load_columns, case, decimator).matrix,
@@ -331,7 +341,7 @@ def judge(model: WorkingModel, state: DriftBank, rows: LogRows) -> Judgement:
         by_parameters = by_parameters * np.array(model.discrepancy.parameters)
     expected = np.sqrt(by_parameters + rows.floor)
     ratios, unexpected = _compare(errors, expected, rows)
-    as_predicted = Judgement(
+    judgement = Judgement(
         ratios=ratios,
         unexpected=unexpected,
         cause=Cause.NONE,
@@ -349,31 +359,42 @@ def judge(model: WorkingModel, state: DriftBank, rows: LogRows) -> Judgement:
     sure = abs(change) > SURE_SIGMAS * sigma
     clear = lasting and sure and best.criterion > rows.count(errors)
     if not unexpected and not clear:
-        return as_predicted
+        return judgement
     if not unexpected:
-        as_predicted = replace(as_predicted, unexpected=(int(np.nanargmax(ratios)),))
+        judgement = replace(judgement, unexpected=(int(np.nanargmax(ratios)),))
 
-    # torques in a smaller unit have larger noise, too
-    noise_factor = np.ones(len(ratios))
-    if best.hypothesis.cause is Cause.UNIT:
-        noise_factor[:] = max(1.0, abs(1.0 + change))
-    elif best.hypothesis.cause is Cause.GAIN:
-        noise_factor[best.hypothesis.row] = max(1.0, abs(1.0 + change))
-    _, remaining = _compare(best.residual, expected * noise_factor, rows)
-    if not remaining and sure:
+    # a single cause
+    _, unexplained = _compare(best.residual, expected * _noise_factors(best, change), rows)
+    if not unexplained and sure:
         cause, row = best.hypothesis.cause, best.hypothesis.row
-        steps = as_predicted.steps
+        steps = judgement.steps
         if cause in (Cause.FRICTION, Cause.GAIN):
             steps = np.abs(best.hypothesis.columns[: len(steps)]) @ _widths(best)
         accepted = bool(steps.any())
-        return replace(as_predicted, cause=cause, row=row, change=change, sigma=sigma, steps=steps, accepted=accepted)
+        return replace(judgement, cause=cause, row=row, change=change, sigma=sigma, steps=steps, accepted=accepted)
 
+    # errors of the model itself, which no values of its parameters explain
     free_errors = rows.target - rows.matrix @ _best_values(rows)
     free_ratios, unexplained = _compare(free_errors, expected, rows)
     if unexplained:
         weights = np.fmax(free_ratios, 1.0)
-        return replace(as_predicted, cause=Cause.MOTION, weights=weights)
-    return replace(as_predicted, cause=Cause.UNKNOWN, accepted=False)
+        return replace(judgement, cause=Cause.MOTION, weights=weights)
+    return replace(judgement, cause=Cause.UNKNOWN, accepted=False)
+
+
+def _noise_factors(fit: _Fit, change: float) -> np.ndarray:
+    """Return the factors (rows,) of the noise under a fit's cause: torques in a smaller unit have larger noise, too.
+
+    Args:
+        fit: fit of the cause.
+        change: its change of the unit or the gain, as a factor - 1.
+    """
+    factors = np.ones(fit.residual.shape[1])
+    if fit.hypothesis.cause is Cause.UNIT:
+        factors[:] = max(1.0, abs(1.0 + change))
+    elif fit.hypothesis.cause is Cause.GAIN:
+        factors[fit.hypothesis.row] = max(1.0, abs(1.0 + change))
+    return factors
 
 
 def _compare(errors: np.ndarray, expected: np.ndarray, rows: LogRows) -> tuple[np.ndarray, tuple[int, ...]]:
@@ -393,7 +414,7 @@ def _compare(errors: np.ndarray, expected: np.ndarray, rows: LogRows) -> tuple[n
         ratios[row] = np.sqrt(np.mean(relative**2))
         inside = (np.abs(relative) <= SIGMAS).astype(float)
         independent = len(inside) / inflation(inside)
-        chance = CHANCE_SIGMAS * np.sqrt(0.05 * 0.95 / max(independent, 1.0))
+        chance = CHANCE_SIGMAS * np.sqrt(OUTSIDE_SHARE * (1.0 - OUTSIDE_SHARE) / max(independent, 1.0))
         if ratios[row] > BEYOND and inside.mean() < MIN_COVERED - chance:
             unexpected.append(row)
     return ratios, tuple(unexpected)
@@ -402,7 +423,7 @@ def _compare(errors: np.ndarray, expected: np.ndarray, rows: LogRows) -> tuple[n
 def _hypotheses(model: WorkingModel) -> Iterable[_Hypothesis]:
     """Yield the causes that are compared, with their columns among [W load] (p + 10, c)."""
     p = len(model.names)
-    identity = np.eye(p + 10)
+    identity = np.eye(p + LOAD_PARAMETERS)
     by_row: dict[int, list[int]] = {}
     groups = model.drift_groups()
     for parameter in np.flatnonzero(groups == FRICTION).tolist():
@@ -452,12 +473,12 @@ def _fits(model: WorkingModel, state: DriftBank, rows: LogRows, errors: np.ndarr
         stacked[len(prior) :, -1] = compressed[:, -1]
         upper = retriangulate(stacked)
         lower = upper[p:-1, p:-1]
-        inverse = np.linalg.pinv(lower, rcond=1e-6)
+        inverse = np.linalg.pinv(lower, rcond=UNOBSERVED)
         changes = inverse @ upper[p:-1, -1]
         # sum of squares that the columns remove, less Schwarz's price for each
         criterion = float(np.sum((lower @ changes) ** 2)) - c * float(np.log(count))
         values = scipy.linalg.solve_triangular(upper[:p, :p], upper[:p, -1] - upper[:p, p:-1] @ changes)
-        step = np.append(values, np.zeros(10)) + directions @ changes
+        step = np.append(values, np.zeros(LOAD_PARAMETERS)) + directions @ changes
         residual = rows.target - every_column @ step
         fitted = _Hypothesis(hypothesis.cause, hypothesis.row, directions)
         fits.append(_Fit(fitted, changes, inverse, criterion, residual))
@@ -492,7 +513,7 @@ def _best_values(rows: LogRows) -> np.ndarray:
     whitened = rows.whitened
     norms = np.linalg.norm(whitened[:, :-1], axis=0)
     scale = np.where(norms > 0.0, norms, 1.0)
-    solution, *_ = np.linalg.lstsq(whitened[:, :-1] / scale, whitened[:, -1], rcond=1e-8)
+    solution, *_ = np.linalg.lstsq(whitened[:, :-1] / scale, whitened[:, -1], rcond=DEPENDENT)
     return solution / scale
 
 
@@ -525,5 +546,5 @@ def torque_shares(rows: LogRows, covariance: np.ndarray) -> np.ndarray:
     count = np.maximum(present.sum(axis=0), 1)
     effect = np.sqrt(np.sum((rows.matrix * present) ** 2, axis=0) / count)
     torque = np.sqrt(np.sum((rows.torque[:, :, None] * present) ** 2, axis=0) / count)
-    relative = effect / np.maximum(torque, 1e-12)
+    relative = effect / np.maximum(torque, MIN_TORQUE)
     return np.asarray(np.sqrt(np.diag(covariance)) * relative.max(axis=0))

@@ -11,7 +11,8 @@ with ĝ and Σ the result of the geometric fit, i.e. all that measured poses say
 bodies (`calib.identification.physical_consistency.solve`) to second order, ε the gains of the torque rows, and m the
 mass and first moments of payloads whose values are stated. The method is Gauss-Newton with rows [W, W χ, ∂(W χ)/∂g];
 its start is the result of the two stages. All standard parameters are estimated, not base parameters, since their
-regrouping depends on the geometry: with bodies that cannot exist, small changes of lengths would have large effects.
+regrouping depends on the geometry: without the prior of physically consistent inertias, small changes of lengths would
+have large effects.
 
 If the fit has joint corrections (compliance, gears, encoders), the geometry is that fitted with them; their
 coefficients follow its change by the correlations of the fit.
@@ -90,9 +91,12 @@ MIN_DATA_SHARE = 0.5
 """Share of the prior variance by which the torques reduce that of an element that they show (our choice)."""
 FIRST_MOMENTS = slice(6, 10)
 """MX, MY, MZ and M among the ten standard parameters of a body."""
-
 FIXED = 1e12
 """Precision of a parameter that the identification fixes, relative to that of its data."""
+LEAST_SCALE = 1e-9
+"""Least diagonal of a precision, relative to that of the data, by which its rows and columns are scaled."""
+SINGULAR = 1e-10
+"""Relative eigenvalue of a correlation matrix below which its inverse leaves a combination out."""
 
 Progress = Callable[[str], None]
 
@@ -108,7 +112,7 @@ class JointEstimate(Frozen):
         prior, covariance: (K, K) covariance of the values before and after.
         widening: factor by which the variance of the torques was raised, as groups of rows ask for; median over
             combinations of elements.
-        held_out: squared torque errors on held-out blocks of time, over those with the geometry before.
+        held_out: ratio of squared torque errors on held-out blocks of time to those with the geometry before.
         rounds: number of linearisations.
         gains, gain_sigma: (rows,) gains of the torque rows, measured over true torques, and their standard deviations.
     """
@@ -467,6 +471,15 @@ def estimate_jointly(
 
 @dataclass(frozen=True, eq=False)
 class _Solution:
+    """Solution of one linearisation.
+
+    Attributes:
+        change: (K,) change of the elements from the geometry before the torques [m or rad].
+        values: (p,) parameters of bodies and drives, then the gains' deviations from 1.
+        covariance: (K, K) covariance of the change.
+        gain_sigma: (rows,) standard deviations of the gains.
+    """
+
     change: np.ndarray
     values: np.ndarray
     covariance: np.ndarray
@@ -475,6 +488,18 @@ class _Solution:
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
+    """Rows and priors of a joint estimate about an identification.
+
+    Attributes:
+        identification: the identification whose weights and prior are used.
+        settings: its settings, with the direction of gravity before the torques.
+        chain: the arm before the torques.
+        cases: training recordings.
+        free: (K,) indices of the estimated elements and tilts.
+        prior: (K, K) their covariance before the torques.
+        doubted: labels of payloads whose stated mass and centre are not used.
+    """
+
     identification: Identification
     settings: IdentificationSettings
     chain: Chain
@@ -504,7 +529,7 @@ class _Problem:
     def beforehand(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Most probable parameters (p,) of the identification, and precision (p, p) and pull (p,) of their prior.
 
-        The parameters are those of bodies that can exist. Their prior is quadratic about them.
+        The inertias are physically consistent; their prior is quadratic about them.
         """
         identification = self.identification
         base = identification.base
@@ -514,10 +539,12 @@ class _Problem:
         drives = base.kept[self.columns[self.columns < base.b]]
         index = np.concatenate([self.computed, drives, friction]).astype(int)
         values = possible.dynamics.values
+        # data of the identification alone, and the slope of their cost at the most probable values
         factor = information.factor[:, :-1] @ information.transform / possible.doubt
         target = information.factor[:, -1] / possible.doubt
         slope = factor.T @ (factor @ values - target)
         covariance = possible.covariance[np.ix_(index, index)]
+        # precision of the prior: of the estimate, less that of the data
         free = np.diag(covariance) > 0.0
         precision = np.zeros_like(covariance)
         data = factor[:, index].T @ factor[:, index]
@@ -527,10 +554,10 @@ class _Problem:
         precision[fixed, fixed] += FIXED * (1.0 + np.diag(data)[fixed])
         values = values[index]
         pull = precision @ values + np.where(free, slope[index], 0.0)
-        richer = np.arange(len(index) - len(friction), len(index))
-        if len(richer) and identification.fitted.beforehand is not None:
+        of_friction = np.arange(len(index) - len(friction), len(index))
+        if len(of_friction) and identification.fitted.beforehand is not None:
             ridges = np.sum(identification.fitted.beforehand**2, axis=0)[base.b :]
-            precision[richer, richer] += ridges
+            precision[of_friction, of_friction] += ridges
         return values, precision, pull
 
     @cached_property
@@ -666,6 +693,7 @@ class _Problem:
         project = selection.T @ directions
         solution = np.concatenate([values, change, [-1.0]])
         decimator = common_decimator(self.cases, self.settings)
+        # scores of each direction: derivatives of the cost by row
         scores = []
         for matrix in self.whitened_rows(change, values):
             residual = matrix @ solution
@@ -675,6 +703,7 @@ class _Problem:
         positions = np.concatenate([case.motion.q[k] for case, k in zip(self.cases, index)])
         velocities = np.concatenate([case.motion.v[k] for case, k in zip(self.cases, index)])
 
+        # groups: number of the group of each row and sample
         count = len(all_scores)
         groupings = []
         for blocks in BLOCK_COUNTS:
@@ -685,6 +714,7 @@ class _Problem:
             ranks = np.argsort(np.argsort(states, axis=0), axis=0)
             bins = (ranks * BINS // count)[:, joints]
             groupings.append(bins + BINS * np.arange(len(joints)))
+        # squared sums of scores over groups: on average the stated variance, if rows are independent
         ratio = np.ones(len(variance))
         effective = variance > 0.0
         for groups in groupings:
@@ -717,7 +747,7 @@ class _Problem:
         return np.asarray(half @ turns)
 
     def held_out(self, products: np.ndarray) -> float:
-        """Return squared errors on held-out time with the geometry estimated, over those with it unchanged."""
+        """Return the ratio of squared errors on held-out time, with the geometry estimated to with it unchanged."""
         fold = (np.arange(len(products)) * PIECES // len(products)) % FOLDS
         squares = np.zeros(2)
         for number in range(FOLDS):
@@ -748,13 +778,13 @@ def payload_information(payload: Payload) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _nonnegative(matrix: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Return the nearest positive semidefinite matrix, nearest with rows and columns scaled.
+    """Return the positive semidefinite matrix that is nearest once rows and columns are scaled.
 
     Args:
         matrix: (p, p) symmetric.
         scale: (p,) sizes that its diagonal is compared with.
     """
-    diagonal = np.maximum(np.abs(np.diag(matrix)), 1e-9 * scale)
+    diagonal = np.maximum(np.abs(np.diag(matrix)), LEAST_SCALE * scale)
     unit = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     values, vectors = np.linalg.eigh(matrix / np.outer(unit, unit))
     half = vectors * np.sqrt(np.clip(values, 0.0, None)) * unit[:, None]
@@ -765,4 +795,4 @@ def _inverse(covariance: np.ndarray) -> np.ndarray:
     """Return the (pseudo-)inverse of a covariance, with rows scaled to unit variance."""
     unit = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(unit, unit)
-    return np.linalg.pinv(correlation, rcond=1e-10, hermitian=True) / np.outer(unit, unit)
+    return np.linalg.pinv(correlation, rcond=SINGULAR, hermitian=True) / np.outer(unit, unit)

@@ -55,7 +55,7 @@ class GeometryFromTorques:
         estimate: the joint estimate.
         delivered: whether the robot of the result has this geometry; otherwise it has that before the torques.
         noticed: findings.
-        unseen: squared errors on held-out recordings, over those of the two stages; None without such recordings.
+        unseen: ratio of squared errors on held-out recordings to those of the two stages; None without such recordings.
         regrouped: the estimate by independent elements.
     """
 
@@ -90,11 +90,11 @@ class GeometryFromTorquesMetrics:
 
     Attributes:
         delivered: whether the robot of the result has this geometry.
-        held_out: squared errors on held-out torques, over those of the two stages.
+        held_out: ratio of squared errors on held-out torques to those of the two stages.
         combinations: number of independent combinations of elements that the torques determine.
-        widening: factor by which blocks of time widened the variance of the torques.
+        widening: factor by which the variance of the torques was raised, median over combinations of elements.
         elements: free elements, and tilts of gravity.
-        gains: measured over true torque of each torque row, with the standard deviation.
+        gains: gain of each torque row, measured over true torque, with its standard deviation.
     """
 
     delivered: bool
@@ -125,20 +125,20 @@ def run_jointly(
     doubted = _doubted_payloads(inputs, plain)
 
     identify_all = partial(identify_jointly, plain, inputs.robot, inputs.cases, settings, doubted)
-
     if inputs.robot.covariance is not None or inputs.robot.corrections is not None:
         by_torques = identify_all(fitted=False, progress=say).estimate
         contradicting = contradictions(by_torques, inputs.robot)
         if contradicting:
             return inputs, plain, GeometryFromTorques(by_torques, False, contradicting, None, by_torques)
-    joint, robot, found = identify_all(progress=say)
-    unseen = _unseen_ratio(inputs, plain, found)
+    joint, robot, joint_identification = identify_all(progress=say)
+    unseen = _unseen_ratio(inputs, plain, joint_identification)
     result = GeometryFromTorques(joint, True, (), unseen, joint.regrouped(inputs.robot.complete))
     if result.held_out > MAX_HELD_OUT:
         noticed = finding("geometry-not-better", ratio=result.held_out)
         return inputs, plain, replace(result, delivered=False, noticed=(noticed,))
-    options = replace(inputs.options, settings=replace(inputs.options.settings, gravity=found.settings.gravity))
-    return replace(inputs, robot=robot, options=options), found, result
+    gravity = joint_identification.settings.gravity
+    options = replace(inputs.options, settings=replace(inputs.options.settings, gravity=gravity))
+    return replace(inputs, robot=robot, options=options), joint_identification, result
 
 
 def _require_usable(inputs: IdentificationInputs) -> None:
@@ -175,13 +175,19 @@ def _doubted_payloads(inputs: IdentificationInputs, plain: Identification) -> tu
     return tuple(labels)
 
 
-def _unseen_ratio(inputs: IdentificationInputs, plain: Identification, found: Identification) -> float | None:
-    """Return squared errors of the joint estimate over those of the two stages, on held-out recordings; None: none."""
+def _unseen_ratio(inputs: IdentificationInputs, plain: Identification, joint: Identification) -> float | None:
+    """Return the ratio of squared errors on held-out recordings, joint estimate to two stages; None without any.
+
+    Args:
+        inputs: the held-out recordings are among them.
+        plain: identification of the two stages.
+        joint: identification on the geometry of the joint estimate.
+    """
     if not inputs.unseen:
         return None
     squares = np.zeros(2)
     for case in inputs.unseen:
-        for k, identification in enumerate((found, plain)):
+        for k, identification in enumerate((joint, plain)):
             residual = case.target - predict(identification.dynamics, case)
             in_band = case.motion.in_band(residual)
             squares[k] += np.sum((in_band * case.present / plain.fitted.std) ** 2)
@@ -189,10 +195,12 @@ def _unseen_ratio(inputs: IdentificationInputs, plain: Identification, found: Id
 
 
 def contradictions(by_torques: JointEstimate, robot: CalibratedChain) -> tuple[Finding, ...]:
-    """Return a finding on the element in which torques contradict a robot's fit most, if they do.
+    """Return a finding on the element in which torques contradict a robot's fit most; empty if none does.
+
+    The limit is that of the largest of all compared distances by chance (Bonferroni).
 
     Args:
-        by_torques: geometry by the torques by_torques.
+        by_torques: joint estimate without the prior of the fit.
         robot: the robot with the covariance of its fit.
     """
     distances = np.abs(by_torques.distances(robot))
@@ -201,15 +209,16 @@ def contradictions(by_torques: JointEstimate, robot: CalibratedChain) -> tuple[F
     p_value = compared * float(erfc(distances[worst] / np.sqrt(2.0)))
     if p_value > CONTRADICTION:
         return ()
+    # mm or mrad
     shift = f"{1e3 * by_torques.change[worst]:.3g} m{by_torques.units[worst]}"
     return (finding("geometry-contradicted", element=by_torques.elements[worst], moved=shift, sigmas=distances[worst]),)
 
 
 def with_covariance(carried: GeometryUncertainty, result: GeometryFromTorques) -> GeometryUncertainty:
-    """Return the geometry's contribution to the dynamics' covariance with the tilts of gravity.
+    """Return the geometry's contribution to the dynamics' covariance, that of the tilts of gravity included.
 
     Args:
-        carried: contribution of the geometry after the torques.
+        carried: contribution of the geometry after the torques, without the tilts.
         result: geometry from torques, which is delivered.
     """
     joint = result.estimate

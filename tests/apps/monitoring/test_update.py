@@ -1,6 +1,7 @@
 """calib update: logs are predicted, then learnt from; what is not as predicted is named and not averaged in."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import planted_motion as planted
 import pytest
 
 import calib
+from calib import folders
 from calib.apps.monitoring.learning.dynamics_update import DRIFT, LOG_TABLE, DynamicsUpdate
 from calib.apps.monitoring.learning.logs import common_share, dated, sketch
 from calib.apps.monitoring.learning.update import update_dynamics
@@ -76,6 +78,20 @@ def test_the_folder_is_an_identification_with_the_values_of_today(identified: Pa
         values[update.state.model.dynamics.model.inertial :]
     )
     assert str(update)
+
+
+def test_a_parameter_without_variance_stays_at_its_value(identified: Path, tmp_path: Path):
+    first = shutil.copytree(identified, tmp_path / "first")
+    names, covariance = folders.read_covariance(first)
+    fixed = names.index("Fc2")
+    covariance[fixed] = covariance[:, fixed] = 0.0
+    folders.write_covariance(first / folders.COVARIANCE, names, covariance)
+    folder = update_dynamics(first, [log(tmp_path, "2026-03-01", 4)]).save(tmp_path / "today", plots=False)
+    value = read_table(first / folders.ESTIMATE).numbers("value", None)[fixed]
+    assert value != 0.0
+    assert read_table(folder / folders.ESTIMATE).numbers("value", None)[fixed] == value
+    factor = np.loadtxt(folder / "information.csv", delimiter=",", skiprows=1)
+    assert np.linalg.solve(factor[:, :-1], factor[:, -1])[fixed] == pytest.approx(value)
 
 
 def test_a_load_that_was_not_stated_is_found_and_not_averaged_in(identified: Path, tmp_path: Path):

@@ -16,7 +16,7 @@ from browsers import chromium
 from calib import files
 from calib.procedure.report.certificate import rendering
 from calib.procedure.report.certificate.record import Page
-from calib.procedure.report.figures import figure_data
+from calib.procedure.report.figures import figure_data, figure_files
 from calib.procedure.report.figures.charts import Captioned, Chart, Line, Panel
 from calib.procedure.report.figures.drawing import figure
 from calib.procedure.report.figures.svg import svg
@@ -258,6 +258,22 @@ def test_stored_figures_are_those_that_were_written(tmp_path):
     stored = figure_data.read(tmp_path / figure_data.NAME)["torque_1"][0].panels[0].layers[0]
     np.testing.assert_allclose(stored.y, curve.y, atol=10.0 / 65535)
     np.testing.assert_allclose(stored.x, curve.x, rtol=1e-6)
+
+
+def test_drawings_are_files_of_their_names(tmp_path):
+    """Asked for, each figure is a file; otherwise none is, and without a page the data are."""
+    charts = {"rows": geometry()["rows"]}
+    for plots, paged, names in (
+        (False, False, []),
+        (True, True, []),
+        (True, False, ["figures.json"]),
+        ("svg", True, ["plot_rows.svg"]),
+        ("png", True, ["plot_rows.png"]),
+    ):
+        folder = tmp_path / f"{plots} {paged}"
+        folder.mkdir()
+        figure_files.write(folder, charts, plots, paged)
+        assert sorted(path.name for path in folder.iterdir()) == names
 
 
 def test_vendored_files_are_those_published():

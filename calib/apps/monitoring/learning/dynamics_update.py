@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -82,9 +82,16 @@ WRITTEN = (
 OUTDATED = (INSTRUMENTAL, *folders.PAGES, "torques_*.csv", *folders.figure_files("*"))
 """Files of the identification that do not hold for the updated model, and are not copied."""
 DRAWN_SHAPES = ("sign", "velocity")
-PANEL_HEIGHT = 1.9  # of the figure, per row of panels [inch]
-TORQUE_RATE = 100.0  # of the table of torques [Hz]
-FIXED = 1e12  # information of parameters without variance, which were switched off or fixed
+"""Shapes of drive terms that the figure shows: Coulomb and viscous friction."""
+PANELS_PER_ROW = 4
+PANEL_HEIGHT = 1.9
+"""Height of a row of panels [in]."""
+LEGEND_HEIGHT = 0.6
+"""Height of the figure beside its panels [in]."""
+TORQUE_RATE = 100.0
+"""Rate of the table of torques [Hz]."""
+FIXED = 1e12
+"""Reciprocal standard deviation of parameters without variance: switched off, or fixed at a value."""
 
 
 class PredictedLog(NamedTuple):
@@ -152,11 +159,8 @@ class DynamicsUpdate(ChartedResult, ReportedResult):
         verdict = Verdict.of(figures, self.noticed)
         before = IdentificationFolder(self.state.folder).metrics()
         unproven = before.code == "no-unseen-motion"
-        if (
-            before.verdict in ("marginal", "fail")
-            and not unproven
-            and LEVELS.index(before.verdict) > LEVELS.index(verdict.level)
-        ):
+        doubtful = before.verdict in ("marginal", "fail") and not unproven
+        if doubtful and LEVELS.index(before.verdict) > LEVELS.index(verdict.level):
             reason = f"{figures}; {self.state.folder}: {before.reason}"
             return Verdict(before.verdict, reason, before.code, before.advice)
         if verdict.level == "pass":
@@ -232,9 +236,10 @@ class DynamicsUpdate(ChartedResult, ReportedResult):
             if index < self.state.model.k:
                 first = record.values[index]
             layers.append(Line(days[[0, -1]], np.full(2, first), "--", QUIET))
-            title = f"{record.names[index]} [{record.units[index]}]".replace(" []", "")
+            title = _heading(record.names[index], record.units[index])
             panels.append(Panel(layers, title, label))
-        return {"drift": Chart(panels, 0.6 + PANEL_HEIGHT * -(-len(panels) // 4), 4)}
+        row_count = -(-len(panels) // PANELS_PER_ROW)
+        return {"drift": Chart(panels, LEGEND_HEIGHT + PANEL_HEIGHT * row_count, PANELS_PER_ROW)}
 
     def _drawn(self, parameter: int) -> bool:
         """Return whether the figure shows a parameter: gains, and friction of the standard model."""
@@ -277,7 +282,7 @@ class DynamicsUpdate(ChartedResult, ReportedResult):
         units = [self.state.record.units[index] for index in drifting]
         header = ["log", "date", "day"]
         for name, unit in zip(names, units):
-            header += [f"{name} [{unit}]".replace(" []", ""), f"sigma {name}"]
+            header += [_heading(name, unit), f"sigma {name}"]
         rows = []
         for log in self.state.record.logs:
             pairs = np.column_stack([log.parameters, log.sigmas]).ravel()
@@ -289,44 +294,42 @@ class DynamicsUpdate(ChartedResult, ReportedResult):
         files.write_json(folder / folders.METRICS, self._metrics())
 
     def _write_model(self, folder: Path) -> None:
-        """Write the updated values, with sigma and covariance, into the tables of the model."""
-        state = self.state
-        changes, covariance = state.bank.posterior()
-        dynamics = state.model.updated(changes)
-        model = json.loads((state.folder / MODEL).read_text(encoding="utf-8"))
-        inertial = dynamics.model.inertial
-        model["bodies"] = dict(zip(dynamics.model.names[:inertial], dynamics.values[:inertial].tolist()))
-        for entry, value in zip(model["terms"], dynamics.values[inertial:]):
-            entry["value"] = float(value)
-        files.write_json(folder / MODEL, model)
+        """Write the updated values, with sigma, covariance and information, into the tables of the model."""
+        model = self.state.model
+        changes, covariance = self.state.bank.posterior()
+        values, covariance = model.values + changes[: model.k], covariance[: model.k, : model.k]
+        self._write_parameters(folder, changes)
+        with (self.state.folder / folders.ESTIMATE).open(encoding="utf-8", newline="") as file:
+            table_rows = csv.DictReader(file)
+            header = list(table_rows.fieldnames or ())
+            rows = list(table_rows)
 
-        names, old_covariance = folders.read_covariance(state.folder)
-        estimated = [names.index(name) for name in state.model.names[: state.model.k]]
-        new_covariance = np.zeros_like(old_covariance)
-        new_covariance[np.ix_(estimated, estimated)] = covariance[: state.model.k, : state.model.k]
-        folders.write_covariance(folder / folders.COVARIANCE, names, new_covariance)
-        information = np.zeros((len(names), len(names) + 1))
-        np.fill_diagonal(information, FIXED)
-        live = [*estimated, len(names)]
-        values = state.model.values + changes[: state.model.k]
-        information[np.ix_(estimated, live)] = whitened(values, covariance[: state.model.k, : state.model.k])
+        names, old_covariance = folders.read_covariance(self.state.folder)
+        estimated = [names.index(name) for name in model.names[: model.k]]
+        complete_covariance = np.zeros_like(old_covariance)
+        complete_covariance[np.ix_(estimated, estimated)] = covariance
+        folders.write_covariance(folder / folders.COVARIANCE, names, complete_covariance)
+
+        first_values = np.array([float(row["value"]) for row in rows])
+        information = FIXED * np.column_stack([np.eye(len(names)), first_values])
+        information[estimated] = 0.0
+        information[np.ix_(estimated, [*estimated, len(names)])] = whitened(values, covariance)
         files.write_numbers(folder / INFORMATION, (*names, "target"), information)
-        value_of = dict(zip(state.model.names, (state.model.values + changes[: state.model.k]).tolist()))
-        sigma_of = dict(zip(state.model.names, np.sqrt(np.diag(covariance)).tolist()))
-        with (state.folder / folders.ESTIMATE).open(encoding="utf-8", newline="") as file:
-            header, *rows = list(csv.reader(file))
-        table_rows: list[Sequence[object]] = []
-        for row in rows:
-            cells: dict[str, object] = dict(zip(header, row))
-            name = row[0]
-            if name in value_of:
-                value, sigma = value_of[name], sigma_of[name]
-                rsd = 100.0 * sigma / abs(value) if value else None
-                cells |= {"value": value, "sigma": sigma, "rsd [%]": rsd, "sigma_torque": sigma, "sigma_geometry": None}
-                if cells["essential"]:
-                    cells["essential"] = value
-            table_rows.append([cells[column] for column in header])
-        files.write_table(folder / folders.ESTIMATE, header, table_rows)
+
+        sigmas = np.sqrt(np.diag(covariance))
+        updated = {name: (float(value), float(sigma)) for name, value, sigma in zip(model.names, values, sigmas)}
+        lines = [_updated_row(row, updated.get(row[header[0]])) for row in rows]
+        files.write_table(folder / folders.ESTIMATE, header, [[line[column] for column in header] for line in lines])
+
+    def _write_parameters(self, folder: Path, changes: np.ndarray) -> None:
+        """Write the model file with changed parameters (p,)."""
+        dynamics = self.state.model.updated(changes)
+        table = json.loads((self.state.folder / MODEL).read_text(encoding="utf-8"))
+        inertial = dynamics.model.inertial
+        table["bodies"] = dict(zip(dynamics.model.names[:inertial], dynamics.values[:inertial].tolist()))
+        for entry, value in zip(table["terms"], dynamics.values[inertial:]):
+            entry["value"] = float(value)
+        files.write_json(folder / MODEL, table)
 
     def _write_torques(self, path: Path) -> None:
         """Write measured and predicted torques of the last log, at about `TORQUE_RATE`."""
@@ -399,6 +402,28 @@ class DynamicsUpdate(ChartedResult, ReportedResult):
 
 def _learnt(log: LogRecord) -> str:
     return "yes" if log.learnt else "no"
+
+
+def _heading(name: str, unit: str) -> str:
+    """Return the heading of a column: the name with its unit, if it has one."""
+    return f"{name} [{unit}]" if unit else name
+
+
+def _updated_row(row: Mapping[str, str], updated: tuple[float, float] | None) -> Mapping[str, object]:
+    """Return a row of ``estimate.csv`` with an updated value.
+
+    Args:
+        row: the row, by column.
+        updated: value and standard deviation; None for a parameter that is not estimated.
+    """
+    if updated is None:
+        return row
+    value, sigma = updated
+    rsd = 100.0 * sigma / abs(value) if value else None
+    cells = {"value": value, "sigma": sigma, "rsd [%]": rsd, "sigma_torque": sigma, "sigma_geometry": None}
+    if row["essential"]:
+        cells["essential"] = value
+    return {**row, **cells}
 
 
 def _table_row(log: LogRecord) -> tuple[object, ...]:

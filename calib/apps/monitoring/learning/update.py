@@ -2,7 +2,7 @@
 
 Each log is predicted before it is learnt from, so that its error is one on unseen motion. A log whose torques are not
 as predicted is not averaged into the model: its cause is named, and the log is left out unless the cause is a change of
-friction or of a drive's gain, after which these are learnt anew.
+friction or of a drive's gain, after which these are estimated anew.
 """
 
 from __future__ import annotations
@@ -36,6 +36,8 @@ from calib.toolkit.torque_models import Case, predict
 
 MIN_RANGE = 1e-3
 """Range of positions from which on a joint moves [rad or m]."""
+TINY = 1e-300
+"""Sum of squares that others are divided by, where a log has no torque at all [N² m² or N²]."""
 Progress = Callable[[str], None]
 
 
@@ -90,7 +92,7 @@ def update_dynamics(
     for log in ordered:
         say(f"learning from {Path(log.path).name}")
         try:
-            step = _taken(state, log, identify_options)
+            step = _next_step(state, log, identify_options)
         except MeasurementError as error:
             failure = error
             findings.append(finding("log-unreadable", file=Path(log.path).name, reason=_reason(error, log.path)))
@@ -143,8 +145,8 @@ def _check_order(state: WorkingState, logs: Sequence[DatedLog]) -> None:
     require(not older, message, UsageError)
 
 
-def _taken(state: WorkingState, log: DatedLog, options: IdentifyOptions) -> _Step:
-    """Return what a log leads to.
+def _next_step(state: WorkingState, log: DatedLog, options: IdentifyOptions) -> _Step:
+    """Return what a log leads to: it is predicted, compared with the prediction, and learnt from if it is accepted.
 
     Args:
         state: the state before it.
@@ -237,7 +239,7 @@ def _unexplained(case: Case, torque: np.ndarray) -> float:
     """Return the share of a log's torque that a prediction (N, rows) leaves unexplained [%]."""
     present = case.present
     residual = np.sum((case.target - torque)[present] ** 2)
-    return 100.0 * float(np.sqrt(residual / max(np.sum(case.target[present] ** 2), 1e-300)))
+    return 100.0 * float(np.sqrt(residual / max(np.sum(case.target[present] ** 2), TINY)))
 
 
 def _repeated(state: WorkingState, hashes: np.ndarray) -> str:

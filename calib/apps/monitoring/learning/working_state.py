@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files, folders
+from calib.apps.monitoring.learning.logs import SKETCH
 from calib.config_types import ParsedTable
 from calib.errors import RobotError, UsageError, refuse_option, refused_as, require
 from calib.records import read_json
@@ -19,7 +20,9 @@ from calib.toolkit.torque_models import estimated_columns, read_model_table
 
 STATE = "learning.npz"
 LOGS = "learning.json"
+# arrays of a `DriftBank`, under their names in the file
 BANK = ("group", "size", "rates", "factors", "log_ratio")
+# torque rows of which each belongs to one joint
 ROWS_SUPPORTED = ("motor", "link", "both")
 
 
@@ -169,7 +172,7 @@ def read_state(path: str | Path) -> WorkingState:
         return WorkingState(folder, robot, model, bank, record, sketches, unit)
     bank = model.first_state(covariance[np.ix_(estimated, estimated)])
     record = LearningRecord(table, model.names, model.units, tuple(model.values.tolist()))
-    return WorkingState(folder, robot, model, bank, record, np.zeros((0, 64), np.uint64), unit)
+    return WorkingState(folder, robot, model, bank, record, np.zeros((0, SKETCH), np.uint64), unit)
 
 
 def _read_record(folder: Path) -> LearningRecord | None:

@@ -25,15 +25,15 @@ NAME = FIGURES
 # what stands before the figures in a page
 BEGIN = '<script type="application/json" id="figures">'
 SCHEMA = 1
-# Numbers from which on a sequence is written as an array.
+# numbers from which on a sequence is written as an array
 SHORTEST_ARRAY = 16
-# numbers of a curve up to which they have four bytes; others have steps, so many between their limits
-LONGEST_FLOATS, STEPS = 256, 65535
+# length of a curve from which on its values are steps of two bytes, and number of steps between their limits
+SHORTEST_STEPS, STEPS = 256, 65535
 # samples of all curves in a page: about 0.7 MB
 MAX_SAMPLES = 250_000
 # script with all samples of a figure, beside the page
 WHOLE = "figure_{}.js"
-# packed arrays by their content, with their number
+# packed arrays of a figure by their content, each with its number
 Arrays: TypeAlias = dict[bytes, tuple[int, ParsedTable]]
 FieldValue: TypeAlias = Any  # of a chart, or its JSON value
 LAYERS: Mapping[str, type] = {kind.__name__: kind for kind in Layer.__args__}
@@ -98,6 +98,7 @@ def _whole(charts: Mapping[str, Captioned]) -> set[str]:
 
 
 def _curves(chart: Chart) -> Iterator[Line]:
+    """Yield the curves of a chart, which may be thinned: lines without points and dashes."""
     for panel in chart.panels:
         for layer in panel.layers:
             if isinstance(layer, Line) and layer.form == "-":
@@ -118,6 +119,7 @@ def _thinned(chart: Chart) -> Chart:
 
 
 def _figure(chart: Chart, caption: str) -> ParsedTable:
+    """Return a chart with its caption as JSON values, its arrays apart."""
     arrays: Arrays = {}
     content = {"caption": caption, **_fields(chart, arrays)}
     return content | {"arrays": [packed for _, packed in arrays.values()]}
@@ -228,7 +230,7 @@ def _packed(content: np.ndarray, name: str) -> ParsedTable:
         content: the array.
         name: name of its field.
     """
-    if name == "y" and content.size >= LONGEST_FLOATS and np.isfinite(content).all():
+    if name == "y" and content.size >= SHORTEST_STEPS and np.isfinite(content).all():
         low, high = float(content.min()), float(content.max())
         step = (high - low) / STEPS or 1.0
         steps = np.round((content - low) / step).astype("<u2")
@@ -240,6 +242,7 @@ def _packed(content: np.ndarray, name: str) -> ParsedTable:
 
 
 def _of_records(value: Sequence[object]) -> bool:
+    """Return whether a sequence contains layers, panels or texts, not numbers."""
     return len(value) > 0 and isinstance(value[0], Layer | Panel | str)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import singledispatch
 from itertools import pairwise
+from math import isfinite
 from operator import attrgetter, itemgetter
 from xml.sax.saxutils import escape
 
@@ -88,6 +89,8 @@ class _Margins:
         x, y: scales of the axes.
         xlabel, ylabel: labels of the axes; empty where another panel of the grid has them.
         xticks, yticks: ticks as (value, text).
+        xtexts, ytexts: texts of the ticks; empty where another panel of the grid has them.
+        upright: whether the texts along x are vertical.
         left, right, top, bottom: the space around the panel.
     """
 
@@ -140,7 +143,7 @@ class _Scale:
     linear: float = 0.0
 
     def shares(self, values: object) -> np.ndarray:
-        """Return the margins of values along the axis: 0 at the lower limit, 1 at the upper limit."""
+        """Return the positions of values along the axis: 0 at the lower limit, 1 at the upper limit."""
         low, high = self._even(np.array([self.low, self.high]))
         return (self._even(np.asarray(values, dtype=float)) - low) / (high - low)
 
@@ -180,6 +183,7 @@ def _even_ticks(low: float, high: float, max_ticks: int) -> Iterator[float]:
 
 
 def _step(least: float) -> float:
+    """Return the smallest 1, 2 or 5 times a power of ten that is not below a number."""
     power = 10.0 ** np.floor(np.log10(max(least, 1e-300)))
     for factor in (1.0, 2.0, 5.0):
         if factor * power >= least * (1.0 - 1e-9):
@@ -315,7 +319,9 @@ class _Frame:
 
     Attributes:
         left, top, right, bottom: the rectangle [pt].
+        panel: the panel.
         clip: name of its clipping path.
+        xscale, yscale: scales of the axes.
     """
 
     def __init__(self, left: float, top: float, right: float, bottom: float, panel: Panel, clip: str):
@@ -334,11 +340,11 @@ class _Frame:
         self.yscale = _widened(self.yscale, np.copysign(unit * height, y_range))
 
     def x(self, values: object) -> np.ndarray:
-        """Return the margins of values along x [pt]."""
+        """Return the positions of values along x [pt]."""
         return self.left + self.xscale.shares(values) * (self.right - self.left)
 
     def y(self, values: object) -> np.ndarray:
-        """Return the margins of values along y [pt]."""
+        """Return the positions of values along y [pt]."""
         return self.bottom - self.yscale.shares(values) * (self.bottom - self.top)
 
     def drawn(self, margin: _Margins, quiet_title: bool) -> Iterator[str]:
@@ -431,7 +437,7 @@ def _text(
 
     Args:
         text: the text.
-        x, y: its margin [pt].
+        x, y: its position [pt].
         size: size of its letters [pt].
         anchor: ``start``, ``middle`` or ``end``: what of the text stands at x.
         colour: its colour.
@@ -439,8 +445,8 @@ def _text(
         extra: further attributes.
     """
     weight = ' font-weight="bold"' if bold else ""
-    margin = f'x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" text-anchor="{anchor}" fill="{colour}"'
-    return f"<text {margin}{weight}{extra}>{escape(text)}</text>"
+    position = f'x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" text-anchor="{anchor}" fill="{colour}"'
+    return f"<text {position}{weight}{extra}>{escape(text)}</text>"
 
 
 def _path(d: str, colour: str, width: float, extra: str = "") -> str:
@@ -451,7 +457,7 @@ def _points(x: np.ndarray, y: np.ndarray, colour: str, size: float) -> str:
     """Return round points as one SVG path.
 
     Args:
-        x, y: (k,) margins [pt].
+        x, y: (k,) positions [pt].
         colour: their colour.
         size: their diameter [pt].
     """
@@ -466,7 +472,7 @@ def _curve(x: np.ndarray, y: np.ndarray) -> str:
     steps = []
     begin = "M"
     for px, py in zip(x.tolist(), y.tolist()):
-        if px - px != 0.0 or py - py != 0.0:
+        if not (isfinite(px) and isfinite(py)):
             begin = "M"
             continue
         steps.append(f"{begin}{px:.1f} {py:.1f}")
@@ -549,10 +555,10 @@ def _bars(bars: Bars, frame: _Frame) -> Iterator[str]:
         along, across = across, along
     ends, begin = along(values), float(along(bars.base))
     sides = across(positions - bars.thick / 2.0), across(positions + bars.thick / 2.0)
-    for end, side, row_margin, colour in zip(ends.tolist(), sides[0].tolist(), sides[1].tolist(), colours):
-        if end - end != 0.0:
+    for end, side, far_side, colour in zip(ends.tolist(), sides[0].tolist(), sides[1].tolist(), colours):
+        if not isfinite(end):
             continue
-        corners = (side, row_margin, begin, end) if bars.upright else (begin, end, side, row_margin)
+        corners = (side, far_side, begin, end) if bars.upright else (begin, end, side, far_side)
         yield _rectangle(*corners, colour)
     if bars.spread is None:
         return
@@ -621,10 +627,10 @@ def _dots(dots: Dots, frame: _Frame) -> Iterator[str]:
 def _colours(name: str) -> Callable[[float], str]:
     """Return the function from a share to the colour of a colour map."""
     stops = np.array([[int(code[k : k + 2], 16) for k in (1, 3, 5)] for code in COLOUR_MAPS[name]])
-    margins = np.linspace(0.0, 1.0, len(stops))
+    positions = np.linspace(0.0, 1.0, len(stops))
 
     def colour(share: float) -> str:
-        red, green, blue = (round(float(np.interp(share, margins, stops[:, k]))) for k in range(3))
+        red, green, blue = (round(float(np.interp(share, positions, stops[:, k]))) for k in range(3))
         return f"#{red:02x}{green:02x}{blue:02x}"
 
     return colour
