@@ -52,7 +52,7 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
     """
 
     kind = BY_NAME["selection"]
-    tab = "q chain selection outlook run notes plot save save_run to_dict to_dataframe"
+    tab = "q chain selection loads outlook run notes plot save save_run to_dict to_dataframe"
 
     @property
     def q(self) -> Floats:

@@ -5,12 +5,13 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from loaded_arm import GivingArm, urdf
+from loaded_arm import HEAD, GivingArm, urdf
 
 from calib.data.poses.fit_options import parse_options
 from calib.data.poses.pose_files import read_measurements
 from calib.geometry.static_torques.column_faults import column_fault
 from calib.geometry.static_torques.gravity_fit import gravity_fit, gravity_regressor
+from calib.geometry.static_torques.load_errors import load_masses
 from calib.geometry.static_torques.sources import MODELLED, driven, load_changes, load_findings
 from calib.robot.formats import urdf as urdf_format
 
@@ -180,3 +181,16 @@ def test_friction_at_rest_is_smoothed_by_the_masses(chain, tmp_path):
     truth = driven(measured, clean, MODELLED).torque
     errors = [np.abs(driven(measured, fit, source).torque - truth).mean() for source in ("measured", MODELLED)]
     assert errors[1] < 0.5 * errors[0]
+
+
+def test_loads_by_row_of_one_file_are_those_of_several_files(arm, chain, folder, tmp_path):
+    tables = arm.table(80, 1), arm.table(40, 2, 2.5, (0.02, -0.03, 0.12))
+    rows = np.column_stack([np.concatenate(tables), np.repeat([0.0, 2.5], [80, 40])])
+    mixed = block(arm.write(tmp_path / "mixed.csv", rows[::-1], [*HEAD, "payload [kg]"]))
+    fit, _ = gravity_fit(chain, [mixed])
+    torques = driven(mixed, fit)
+    assert np.unique(torques.load[:, 3]).size == 2
+    difference = torques.load[:40, 3].mean() - torques.load[40:, 3].mean()
+    assert difference == pytest.approx(2.5, abs=0.1)
+    assert load_findings(mixed, fit) == []
+    assert len(load_masses([torques])) == 2

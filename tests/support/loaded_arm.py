@@ -66,7 +66,9 @@ class GivingArm:
         self.offsets = 0.15 * random.normal(size=7)
         self.tool = random.uniform(-0.05, 0.05, 3) + np.array([0.0, 0.0, 0.1])
 
-    def table(self, count: int, seed: int, load: float = 0.0, centre: tuple = (0.0, 0.0, 0.1)) -> np.ndarray:
+    def table(
+        self, count: int, seed: int, load: float = 0.0, centre: tuple = (0.0, 0.0, 0.1), poses: np.ndarray | None = None
+    ) -> np.ndarray:
         """Return rows of joint values, positions of the target in the instrument, and sensors' torques.
 
         Args:
@@ -74,6 +76,7 @@ class GivingArm:
             seed: seed of poses and noise.
             load: mass of the payload [kg].
             centre: its centre of mass in the flange [m].
+            poses: (count, 7) joint values; None: random ones.
         """
         random = np.random.default_rng(1000 + seed)
         model = self.model.copy()
@@ -84,7 +87,9 @@ class GivingArm:
         station = pin.SE3(pin.exp3(np.array([0.1, -0.2, 0.7])), np.array([1.5, 0.4, 0.2]))
         low = np.array([-1.5, 0.0, -2.8, -2.0, -2.8, -2.0, -2.8])
         rows = []
-        for q in random.uniform(low, -low + [0, 2.0, 0, 0, 0, 0, 0], (count, 7)):
+        if poses is None:
+            poses = random.uniform(low, -low + [0, 2.0, 0, 0, 0, 0, 0], (count, 7))
+        for q in poses:
             gravity = pin.computeGeneralizedGravity(model, data, q)
             pin.forwardKinematics(model, data, q)
             placement = pin.SE3.Identity()

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, UsageError, finding, require
 from calib.geometry.static_torques.column_faults import column_fault
 from calib.robot.chain import Chain
@@ -82,6 +82,15 @@ class GravityFit:
             spread = np.nanmedian(np.abs(residual), axis=0) / 0.6745
             weights = np.abs(residual) < MAX_RESIDUAL * np.maximum(spread, self.sigma)
         return values, _mass_sigma(values, covariance)
+
+
+def by_stated_load(block: PoseMeasurements) -> list[np.ndarray]:
+    """Return the rows of a block in groups of the same stated mass, in the order in which these appear."""
+    if block.payload is None:
+        return [np.arange(len(block))]
+    mass = np.nan_to_num(block.payload[:, 0], nan=-1.0)
+    _, first, group = np.unique(mass, return_index=True, return_inverse=True)
+    return [np.flatnonzero(group == number) for number in np.argsort(first)]
 
 
 def gravity_regressor(chain: Chain, q: np.ndarray) -> np.ndarray:
@@ -159,7 +168,10 @@ def gravity_fit(chain: Chain, blocks: Sequence[PoseMeasurements]) -> tuple[Gravi
         chain: the arm, with its described masses if they are known.
         blocks: the blocks of measurements.
     """
-    measured = [block for block in blocks if block.measured_torque is not None]
+    measured = []
+    for block in blocks:
+        if block.measured_torque is not None:
+            measured += [take(block, rows) for rows in by_stated_load(block)]
     if not measured or len(chain.driven) != chain.n:
         return None, []
     torques = [np.asarray(block.measured_torque) for block in measured]

@@ -24,7 +24,12 @@ SAME_LOAD = 0.05
 
 def load_masses(blocks: Sequence[PoseMeasurements]) -> tuple[float, ...]:
     """Return the distinct masses [kg] that the arm carried in blocks beyond its masses, rounded; 0 if none is known."""
-    masses = {0.0 if block.load is None else round(float(block.load[:, 3].mean()), 2) for block in blocks}
+    masses: set[float] = set()
+    for block in blocks:
+        if block.load is None:
+            masses.add(0.0)
+        else:
+            masses |= set(np.unique(np.round(block.load[:, 3], 2)).tolist())
     return tuple(sorted(masses))
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data.poses.measurements import PoseMeasurements
+from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, finding
 from calib.geometry.static_torques.gravity_fit import (
     LEAST_LOAD,
@@ -14,6 +14,7 @@ from calib.geometry.static_torques.gravity_fit import (
     MAX_RESIDUAL,
     STATED_SHARE,
     GravityFit,
+    by_stated_load,
     carried_load,
 )
 from calib.geometry.static_torques.load_errors import SAME_LOAD, load_masses
@@ -64,10 +65,11 @@ def driven(block: PoseMeasurements, gravity: GravityFit, source: str = MEASURED)
     """
     if block.measured_torque is None:
         return with_stated_load(gravity.chain, block)
-    load, sigma = gravity.load(block)
-    if not _differs(gravity, load[3], sigma, 0.0):
-        load = np.zeros(4)
-    loads = np.tile(load, (len(block), 1))
+    loads = np.zeros((len(block), 4))
+    for rows in by_stated_load(block):
+        load, sigma = gravity.load(take(block, rows))
+        if _differs(gravity, load[3], sigma, 0.0):
+            loads[rows] = load
     modelled = gravity_torques(gravity.chain, block.q, loads)
     torque = modelled
     if source == MEASURED:
@@ -85,6 +87,19 @@ def load_findings(block: PoseMeasurements, gravity: GravityFit) -> list[Finding]
     """
     if block.measured_torque is None:
         return []
+    findings = []
+    for rows in by_stated_load(block):
+        findings += _findings_of_load(take(block, rows), gravity)
+    return findings
+
+
+def _findings_of_load(block: PoseMeasurements, gravity: GravityFit) -> list[Finding]:
+    """Return the findings of `load_findings` on rows of the same load.
+
+    Args:
+        block: the measurements.
+        gravity: the fitted gravity.
+    """
     name = Path(block.file).name
     load, sigma = gravity.load(block)
     loads = np.tile(load, (len(block), 1))
@@ -138,10 +153,10 @@ def load_changes(fitted: Sequence[PoseMeasurements], unseen: Sequence[PoseMeasur
     masses = load_masses(fitted)
     findings = []
     for block in unseen:
-        (mass,) = load_masses([block])
-        nearest = min(masses, key=lambda fitted_mass: abs(fitted_mass - mass), default=mass)
-        if abs(mass - nearest) > SAME_LOAD:
-            findings.append(finding("load-changed", file=Path(block.file).name, mass=mass, fitted=nearest))
+        for mass in load_masses([block]):
+            nearest = min(masses, key=lambda fitted_mass, mass=mass: abs(fitted_mass - mass), default=mass)
+            if abs(mass - nearest) > SAME_LOAD:
+                findings.append(finding("load-changed", file=Path(block.file).name, mass=mass, fitted=nearest))
     return findings
 
 

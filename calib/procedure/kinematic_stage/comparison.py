@@ -13,6 +13,7 @@ from calib.geometry.error_model import ErrorModel, outside
 from calib.geometry.fit import placed_on
 from calib.geometry.installation import Installation
 from calib.geometry.repeatability import ARMS, RepeatedPoses, repeated_poses
+from calib.geometry.static_torques.load_errors import load_masses
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.image_findings import reprojection
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
@@ -154,6 +155,7 @@ class Comparison:
             parameters=parameters,
             interval95=interval95,
             reprojection_px=dict(zip(ARMS, self.reprojection or ())),
+            loads_kg=load_masses([block for block in self.blocks if block.load is not None]),
             position_means=_position_means(self.blocks),
         )
 

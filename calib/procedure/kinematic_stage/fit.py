@@ -388,6 +388,7 @@ def _findings(
         noticed=settle(noticed, accepted),
         blind=selection.folds.blind,
         rigid_cross_validated=selection.rigid_cross_validated,
+        torques=inputs.torques,
     )
 
 

@@ -209,7 +209,7 @@ def gather(
     elif masses is not None:
         notes += (f"gravity torques of the compliance are those of the masses identified in {settings.masses}",)
     inputs = Inputs(chain, robot_file, tuple(fitted_blocks), unseen, notes, earlier, masses, tuple(noticed), gravity)
-    inputs = with_unseen(inputs, validate, options, settings).driven_by(MEASURED)
+    inputs = with_unseen(inputs, validate, options, settings)
     if earlier is None or earlier.corrections is None:
         return inputs
     name = robot_file if isinstance(robot, CalibratedChain) else robot
@@ -258,7 +258,8 @@ def with_unseen(
         if name in copied and not rows.held_out:
             unseen[name] = replace(rows, seen=True)
     notes = [*inputs.notes, *notes, *copy_notes]
-    return replace(inputs, unseen=unseen, notes=tuple(notes), noticed=tuple(noticed))
+    inputs = replace(inputs, unseen=unseen, notes=tuple(notes), noticed=tuple(noticed))
+    return inputs.driven_by(inputs.torques)
 
 
 def plain_reference(nominal: Installation, inputs: Inputs) -> Installation | None:

@@ -10,6 +10,7 @@ from calib.geometry.checks.joint_range import JointRange
 from calib.geometry.error_model import Discrepancy
 from calib.geometry.model_choice.ladder import ModelStep
 from calib.geometry.repeatability import RepeatedPoses
+from calib.geometry.static_torques.sources import MEASURED
 from calib.procedure.findings import Verdict
 
 # of metrics.json; 1 had no findings, 2 kept sentences in place of codes
@@ -53,6 +54,7 @@ class ComparedRows:
         interval95: coverage of the error intervals that the fit predicts; None without an error model.
         reprojection_px: arm -> rms distance between detected and predicted corners.
         plain: errors of the plain reference; None on fitted rows.
+        loads_kg: masses that the arm carried beyond its masses, as stated or found from torques; empty if unknown.
         position_means: meaning of the errors ``position_mm``: ``position`` if positions were measured, otherwise the
             component that sockets and planes measure (`calib.geometry.accuracy`).
     """
@@ -69,6 +71,7 @@ class ComparedRows:
     interval95: PoseIntervalCoverage | None = None
     reprojection_px: Mapping[str, float] = field(default_factory=dict)
     plain: ArmErrors | None = None
+    loads_kg: tuple[float, ...] = ()
     position_means: str = "position"
 
     def words(self, nature: str) -> str:
@@ -141,6 +144,7 @@ class Findings:
         rigid_cross_validated: cross-validated error of the best model without joint corrections [m]; None if not
             computed.
         joint_range: joint range of the fitted rows; None in files of earlier versions.
+        torques: source of the torques that drove the compliance: measured, or modelled by the masses.
     """
 
     model: str
@@ -154,6 +158,7 @@ class Findings:
     discrepancy: Discrepancy | None = None
     rigid_cross_validated: float | None = None
     joint_range: JointRange | None = None
+    torques: str = MEASURED
 
 
 @dataclass(frozen=True, kw_only=True)

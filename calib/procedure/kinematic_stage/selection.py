@@ -244,6 +244,8 @@ def choose(
         assert selection.indices is not None and isinstance(jacobian, Observation)
         outlook, loads = _loaded_outlook(jacobian, limits, search, selection, pairs)
         notes += [remark for remark in (without_masses(chain),) if remark]
+        if existing_q is not None:
+            notes.append("the existing poses count as measured without load")
         if loads.excluded:
             notes.append(f"{loads.excluded} pairs of pose and load exceed a joint's largest torque and were left out")
         selection = replace(selection, indices=pairs.pose[selection.indices])

@@ -17,7 +17,7 @@ from calib.procedure.kinematic_stage.metrics import FitMetrics
 from calib.procedure.report import fit_report
 from calib.procedure.report.certificate import dynamics_pages, geometry, rendering
 from calib.procedure.report.certificate.record import EDITED, Certificate, Entry, Page, StageRecord, records
-from calib.procedure.report.certificate.results import measured_range, tolerance
+from calib.procedure.report.certificate.results import loads, measured_range, tolerance
 from calib.procedure.report.figures import figure_data
 from calib.procedure.report.fit_report import RowErrors, file_row, unseen_role
 from calib.procedure.report.page import FileRow, Text, chart_pictures
@@ -226,6 +226,7 @@ def _setup(session: Session, metrics: FitMetrics | None) -> list[Entry]:
             ("poses NOT checked for", ", ".join(plan.unchecked)),
             ("model", metrics.model),
             ("measured range", measured_range(metrics)),
+            ("load", loads(metrics)),
             ("tolerance", tolerance(settings.fit.tolerance_mm, metrics)),
         ]
     if session.dynamic:

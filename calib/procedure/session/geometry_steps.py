@@ -459,11 +459,13 @@ def validate(session: Session, say: Say) -> list[Note]:
     notes = notes_on(session, chain, read_measured(session, chain, unseen, like), folder.UNSEEN)
 
     say("comparing on unseen poses")
-    gathered, options, fit_settings = _gathered(session, unseen), _options_of(session), _fit_settings(session)
+    findings = session.fit.findings()
+    gathered = _gathered(session, unseen).driven_by(findings.torques)
+    options, fit_settings = _options_of(session), _fit_settings(session)
     weighing = fitting.weighing_settings(options, fit_settings)
     fit_settings = replace(fit_settings, model=fit_settings.model or options.model)
     arms = session.fit.arms(gathered, weighing)
-    assessment = assess(arms, gathered, session.fit.findings(), weighing, fit_settings)
+    assessment = assess(arms, gathered, findings, weighing, fit_settings)
     rows = []
     for name, comparison in assessment.validation.items():
         rows.append(fit_report.rows_of(name, comparison, comparison.proves))

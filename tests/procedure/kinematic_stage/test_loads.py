@@ -10,6 +10,8 @@ import calib
 from calib.data.poses.fit_options import parse_options
 from calib.errors import UsageError
 from calib.geometry.static_torques.load_check import suspected_load
+from calib.geometry.static_torques.sources import MODELLED, gravity_of
+from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.robot.kinematics import forward
 
 CENTRE = (0.02, -0.03, 0.12)
@@ -99,3 +101,70 @@ def test_without_compliance_a_payload_widens_the_expected_error(folder):
     q = train[:20, :7]
     assert np.mean(silent.position_sigma(q, payload=5.0) / silent.position_sigma(q)) > 1.5
     assert "do not depend on a load" in str(calib.compensate(silent, q[:3], payload=2.5).notes)
+
+
+def plain_options(masses):
+    files = {name: {"payload": {"mass": mass, "centre": list(CENTRE)}} for name, mass in masses.items()}
+    return parse_options({"files": files})
+
+
+@pytest.fixture(scope="module")
+def several(tmp_path_factory):
+    """Files of one arm: a and b to fit without and with 2.5 kg, v to validate with 5 kg, c with the rows of a and b."""
+    path = tmp_path_factory.mktemp("several")
+    (path / "arm.urdf").write_text(urdf(True))
+    arm = GivingArm(seed=3)
+    tables = {"a": arm.table(50, 1), "b": arm.table(40, 2, 2.5, CENTRE), "v": arm.table(60, 3, 5.0, CENTRE)}
+    for name, table in tables.items():
+        arm.write(path / f"{name}.csv", table)
+        arm.write(path / f"{name}_silent.csv", table[:, :10], HEAD[:10])
+    loads = np.repeat([0.0, 2.5], [50, 40])
+    rows = np.column_stack([np.concatenate([tables["a"], tables["b"]]), loads])
+    arm.write(path / "c.csv", np.random.default_rng(0).permutation(rows), [*HEAD, "payload [kg]"])
+    return path
+
+
+@pytest.mark.parametrize(
+    ("fitted", "unseen"),
+    [(("a", "b"), "v"), (("a_silent", "b_silent"), "v_silent"), (("a_silent", "b"), "v_silent"), (("c",), "v")],
+)
+def test_poses_under_several_loads_are_fitted_together(several, fitted, unseen):
+    """Torques measured in all files, in none, in one, and loads by row of one file: 5 kg are predicted by all."""
+    masses = dict.fromkeys(("a.csv", "a_silent.csv"), 0.0)
+    masses |= dict.fromkeys(("b.csv", "b_silent.csv"), 2.5) | dict.fromkeys(("v.csv", "v_silent.csv"), 5.0)
+    masses = {name: mass for name, mass in masses.items() if name[:-4] in (*fitted, unseen)}
+    options = replace(plain_options(masses), payload=parse_options({"payload": {"centre": list(CENTRE)}}).payload)
+    files = [several / f"{name}.csv" for name in fitted]
+    result = calib.fit_geometry(several / "arm.urdf", files, validate=several / f"{unseen}.csv", options=options)
+    assert "stiffness" in result.selection.chosen
+    (rows,) = result.validation.values()
+    assert rows.errors[1].rms < 2.4e-4
+    assert rows.intervals.covered >= 0.9
+    assert result.findings.discrepancy.loads == pytest.approx((0.0, 2.5), abs=0.1)
+    assert rows.record().loads_kg == pytest.approx((5.0,), abs=0.2)
+    codes = {finding.code: finding.values for finding in result.assessment.noticed}
+    assert codes["load-changed"]["fitted"] == pytest.approx(2.5, abs=0.1)
+    assert not {"payload-differs", "payload-found"} & set(codes)
+
+
+def test_the_certificate_states_the_loads(several, tmp_path):
+    options = plain_options({"a.csv": 0.0, "v.csv": 5.0})
+    result = calib.fit_geometry(several / "arm.urdf", several / "a.csv", validate=several / "v.csv", options=options)
+    result.save(tmp_path / "fit", plots=False)
+    page = (tmp_path / "fit" / "report.html").read_text()
+    assert "0 kg fitted; validated with 4.9" in page or "0 kg fitted; validated with 5" in page
+    assert "load" in " ".join(result.warnings)
+
+
+def test_what_drove_the_compliance_is_stored_and_drives_it_in_later_validations(tmp_path):
+    """Torques of motors with friction at rest: masses predict better, and are taken for unseen poses, too."""
+    arm = GivingArm(seed=3, friction=0.08, noise=2e-5)
+    (tmp_path / "arm.urdf").write_text(urdf(True))
+    fitted = arm.write(tmp_path / "fitted.csv", arm.table(100, 1))
+    unseen = arm.write(tmp_path / "unseen.csv", arm.table(30, 2))
+    result = calib.fit_geometry(tmp_path / "arm.urdf", fitted)
+    assert result.inputs.torques == MODELLED
+    result.save(tmp_path / "fit", plots=False)
+    assert FitFolder(tmp_path / "fit").findings().torques == MODELLED
+    (rows,) = calib.validate(result, unseen).inputs.unseen.values()
+    assert np.allclose(rows.block.torque, gravity_of(result.inputs.weighed, rows.block.q, rows.block.load))

@@ -38,6 +38,7 @@ CERTIFIED_SETUP = (
     "measurements",
     "model",
     "measured range",
+    "load",
     "recordings",
     "torques",
     "payloads",

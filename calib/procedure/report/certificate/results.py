@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -78,6 +78,8 @@ def of_fit(
         Entry("seed", str(metrics.seed)),
         Entry("toolkit", versions()),
     ]
+    if loads(metrics):
+        setup.append(Entry("load", loads(metrics)))
     stages = [geometry.stage(fit_report, drawn)]
     unchecked = ["dynamics: not identified"]
     return records(f"Calibration of {robot}", "Geometry", setup, stages, unchecked, fit_report.files, details)
@@ -118,6 +120,28 @@ def measured_range(metrics: FitMetrics) -> str:
             factor, printed_unit = 1e3, " mm"
         texts.append(f"{round(factor * low)}…{round(factor * high)}{printed_unit}")
     return ", ".join(texts)
+
+
+def loads(metrics: FitMetrics) -> str:
+    """Return a text on the masses that the arm carried in fitted and in held-out poses; empty if none is known.
+
+    Args:
+        metrics: metrics of the fit, with the errors on held-out poses.
+    """
+    fitted = metrics.fit.loads_kg
+    validated: set[float] = set()
+    for rows in metrics.proofs.values():
+        validated |= set(rows.loads_kg)
+    if not fitted and not validated:
+        return ""
+    text = f"{_masses(fitted)} fitted" if fitted else "not known of the fitted poses"
+    if validated:
+        text += f"; validated with {_masses(sorted(validated))}"
+    return text
+
+
+def _masses(values: Sequence[float]) -> str:
+    return ", ".join(f"{mass:g}" for mass in values) + " kg"
 
 
 def write_model(model_report: DynamicReport, drawn: Mapping[str, ChartPicture], folder: Path) -> None:
