@@ -9,8 +9,14 @@ from loaded_arm import HEAD, GivingArm, urdf
 
 from calib.data.poses.fit_options import parse_options
 from calib.data.poses.pose_files import read_measurements
+from calib.errors import UsageError
 from calib.geometry.static_torques.column_faults import column_fault
-from calib.geometry.static_torques.gravity_fit import gravity_fit, gravity_regressor
+from calib.geometry.static_torques.gravity_fit import (
+    gravity_fit,
+    gravity_regressor,
+    payload_load,
+    without_contradicting_torques,
+)
 from calib.geometry.static_torques.load_errors import load_masses
 from calib.geometry.static_torques.sources import MODELLED, driven, load_changes, load_findings
 from calib.robot.formats import urdf as urdf_format
@@ -194,3 +200,46 @@ def test_loads_by_row_of_one_file_are_those_of_several_files(arm, chain, folder,
     assert difference == pytest.approx(2.5, abs=0.1)
     assert load_findings(mixed, fit) == []
     assert len(load_masses([torques])) == 2
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        (lambda torque: np.negative(torque, out=torque), "the other one than in the fitted files"),
+        (lambda torque: np.multiply(torque, 1000.0, out=torque), "times the gravity of the fitted files"),
+        (lambda torque: torque.fill(0.0), "zero in every row"),
+        (lambda torque: np.multiply(torque, 0.5, out=torque), "no load explains them"),
+        (lambda torque: np.negative(torque[:, 1], out=torque[:, 1]), "with tau2 reversed"),
+    ],
+)
+def test_torques_of_an_unseen_file_that_contradict_the_fitted_gravity_are_not_used(folder, gravity, change, says):
+    measured, findings = without_contradicting_torques(faulty(folder, change), gravity)
+    assert measured.measured_torque is None
+    (unused,) = findings
+    assert unused.code == "torques-unused" and says in f"{unused.values['reason']}"
+    assert load_findings(measured, gravity) == []
+
+
+def test_a_loaded_unseen_file_does_not_contradict_the_fitted_gravity(folder, gravity):
+    loaded = block(folder / "loaded.csv")
+    measured, findings = without_contradicting_torques(loaded, gravity)
+    assert measured is loaded
+    assert findings == []
+
+
+def test_a_file_lighter_than_the_first_one_tells_whose_payload_to_state(chain, folder):
+    fit, _ = gravity_fit(chain, [block(folder / "loaded.csv")])
+    (lighter,) = load_findings(block(folder / "empty.csv"), fit)
+    assert lighter.code == "payload-missing"
+    assert lighter.values["mass"] == pytest.approx(2.5, rel=0.05)
+
+
+@pytest.mark.parametrize("payload", ["heavy", (2.5, (0.0, 0.0, 0.1)), -2.5, float("nan"), (2.5, 0.0)])
+def test_a_payload_of_another_form_is_refused(chain, payload):
+    with pytest.raises(UsageError, match="expected a mass"):
+        payload_load(chain, payload)
+
+
+def test_empty_torque_columns_are_called_empty(chain, folder):
+    _, (unused,) = gravity_fit(chain, [faulty(folder, lambda torque: torque.fill(np.nan))])
+    assert unused.values["reason"] == "their columns are empty"

@@ -43,6 +43,10 @@ STATED_SHARE = 0.15
 MAX_MASS = 800.0
 # described gravity is this many times the measured one where torques are in N·mm (our choice)
 MILLIMETRES = 200.0
+# share of a file's rows at rest from which on its torques are those of the arm with some load (our choice)
+MIN_AT_REST = 0.5
+# what is said of torques that are zero, and what to do
+ZERO = "they are zero in every row", "is the sensors' signal in other columns?"
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +86,53 @@ class GravityFit:
             spread = np.nanmedian(np.abs(residual), axis=0) / 0.6745
             weights = np.abs(residual) < MAX_RESIDUAL * np.maximum(spread, self.sigma)
         return values, _mass_sigma(values, covariance)
+
+    def at_rest(self, block: PoseMeasurements) -> np.ndarray:
+        """Return whether each measured torque (m, n) of a block is that of the arm at rest with the block's load."""
+        load, _ = self.load(block)
+        loads = np.tile(load, (len(block), 1))
+        residual = self.balancing(block) - gravity_torques(self.chain, block.q, loads)
+        return np.asarray(np.abs(residual) < MAX_RESIDUAL * self.sigma)
+
+
+def without_contradicting_torques(
+    block: PoseMeasurements, gravity: GravityFit
+) -> tuple[PoseMeasurements, list[Finding]]:
+    """Return a block without its measured torques where no load explains them, and a finding on these.
+
+    Args:
+        block: measurements that were not fitted.
+        gravity: the gravity of the fitted ones.
+    """
+    if block.measured_torque is None:
+        return block, []
+    unmeasured = np.isnan(block.measured_torque)
+    resting = np.all(gravity.at_rest(block) | unmeasured, axis=1)
+    if resting.mean() >= MIN_AT_REST:
+        return block, []
+    reason, cure = _contradiction(block, gravity)
+    files = [block.file]
+    unused = finding("torques-unused", files=files, reason=reason, cure=cure)
+    return replace(block, measured_torque=None), [unused]
+
+
+def _contradiction(block: PoseMeasurements, gravity: GravityFit) -> tuple[str, str]:
+    """Return why torques of a block are not those of the fitted arm with any load, and what to do."""
+    torque = np.asarray(block.measured_torque)
+    finite = np.isfinite(torque)
+    if np.max(np.abs(torque), initial=0.0, where=finite) < MIN_SPREAD:
+        return ZERO
+    expected = gravity.sign * gravity_torques(gravity.chain, block.q)
+    factor = _factor(expected, torque, finite)
+    if abs(factor) > MILLIMETRES:
+        return f"they are {abs(factor):.0f} times the gravity of the fitted files", "name the columns tau1 [N mm] …"
+    fault = column_fault(gravity_regressor(gravity.chain, block.q), np.where(finite, torque, 0.0), finite)
+    if fault is not None:
+        return fault
+    if factor < 0.0:
+        return "their sign is the other one than in the fitted files", "reverse the sign of all of them"
+    cure = "were they read at rest, by the same sensors, in the same unit and joint order as those of the fit?"
+    return "with the gravity of the fitted files, no load explains them", cure
 
 
 def by_stated_load(block: PoseMeasurements) -> list[np.ndarray]:
@@ -138,9 +189,13 @@ def payload_load(chain: Chain, payload: float | Sequence[float] | None) -> np.nd
     """
     if payload is None:
         return None
-    values = np.atleast_1d(np.asarray(payload, dtype=float))
+    expected = f"payload {payload}: expected a mass [kg], or mass,x,y,z [kg, m]"
+    try:
+        values = np.atleast_1d(np.asarray(payload, dtype=float))
+    except (TypeError, ValueError):
+        raise UsageError(expected) from None
     valid = values.shape in ((1,), (4,)) and np.isfinite(values).all() and values[0] >= 0.0
-    require(valid, f"payload {payload}: expected a mass [kg], or mass,x,y,z [kg, m]", UsageError)
+    require(valid, expected, UsageError)
     complete = np.concatenate([values, np.full(4 - len(values), np.nan)])
     return carried_load(chain, complete[None])[0]
 
@@ -179,7 +234,9 @@ def gravity_fit(chain: Chain, blocks: Sequence[PoseMeasurements]) -> tuple[Gravi
     files = sorted({block.file for block in measured})
     spread = np.nanmax(np.abs(torque), axis=0, initial=0.0, where=np.isfinite(torque))
     if spread.max() < MIN_SPREAD:
-        reason, advice = "they are zero in every row", "is the sensors' signal in other columns?"
+        reason, advice = ZERO
+        if not np.isfinite(torque).any():
+            reason = "their columns are empty"
         return None, [finding("torques-unused", files=files, reason=reason, cure=advice)]
     described = reference_masses(chain)
     regressor = np.concatenate([gravity_regressor(chain, block.q) for block in measured])

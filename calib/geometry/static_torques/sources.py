@@ -102,16 +102,19 @@ def _findings_of_load(block: PoseMeasurements, gravity: GravityFit) -> list[Find
     """
     name = Path(block.file).name
     load, sigma = gravity.load(block)
-    loads = np.tile(load, (len(block), 1))
-    residual = gravity.balancing(block) - gravity_torques(gravity.chain, block.q, loads)
-    moving = np.flatnonzero(~np.all(_at_rest(gravity, residual) | np.isnan(residual), axis=1))
+    resting = gravity.at_rest(block) | np.isnan(block.measured_torque)
+    moving = np.flatnonzero(~np.all(resting, axis=1))
     findings = []
     if len(moving):
         rows = block.rows[moving].tolist()
         findings.append(finding("torques-of-motion", file=name, count=len(moving), rows=rows))
     mass = float(load[3])
     if block.payload is None or np.isnan(block.payload[:, 0]).all():
-        if _differs(gravity, mass, sigma, 0.0):
+        if not _differs(gravity, mass, sigma, 0.0):
+            return findings
+        if mass < 0.0:
+            findings.append(finding("payload-missing", file=name, mass=-mass, sigma=sigma))
+        else:
             findings.append(finding("payload-found", file=name, mass=mass, sigma=sigma))
         return findings
     stated_mass = float(np.nanmean(block.payload[:, 0]))

@@ -24,7 +24,7 @@ from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
 from calib.geometry.repeatability import repeated, repeated_rows, without_copies
-from calib.geometry.static_torques.gravity_fit import GravityFit, gravity_fit
+from calib.geometry.static_torques.gravity_fit import GravityFit, gravity_fit, without_contradicting_torques
 from calib.geometry.static_torques.sources import MEASURED, driven, load_findings, with_stated_load
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.undecided_files import decided
@@ -245,7 +245,8 @@ def with_unseen(
             block, unseen_readings = without_unseen(inputs.weighed, block, "copies" in options.accept)
             noticed += unseen_readings
             if inputs.gravity is not None:
-                noticed += load_findings(block, inputs.gravity)
+                block, unused_torques = without_contradicting_torques(block, inputs.gravity)
+                noticed += [*unused_torques, *load_findings(block, inputs.gravity)]
             if settings.refit_frames:
                 unseen[name] = Unseen(block, own_frames=True, seen=fitted)
             else:
