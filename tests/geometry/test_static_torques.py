@@ -243,3 +243,16 @@ def test_a_payload_of_another_form_is_refused(chain, payload):
 def test_empty_torque_columns_are_called_empty(chain, folder):
     _, (unused,) = gravity_fit(chain, [faulty(folder, lambda torque: torque.fill(np.nan))])
     assert unused.values["reason"] == "their columns are empty"
+
+
+@pytest.mark.parametrize(
+    "payload, says",
+    [
+        ((2.5, 10.0, 20.0, 150.0), "the arm reaches"),
+        ((2500.0,), "state it in kg"),
+        ((1e6, 0.0, 0.0, 0.1), "state it in kg"),
+    ],
+)
+def test_a_payload_in_another_unit_is_refused(chain, payload, says):
+    with pytest.raises(UsageError, match=says):
+        payload_load(chain, payload)

@@ -41,6 +41,8 @@ LOAD_SIGMAS, LEAST_LOAD = 4.0, 0.005
 STATED_SHARE = 0.15
 # [kg/m²] largest mass of an arm over the square of its length (our choice: four times that of a heavy palletiser)
 MAX_MASS = 800.0
+# largest payload as a share of the arm's described mass (our choice: arms lift less than their own mass)
+MAX_PAYLOAD_SHARE = 3.0
 # described gravity is this many times the measured one where torques are in N·mm (our choice)
 MILLIMETRES = 200.0
 # share of a file's rows at rest from which on its torques are those of the arm with some load (our choice)
@@ -168,12 +170,30 @@ def carried_load(chain: Chain, payload: np.ndarray) -> np.ndarray:
     Args:
         chain: the arm.
         payload: mass [kg] and centre of mass [m]; NaN where not stated.
+
+    Raises:
+        UsageError: a centre or a mass that this arm cannot carry, as of another unit.
     """
+    _check_payload(chain, payload)
     zero = np.zeros((1, chain.n))
     flange = np.linalg.inv(joint_frames(chain, zero)[-1, 0]) @ forward(chain, zero)[0]
     mass = np.nan_to_num(payload[:, 0])
     centre = np.nan_to_num(payload[:, 1:]) @ flange[:3, :3].T + flange[:3, 3]
     return np.column_stack([mass[:, None] * centre, mass])
+
+
+def _check_payload(chain: Chain, payload: np.ndarray) -> None:
+    """Raise a UsageError for payloads (m, 4) whose centre is beyond the arm's reach, or which are too heavy for it."""
+    reach = chain.stretched_length()
+    distance = float(np.linalg.norm(np.nan_to_num(payload[:, 1:]), axis=1).max(initial=0.0))
+    message = f"payload: its centre is {distance:.3g} m from the tip, the arm reaches {reach:.3g} m; state it in m"
+    require(distance <= reach, message, UsageError)
+    mass = float(np.nan_to_num(payload[:, 0]).max(initial=0.0))
+    limit = MAX_MASS * reach**2
+    if chain.inertias is not None and chain.inertias[:, 9].sum() > 0.0:
+        limit = MAX_PAYLOAD_SHARE * float(chain.inertias[:, 9].sum())
+    message = f"payload of {mass:.4g} kg: more than such an arm carries ({limit:.3g} kg at most); state it in kg"
+    require(mass <= limit, message, UsageError)
 
 
 def payload_load(chain: Chain, payload: float | Sequence[float] | None) -> np.ndarray | None:

@@ -102,7 +102,7 @@ def _findings_of_load(block: PoseMeasurements, gravity: GravityFit) -> list[Find
     """
     name = Path(block.file).name
     load, sigma = gravity.load(block)
-    resting = gravity.at_rest(block) | np.isnan(block.measured_torque)
+    resting = gravity.at_rest(block) | np.isnan(np.asarray(block.measured_torque))
     moving = np.flatnonzero(~np.all(resting, axis=1))
     findings = []
     if len(moving):
