@@ -5,7 +5,7 @@ from calib.procedure.answers import Answers, CertificateSection
 from calib.procedure.session.certificate import pages as certificate_pages
 from calib.procedure.session.commands import COLOURS, asks, go_on, measured_columns, new_session, recorded_columns
 from calib.procedure.session.drift import Trend, noise_of_difference, repeats, trends
-from calib.procedure.session.dynamics_steps import check_recording, designed_motions, next_round
+from calib.procedure.session.dynamics_steps import check_recording, designed_motions, next_round, options_of
 from calib.procedure.session.folder import (
     BROUGHT,
     LOGS,
@@ -24,7 +24,7 @@ from calib.procedure.session.folder import (
 from calib.procedure.session.geometry_steps import chain_of, clear_staging, notes_on, read_measured
 from calib.procedure.session.questions import INSTRUMENTS, QUESTIONS, Question, stated_payloads, with_answer
 from calib.procedure.session.questions import checked as checked_answers
-from calib.procedure.session.recording_names import log_name
+from calib.procedure.session.recording_names import labels_in, log_name
 from calib.procedure.session.session_results import folders_of, position_errors, torque_error
 from calib.procedure.session.settings import read_settings
 from calib.procedure.session.steps import DONE, KEPT, WAITING, run_next, steps_of
@@ -65,6 +65,7 @@ __all__ = [
     "find_step",
     "folders_of",
     "go_on",
+    "labels_in",
     "locked",
     "log_name",
     "measured_columns",
@@ -73,6 +74,7 @@ __all__ = [
     "noise_of_difference",
     "notes_on",
     "open_session",
+    "options_of",
     "position_errors",
     "read_measured",
     "read_settings",

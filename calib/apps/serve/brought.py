@@ -1,12 +1,13 @@
 """Requests that bring files to a served session, state their columns, join them, and take them as a measurement."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, Response
 
-from calib.apps.serve import received, uploads
+from calib.apps.serve import received, split_logs, uploads
 from calib.apps.serve.page_responses import MEASURED_KINDS, back, kind_of, kinds_of, name_of, session_of
 from calib.apps.serve.received import JOINTS, POINTS, Pairing
 from calib.apps.serve.work import CHECK, JOIN, Work
@@ -18,19 +19,43 @@ MAX_FORM = 1 << 20
 
 
 async def bring(request: Request) -> Response:
-    """Store the files of an uploaded form, and queue their check, or the join of joint values and points."""
+    """Store the files of an uploaded form, and queue their check, or the join of two that belong together."""
     session = session_of(request)
     kind = request.path_params["kind"]
     if kind not in kinds_of(session):
         return PlainTextResponse("this session does not accept such files", 404)
     try:
-        await uploads.receive(session, kind, request.headers.get("content-type", ""), request.stream())
+        paths = await uploads.receive(session, kind, request.headers.get("content-type", ""), request.stream())
     except ClientDisconnect:
         return PlainTextResponse("interrupted; nothing was stored", 400)
+    work: Work = request.app.state.work
     if kind in MEASURED_KINDS:
         received.discard_joined(session, kind)
-    await run_in_threadpool(_sort, request.app.state.work, session, kind)
+        await run_in_threadpool(_sort, work, session, kind)
+    else:
+        await run_in_threadpool(_sort_logs, work, session, kind, paths)
     return back(f"brought-{kind}")
+
+
+def _sort_logs(work: Work, session: Session, kind: str, paths: list[Path]) -> None:
+    """Queue the check of uploaded logs, or the join of two that each hold half of a recording.
+
+    Args:
+        work: the session's worker.
+        session: the session.
+        kind: kind of the logs.
+        paths: the uploaded logs.
+    """
+    recordings = split_logs.put_halves_apart(session, kind, paths)
+    if recordings:
+        work.ask(CHECK, kind)
+    if len(recordings) == len(paths):
+        return
+    received.discard_joined(session, kind)
+    work.joins.pop(kind, None)
+    pairing = split_logs.pairing_of(split_logs.halves(session, kind))
+    if pairing is not None:
+        work.ask(JOIN, kind, pairing)
 
 
 def _sort(work: Work, session: Session, kind: str) -> None:
@@ -41,9 +66,6 @@ def _sort(work: Work, session: Session, kind: str) -> None:
         session: the session.
         kind: kind of the files.
     """
-    if kind not in MEASURED_KINDS:
-        work.ask(CHECK, kind)
-        return
     if received.take_measured(session, kind) or not received.waiting(session, kind):
         work.ask(CHECK, kind)
     parts = received.received(session, kind)
@@ -93,7 +115,9 @@ async def form_of(request: Request) -> dict[str, str]:
 
 
 def take(request: Request) -> Response:
-    """Make the joined table the measurement of its step, and queue its check."""
+    """Make the joined table the measurement or the recording of its step, and queue its check."""
+    if request.path_params["kind"] not in MEASURED_KINDS:
+        return _take(request, split_logs.take_recording)
     return _take(request, received.take_joined)
 
 
@@ -119,9 +143,7 @@ def set_aside(request: Request) -> Response:
     name = request.path_params["name"]
     session = session_of(request)
     for kind in kinds_of(session):
-        paths = session.brought(kind)
-        if kind in MEASURED_KINDS:
-            paths = [*paths, *received.waiting(session, kind)]
+        paths = [*session.brought(kind), *received.waiting(session, kind)]
         for path in paths:
             if name_of(session, path) != name:
                 continue

@@ -26,7 +26,10 @@ WITH_IMAGES = (
     "Images of the board, joints.csv (a row per image: its file name and joint values), board.toml (calib board "
     "makes boards), and camera.yaml if the lens is known: choose all of them at once."
 )
-OTHERS = "Other formats of logs: .npz, .mcap, .bag, .db3, a controller's own log as .csv."
+OTHERS = (
+    "Other formats of logs: .npz, .mcap, .bag, .db3, a controller's own log as .csv. Positions in one .csv and torques "
+    "or currents in another, with times of one clock: upload both, and they are joined here."
+)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, R
 from starlette.routing import Route
 
 from calib.apps.joining.joining import METHODS
-from calib.apps.serve import brought, creation, editing, received
+from calib.apps.serve import brought, creation, editing, received, split_logs
 from calib.apps.serve.columns_wanted import Example, example_of
 from calib.apps.serve.guard import Guard
 from calib.apps.serve.page_responses import (
@@ -37,6 +37,7 @@ from calib.toolkit.chains import controllers
 from calib.toolkit.pose_data import EULER
 from calib.toolkit.report_pages import figures_page, read_figures, script_sources
 from calib.toolkit.sessions import (
+    BROUGHT,
     DONE,
     KEPT,
     SETTINGS,
@@ -143,7 +144,6 @@ def page(request: Request) -> Response:
         controllers=list(controllers()),
         eulers=EULER,
         units=(tuple(ANGLES), tuple(LENGTHS)),
-        methods=METHODS,
         notes=_notes(session),
         pages=_pages(session),
         bundles=_bundles(session),
@@ -196,9 +196,12 @@ class Brought:
         names: paths of the files that the session reads.
         example: the columns that it wants.
         parts: received files that are no measurement yet.
-        preview: joined joint values and points that can be taken; None if nothing is joined.
+        preview: joined files that can be taken; None if nothing is joined.
         planned: whether points alone can be taken with the planned joint values.
         answers: what was stated of the parts' columns: name of the part -> field of the form -> answer.
+        halves: roles of two parts that are joined.
+        methods: ways to join them.
+        missing: what the other file of a recording must hold; empty if none is missing.
     """
 
     kind: str
@@ -209,6 +212,14 @@ class Brought:
     preview: received.Preview | None = None
     planned: bool = False
     answers: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    halves: tuple[str, str] = (received.JOINTS, received.POINTS)
+    methods: tuple[str, ...] = METHODS
+    missing: str = ""
+
+    @property
+    def folder(self) -> str:
+        """Name of the session's folder in which they come."""
+        return BROUGHT[self.kind][0]
 
     def of_role(self, role: str) -> list[str]:
         """Return the names of the received files that were recognised as `role`."""
@@ -220,7 +231,18 @@ def _brought(session: Session, kind: str, description: str) -> Brought:
     names = tuple(name_of(session, path) for path in session.brought(kind))
     example = example_of(session, kind)
     if kind not in MEASURED_KINDS:
-        return Brought(kind, description, names, example)
+        logs = split_logs.halves(session, kind)
+        return Brought(
+            kind,
+            description,
+            names,
+            example,
+            tuple(logs),
+            received.preview(session, kind),
+            halves=(split_logs.POSITIONS, split_logs.EFFORTS),
+            methods=split_logs.METHODS,
+            missing=split_logs.missing_half(session, logs),
+        )
     parts = tuple(received.received(session, kind))
     planned = received.planned_poses(session, kind) is not None
     answers = received.stated_answers(session, kind)

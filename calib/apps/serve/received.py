@@ -4,7 +4,7 @@ They wait in ``3-measured/received/KIND``, which the session does not read:
 
 files/         the files as they were sent
 options.toml   what was stated of their columns on the page, by file
-joined/        joint values and points joined, as they are shown on the page, until they are taken as the measurement
+joined/        two files joined, as the page shows them until they are taken as the measurement, and the files' names
 used/          files from which a measurement was made
 """
 
@@ -40,7 +40,8 @@ from calib.toolkit.result_folders import joints_of
 from calib.toolkit.sessions import BROUGHT, POSES, UNSEEN, Session, chain_of, open_session
 
 FOLDER, FILES, USED, JOINED, OPTIONS = "received", "files", "used", "joined", "options.toml"
-RESULT = "measured.csv"
+# joined table, and names of the files of which it was made
+RESULT, SOURCES = "measured.csv", "files.txt"
 JOINTS, POINTS, MEASURED, UNCLEAR = "joints", "points", "measured", "unclear"
 # lists of planned poses, by kind of measurement
 PLANS = {"measured": POSES, "validation": UNSEEN}
@@ -70,7 +71,7 @@ class Pairing:
     """Choice of what is joined.
 
     Attributes:
-        joints, points: names of the received files.
+        joints, points: names of the received files; of two logs, that with positions and that with efforts.
         by: how rows are matched; empty: the first way for which both have columns.
     """
 
@@ -226,7 +227,7 @@ def state_columns(session: Session, kind: str, name: str, answers: Mapping[str, 
         UsageError: an answer that the options do not take.
     """
     keys: dict[str, object] = {}
-    headings = dict.fromkeys(read_table(_named_file(session, kind, name)).header)
+    headings = dict.fromkeys(read_table(file_of(session, kind, name)).header)
     for key, text in answers.items():
         if not text:
             continue
@@ -276,18 +277,38 @@ def join_received(session: Session, kind: str, pairing: Pairing) -> list[str]:
     Raises:
         CalibError: the files cannot be joined; the message says what to try.
     """
-    joints, points = _named_file(session, kind, pairing.joints), _named_file(session, kind, pairing.points)
+    joints, points = file_of(session, kind, pairing.joints), file_of(session, kind, pairing.points)
     robot = CalibratedChain(chain_of(session))
     joined = join(joints, points, by=pairing.by, robot=robot, options=stated_options(session, kind))
     source = f"joint values of {joints.name}, points of {points.name}"
     joined = replace(joined, notes=(source, *joined.notes))
-    target = place(session, kind, JOINED)
-    target.mkdir(parents=True, exist_ok=True)
-    joined.write(target / RESULT)
+    store_joined(session, kind, joined, [joints, points])
     return [*joined.notes, f"{counted(len(joined.poses), 'measured pose')}"]
 
 
-def _named_file(session: Session, kind: str, name: str) -> Path:
+def store_joined(session: Session, kind: str, joined: Joined, sources: list[Path]) -> None:
+    """Store a joined table for the page, with the names of the files of which it was made."""
+    target = place(session, kind, JOINED)
+    target.mkdir(parents=True, exist_ok=True)
+    names = [path.name for path in sources]
+    files.write(target / SOURCES, "\n".join(names))
+    joined.write(target / RESULT)
+
+
+def sources_of_joined(session: Session, kind: str) -> list[Path]:
+    """Return the received files of which the joined table was made.
+
+    Raises:
+        UsageError: nothing is joined.
+    """
+    folder = place(session, kind, JOINED)
+    joined = (folder / RESULT).exists() and (folder / SOURCES).exists()
+    require(joined, "nothing is joined, or it was taken already: join the received files first", UsageError)
+    names = (folder / SOURCES).read_text(encoding="utf-8").splitlines()
+    return [file_of(session, kind, name) for name in names]
+
+
+def file_of(session: Session, kind: str, name: str) -> Path:
     """Return the path of a received file that waits.
 
     Raises:
@@ -310,17 +331,21 @@ def preview(session: Session, kind: str) -> Preview | None:
     return Preview(notes, len(rows), header, tuple(rows[:SHOWN]))
 
 
-def take_joined(session: Session, kind: str) -> Path:
-    """Make the joined table the measurement of a session's step, and return its path.
+def take_joined(session: Session, kind: str, name: str = RESULT) -> Path:
+    """Make the joined table the measurement, or the recording, of a session's step, and return its path.
+
+    Args:
+        session: the session.
+        kind: kind of the files.
+        name: name under which the session reads it.
 
     Raises:
         UsageError: nothing is joined.
     """
-    result = place(session, kind, JOINED) / RESULT
-    require(result.exists(), "nothing is joined, or it was taken already: join the received files first", UsageError)
-    target = _free(session, kind, RESULT)
-    result.replace(target)
-    _put_away(session, kind, waiting(session, kind))
+    sources = sources_of_joined(session, kind)
+    target = _free(session, kind, name)
+    (place(session, kind, JOINED) / RESULT).replace(target)
+    _put_away(session, kind, sources)
     return target
 
 
@@ -356,7 +381,7 @@ def take_points(session: Session, kind: str, name: str) -> Path:
     Returns:
         Path of the new file.
     """
-    path = _named_file(session, kind, name)
+    path = file_of(session, kind, name)
     table = stated(read_table(path), _options(session, kind, path), None, holds_points=True)
     target = _named(session, kind, name)
     Joined(table, table.rows - 1, table.notes).write(target)

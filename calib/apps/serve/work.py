@@ -20,6 +20,7 @@ from typing import Any
 
 from calib import bug_reports
 from calib.apps.serve.received import Pairing, join_received
+from calib.apps.serve.split_logs import MOTIONS, join_halves
 from calib.errors import command_line, complaint
 from calib.toolkit.sessions import POSES, UNSEEN, Session, open_session
 from calib.workers.processes import end_with_parent
@@ -167,7 +168,10 @@ def _run(sender: Connection, folder: Path, job: Job) -> None:
             for line in checked(open_session(folder), job.subject):
                 say(line)
         elif job.task == JOIN and job.pairing is not None:
-            for line in join_received(open_session(folder), job.subject, job.pairing):
+            join = join_received
+            if job.subject in MOTIONS:
+                join = join_halves
+            for line in join(open_session(folder), job.subject, job.pairing):
                 say(line)
         elif job.task == REDO:
             go_on(folder, say, partial(send, "words"), command, job.subject)

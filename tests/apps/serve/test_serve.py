@@ -10,6 +10,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Iterator
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -22,18 +23,21 @@ from sessions import begin, go_on
 from starlette.testclient import TestClient
 
 from calib.apps.cell_demo import demo
-from calib.apps.serve import pages, received
+from calib.apps.serve import pages, received, split_logs
 from calib.apps.serve.pages import application
 from calib.apps.serve.work import CHECK, NEXT, Work
-from calib.errors import UsageError
+from calib.data.recordings.recording_files import read_recording
+from calib.errors import MeasurementError, UsageError
 from calib.procedure.report.figures import figure_data
 from calib.procedure.report.figures.charts import Chart, Line, Panel
 from calib.procedure.session import commands, steps
 from calib.procedure.session.folder import Session, open_session
 from calib.procedure.session.geometry_steps import chain_of, read_measured
+from calib.procedure.session.questions import stated_payloads
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward
 from calib.simulation.virtual_cells import virtual_cell
+from calib.toolkit.result_folders import joints_of
 from calib.transforms import pose
 
 
@@ -138,6 +142,95 @@ def test_joints_and_points_apart_are_joined_in_the_page(session: Session, client
     np.testing.assert_allclose(block.q, q, atol=1e-6)
     assert client.post("/take/measured").status_code == 400, "taken already"
     assert len(list(session.path("3-measured/received/measured/used").iterdir())) == 2
+
+
+def halves_of_a_log() -> tuple[bytes, bytes]:
+    """Return positions, and currents 2 ms later, of seven joints as CSV files, whose columns are named alike."""
+    t = np.arange(200) / 100.0
+    q = np.sin(t[:, None] * np.arange(1.0, 8.0))
+    contents = []
+    for late, values in ((0.0, q), (0.002, 1e3 * q)):
+        lines = ["time," + ",".join(f"joint{k}" for k in range(1, 8))]
+        lines += [",".join(f"{x:.6f}" for x in row) for row in np.column_stack([t + late, values])]
+        contents.append("\n".join(lines).encode())
+    return contents[0], contents[1]
+
+
+def test_two_logs_of_one_motion_are_joined_in_the_page(tmp_path: Path) -> None:
+    """Half a recording waits for the other half; both are paired by time, shown, and taken under the awaited name."""
+    payloads = stated_payloads(["load=3.28 at 0,0,0.05"])
+    session = begin(tmp_path / "cell", "lwr4plus", "cmm", 12, 4, payloads=payloads)
+    client = TestClient(application(Recorded(session.folder)), base_url="http://127.0.0.1:8000")
+    work = client.app.state.work  # type: ignore[attr-defined]
+    positions, currents = halves_of_a_log()
+    assert bring(client, "training", "load_position.csv", positions).status_code == 303
+    shown = unescape(client.get("/").text)
+    assert "The torques or currents of this motion are missing" in shown and "tau_" in shown
+    assert not session.brought("training") and work.current is None
+    client.post("/aside/7-recorded/received/training/files/load_position.csv")
+    assert not received.waiting(session, "training")
+
+    assert bring(client, "training", "load_current_mA.csv", currents).status_code == 303
+    assert "The positions of this motion are missing" in client.get("/").text
+    assert bring(client, "training", "load_position.csv", positions).status_code == 303
+    asked = work.current.pairing
+    assert (asked.joints, asked.points) == ("load_position.csv", "load_current_mA.csv")
+    notes = split_logs.join_halves(session, "training", asked)
+    shown = unescape(client.get("/").text)
+    assert all(note in shown for note in notes[:-1])
+    assert "joined by time" in shown and "joint1 as current_joint1" in shown and "Take as the recording" in shown
+
+    assert client.post("/take/training").status_code == 200
+    (path,) = session.brought("training")
+    assert path.name == "training_load_log.csv"
+    recording = read_recording(path, joints_of(chain_of(session)))
+    assert recording.kind == "current"
+    # the first position is before the first current, and left out; currents are 2 ms late
+    t = recording.t[:, None] + 0.01
+    np.testing.assert_allclose(recording.q, np.sin(t * np.arange(1.0, 8.0)), atol=1e-5)
+    np.testing.assert_allclose(recording.effort, np.sin((t - 0.002) * np.arange(1.0, 8.0)), atol=1e-3)
+    assert client.post("/take/training").status_code == 400, "taken already"
+    assert not received.waiting(session, "training")
+
+
+def test_whole_logs_and_logs_of_other_clocks(tmp_path: Path) -> None:
+    """A whole log is checked as it is, and waits for nothing; halves without common times stay, with the cause."""
+    session = begin(tmp_path / "cell", "lwr4plus", "cmm", 12, 4)
+    client = TestClient(application(Recorded(session.folder)), base_url="http://127.0.0.1:8000")
+    work = client.app.state.work  # type: ignore[attr-defined]
+    example = client.get("/example/training").content
+    assert bring(client, "training", "run.csv", example).status_code == 303
+    assert [path.name for path in session.brought("training")] == ["run.csv"] and work.current.task == CHECK
+
+    positions, currents = halves_of_a_log()
+    later = currents.replace(b"\n0.", b"\n9000.").replace(b"\n1.", b"\n9001.")
+    files = [("file", ("position.csv", positions)), ("file", ("torque.csv", later))]
+    assert client.post("/bring/unseen", files=files).status_code == 200
+    assert not session.brought("unseen")
+    pairing = split_logs.pairing_of(split_logs.halves(session, "unseen"))
+    assert pairing is not None
+    with pytest.raises(MeasurementError, match="of one clock"):
+        split_logs.join_halves(session, "unseen", pairing)
+    form = {"joints": pairing.joints, "points": pairing.points, "by": "row"}
+    assert client.post("/join/unseen", data=form).status_code == 200
+    split_logs.join_halves(session, "unseen", replace(pairing, by="row"))
+    assert client.post("/take/unseen").status_code == 200
+    assert [path.name for path in session.brought("unseen")] == ["validation_log.csv"]
+
+
+@pytest.mark.parametrize(
+    ("header", "stem", "half"),
+    [
+        (("t", "q1", "q2"), "log", split_logs.POSITIONS),
+        (("t", "tau_a", "tau_b", "v_a", "v_b"), "log", split_logs.EFFORTS),
+        (("t", "q1", "i1"), "torque", ""),
+        (("t", "v1", "v2"), "log", ""),
+        (("t", "a", "b"), "log", ""),
+        (("t", "q1", "q2"), "current_mA", split_logs.EFFORTS),
+    ],
+)
+def test_halves_are_told_by_columns_and_names(header: tuple[str, ...], stem: str, half: str) -> None:
+    assert split_logs.half_of(header, stem) == half
 
 
 def test_mistakes_in_files_are_shown_with_their_cure(session: Session, client: TestClient) -> None:
