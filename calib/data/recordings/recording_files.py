@@ -459,8 +459,8 @@ def _numbered(table: Table, stem: str) -> list[int]:
         if number is not None:
             numbered.setdefault(column_stem, []).append((number, column))
     plain_stem = stem_of(stem)[0]
-    full_stem = plain_stems(tuple(numbered)).get(plain_stem, "")
-    pairs = sorted(numbered.get(full_stem, []))
+    full_stem = plain_stems(tuple(numbered)).get(plain_stem)
+    pairs = [] if full_stem is None else sorted(numbered[full_stem])
     numbers = [number for number, _ in pairs]
     if not numbers or numbers[0] > 1 or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
         return []

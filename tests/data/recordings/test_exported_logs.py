@@ -257,3 +257,21 @@ def test_small_steps_back_are_no_second_log(tmp_path, series, back):
     np.savetxt(tmp_path / "log.csv", table, fmt="%.9g", delimiter=",", header=header, comments="")
     recording = read_recording(tmp_path / "log.csv", ROBOT)
     assert any("stamps are" in note for note in recording.notes)
+
+
+def test_joint_columns_without_a_quantity_are_not_torques(tmp_path):
+    """Columns joint1 … are positions beside torques, and alone no recording; they are never read twice."""
+    t = np.arange(200) / 100.0
+    q = np.sin(np.outer(t, [1.0, 2.0, 3.0]))
+    names = ["joint1", "joint2", "joint3"]
+    joints = Joints(tuple(names))
+    alone = tmp_path / "positions.csv"
+    np.savetxt(alone, np.column_stack([t, q]), delimiter=",", header=",".join(["time", *names]), comments="")
+    with pytest.raises(MeasurementError, match="has no torques"):
+        read_recording(alone, joints)
+    whole = tmp_path / "whole.csv"
+    header = ",".join(["time", *names, "tau1", "tau2", "tau3"])
+    np.savetxt(whole, np.column_stack([t, q, 5.0 * q]), delimiter=",", header=header, comments="")
+    recording = read_recording(whole, joints)
+    np.testing.assert_allclose(recording.q, q)
+    np.testing.assert_allclose(recording.effort, 5.0 * q)
