@@ -28,7 +28,7 @@ from calib.geometry.fit import plausible_deviation
 from calib.geometry.installation import Installation
 from calib.geometry.left_out import LeftOut, Profile, unevenness
 from calib.geometry.many_corrections import position_variances
-from calib.geometry.model_choice.cross_validation import project_out, term_groups, term_sizes
+from calib.geometry.model_choice.cross_validation import project_out, term_groups, term_sizes, with_terms
 from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.observation import layout, observe, prepare
@@ -378,7 +378,7 @@ class _Rows:
         pose: for each block, (m,) number of each row's pose.
         poses: (p, n) joint values of all poses.
         counts: for each block, (m,) mask of the rows that are not gross outliers.
-        free: indices of the fit's parameters without its corrections, then of all terms of the chosen effects.
+        free: indices of the fit's parameters without its chosen corrections, then of all terms of the chosen effects.
         station: positions of the station placements in `free`.
         prior: standard deviations about the optimum, for parameters that a fold does not determine.
         coordinates: coordinates of the columns in which the statistics are expressed.
@@ -400,11 +400,14 @@ class _Rows:
             good = [(block.file, int(row)) not in gross for row in block.rows]
             self.counts.append(np.array(good, bool))
         cell = fit.cell
+        # compliance from other recordings, which is fitted with the geometry
+        stated_count = len(selection.rigid.cell.deflection.terms)
         if terms:
             reference = selection.reference or selection.nominal.cell.chain
-            cell = replace(cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
+            stated = Deflection(cell.deflection.terms[:stated_count], cell.deflection.coefficients[:stated_count])
+            cell = with_terms(replace(cell, deflection=stated), terms, reference)
         table = layout(cell)
-        terms_index = table.index("deflection")
+        terms_index = table.index("deflection")[stated_count:]
         geometry = np.flatnonzero(~np.isin(fit.free, terms_index))
         self.free = np.concatenate([fit.free[geometry], terms_index])
         self.station = np.flatnonzero(np.isin(self.free, table.index("station")))

@@ -203,8 +203,9 @@ def fold_statistics(
         reference: chain on which the terms' basis functions are evaluated.
         folds: partition of the rows.
     """
-    cell = replace(fit.cell, deflection=Deflection(terms, np.zeros(len(terms)), reference))
-    free = np.concatenate([fit.free, layout(cell).index("deflection")])
+    cell = with_terms(fit.cell, terms, reference)
+    added = layout(cell).index("deflection")[len(fit.cell.deflection.terms) :]
+    free = np.concatenate([fit.free, added])
     sample = sampled(measured, JUDGED_POSES)
     measured = [take(block, rows) for block, rows in zip(measured, sample)]
     folds_of_rows = [members[rows] for members, rows in zip(folds.members, sample)]
@@ -267,6 +268,19 @@ def fold_statistics(
         rows=np.array(counts),
         total=total,
     )
+
+
+def with_terms(cell: Installation, terms: tuple[Term, ...], reference: Chain) -> Installation:
+    """Return an installation with deflection terms after its own, with coefficients of zero.
+
+    Args:
+        cell: the installation.
+        terms: the terms to add.
+        reference: chain on which the basis functions of all terms are evaluated.
+    """
+    coefficients = np.asarray(cell.deflection.coefficients)
+    coefficients = np.concatenate([coefficients, np.zeros(len(terms))])
+    return replace(cell, deflection=Deflection((*cell.deflection.terms, *terms), coefficients, reference))
 
 
 def _placed_anew(measured: Sequence[PoseMeasurements], held_out: Sequence[np.ndarray]) -> list[bool]:

@@ -26,8 +26,10 @@ from calib.geometry.model_choice.cross_validation import (
     UnseenErrors,
     blind_folds,
     fold_statistics,
+    with_terms,
 )
 from calib.geometry.model_choice.folds import Folds, divide, transfer_folds
+from calib.geometry.model_choice.stated_compliance import StatedCompliance
 from calib.geometry.observation import layout, prepare
 from calib.geometry.weighing import GeometricFit, Settings
 from calib.robot.calibrated import Deflection, Term
@@ -267,6 +269,7 @@ def select_model(
     folds: Folds | None = None,
     progress: Progress | None = None,
     masses: np.ndarray | None = None,
+    compliance: StatedCompliance | None = None,
 ) -> ModelSelection:
     """Return the model that the data support, or the model of a given name, fitted to all rows.
 
@@ -285,6 +288,8 @@ def select_model(
         progress: called with (done, total, task): steps done, steps in all, name of the next step; None for no report.
         masses: (n, 10) standard parameters of the bodies, by which the blocks' torques were computed; None for those of
             the arm.
+        compliance: compliance of joints that `cell` has as known; the full geometry is fitted with it as prior. None
+            for no stated compliance.
 
     Raises:
         UsageError: the model does not exist.
@@ -300,6 +305,7 @@ def select_model(
         progress=progress or _no_progress,
         seed=seed,
         masses=masses,
+        compliance=compliance,
     )
     climber.rigid(model)
     if climber.settings.loss == "auto" and climber.best.outliers(MAX_RESIDUAL):
@@ -319,7 +325,7 @@ class _Climber:
     """State of a model selection: the best model so far, and the steps tried.
 
     Attributes:
-        cell, measured, settings, fixed, prior, progress, seed, masses: arguments of `select_model`.
+        cell, measured, settings, fixed, prior, progress, seed, masses, compliance: arguments of `select_model`.
         transfer: the partition of the rows that was requested.
         folds: that partition, with those folds split that the other rows do not determine.
         nominal: the nominal arm with its placements fitted.
@@ -342,6 +348,7 @@ class _Climber:
     progress: Progress
     seed: int
     masses: np.ndarray | None = None
+    compliance: StatedCompliance | None = None
 
     def __post_init__(self) -> None:
         self.ticks = 0
@@ -392,12 +399,31 @@ class _Climber:
         if rigid_model == "offsets":
             candidates = np.concatenate([self.nominal.cell.chain.driven, table.frame_index])
         candidates = np.setdiff1d(candidates, self.fixed)
-        self.best = fit(self.nominal.cell, self.measured, candidates, settings=self.settings, prior=self.prior)
+        if self.compliance is not None and rigid_model == "geometry":
+            self.best = self._with_compliance(self.compliance, candidates)
+        else:
+            self.best = fit(self.nominal.cell, self.measured, candidates, settings=self.settings, prior=self.prior)
         self.stiff = self.best
         self.error = self._statistics(self.best, ()).error(NONE).rms
         self.rungs.append(ModelStep(rigid_model, self.best.identified, 1e3 * self.error, True))
         if rigid_model == "geometry":
             self.full = self.best
+
+    def _with_compliance(self, compliance: StatedCompliance, candidates: np.ndarray) -> GeometricFit:
+        """Return the fit of the geometry and of a stated compliance, which has its sigma as prior.
+
+        Args:
+            compliance: the stated compliance.
+            candidates: indices of the parameters of the geometry to fit.
+        """
+        rigid = self.nominal.cell
+        prior = self.prior
+        if prior is None:
+            prior = np.full(len(layout(rigid).names), np.inf)
+        cell = replace(rigid, deflection=compliance.deflection, known=Deflection())
+        candidates = np.concatenate([candidates, layout(cell).index("deflection")])
+        prior = np.concatenate([prior, compliance.sigma])
+        return fit(cell, self.measured, candidates, settings=self.settings, prior=prior)
 
     def effects(self, model: str) -> None:
         """Add effects to the geometry one by one or, given the name of an effect, add this one and all before it.
@@ -495,14 +521,16 @@ class _Climber:
         ridges = statistics.ridges(index)
         alive = ridges > 0.0
         alive_terms = tuple(terms[k] for k in index[alive])
-        cell = replace(rigid.cell, deflection=Deflection(alive_terms, np.zeros(len(alive_terms)), reference))
+        cell = with_terms(rigid.cell, alive_terms, reference)
         geometry_prior = rigid.prior
         if geometry_prior is None:
             geometry_prior = np.full(len(rigid.free), np.inf)
         blocks = prepare(cell, self.measured)
-        free = np.concatenate([rigid.free, layout(cell).index("deflection")])
+        added = layout(cell).index("deflection")[len(rigid.cell.deflection.terms) :]
+        free = np.concatenate([rigid.free, added])
         prior = np.concatenate([geometry_prior, ridges[alive]])
-        nominal = replace(cell, chain=self.nominal.cell.chain)
+        start = with_terms(rigid.start, alive_terms, reference)
+        nominal = replace(cell, chain=self.nominal.cell.chain, deflection=start.deflection)
         result = fit_with_prior(cell, blocks, free, prior, settings=self.settings, nominal=nominal)
         return replace(result, start=rigid.start, split=rigid.split, candidates=rigid.candidates)
 
@@ -517,7 +545,10 @@ class _Climber:
         poses = sum(len(block) for block in self.measured)
         terms = EFFECTS[effect](self.reference, torques_known)
         max_order = poses // POSES_PER_ORDER
-        return [term for term in terms if term.basis not in HARMONIC or term.order <= max_order]
+        terms = [term for term in terms if term.basis not in HARMONIC or term.order <= max_order]
+        if self.compliance is None:
+            return terms
+        return [term for term in terms if term not in self.compliance.deflection.terms]
 
     def _statistics(self, fit: GeometricFit, terms: tuple[Term, ...]) -> FoldStatistics:
         return fold_statistics(fit, self.measured, terms, self.reference, self.folds)

@@ -21,6 +21,7 @@ from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.folds import folds_by_name
 from calib.geometry.model_choice.ladder import MIN_GAIN, RIGID_MODELS, ModelSelection, select_model
+from calib.geometry.model_choice.stated_compliance import contradictions
 from calib.geometry.observability import unidentified
 from calib.geometry.observation import fixed_parameters, stated_prior
 from calib.geometry.static_torques.load_errors import DESCRIBED, WEIGHED
@@ -200,6 +201,8 @@ def run(
         for block in inputs.fit:
             notes += parted_set_up(inputs.chain, block)
     notes += torques_used(selection.fit.cell.deflection, inputs.gravity, inputs.torques)
+    if inputs.compliance is not None:
+        notes += contradictions(selection.fit, selection.rigid, inputs.compliance)
     if prediction is not None:
         ratio = compared_with_fit(prediction, selection.fit)
         if ratio is not None:
@@ -257,6 +260,7 @@ def _selected(
         seed=settings.seed,
         progress=lambda done, total, what: progress(f"fitting: {what}"),
         masses=inputs.masses,
+        compliance=inputs.compliance,
     )
     return climb, climb(settings.model or options.model, settings=weighing)
 

@@ -16,13 +16,14 @@ from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
-from calib.errors import CalibError, Finding, MeasurementError, UsageError, listing, require
+from calib.errors import CalibError, Finding, MeasurementError, UsageError, listing, refuse_option, require
 from calib.extensions import Point
 from calib.geometry.checks.pose_direction import as_seen_by_instrument
 from calib.geometry.checks.readings import without_unseen
 from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
+from calib.geometry.model_choice.stated_compliance import StatedCompliance, check_torques, read_compliance
 from calib.geometry.repeatability import repeated, repeated_rows, without_copies
 from calib.geometry.static_torques.gravity_fit import GravityFit, gravity_fit, without_contradicting_torques
 from calib.geometry.static_torques.sources import MEASURED, driven, load_findings, with_stated_load
@@ -76,6 +77,7 @@ class Inputs:
         noticed: findings on readings that were left out, since the instrument did not see the target, and on torques.
         gravity: gravity of the arm by the torques that it measured at rest; None without such torques.
         torques: whether measured torques drive the compliance, or those of the masses.
+        compliance: compliance of joints that an identification told; None without it.
     """
 
     chain: Chain
@@ -88,6 +90,7 @@ class Inputs:
     noticed: tuple[Finding, ...] = ()
     gravity: GravityFit | None = None
     torques: str = MEASURED
+    compliance: StatedCompliance | None = None
 
     def driven_by(self, source: str) -> "Inputs":
         """Return the inputs whose compliance is driven by measured or by modelled torques.
@@ -113,17 +116,18 @@ class Inputs:
 
     @property
     def known(self) -> Deflection:
-        """Joint corrections that the robot has from an earlier fit; empty without an earlier fit."""
+        """Joint corrections that the robot has from an earlier fit or an identification; else empty."""
+        if self.compliance is not None:
+            return self.compliance.deflection
         if self.earlier is None:
             return Deflection()
         return self.earlier.deflection
 
     @property
     def bare(self) -> Chain | None:
-        """Geometry of an earlier fit for use without its joint corrections.
-
-        None if the earlier fit has no corrections.
-        """
+        """Geometry before the fit for use without joint corrections; None if the robot has none before the fit."""
+        if self.compliance is not None:
+            return self.chain
         if self.earlier is None or self.earlier.corrections is None:
             return None
         return self.earlier.chain
@@ -210,12 +214,33 @@ def gather(
         notes += (f"gravity torques of the compliance are those of the masses identified in {settings.masses}",)
     inputs = Inputs(chain, robot_file, tuple(fitted_blocks), unseen, notes, earlier, masses, tuple(noticed), gravity)
     inputs = with_unseen(inputs, validate, options, settings)
+    if settings.compliance:
+        inputs = _with_compliance(inputs, settings.compliance)
     if earlier is None or earlier.corrections is None:
         return inputs
     name = robot_file if isinstance(robot, CalibratedChain) else robot
     count = len(earlier.deflection.terms)
     note = f"{name} has {count} deflection terms of an earlier fit; these stay unchanged"
     return replace(inputs, notes=(*inputs.notes, note))
+
+
+def _with_compliance(inputs: Inputs, path: str) -> Inputs:
+    """Return the inputs with the compliance of joints that an identification told.
+
+    Args:
+        inputs: robot and measurements.
+        path: ``joint_compliance.csv``, or the folder of an identification.
+
+    Raises:
+        UsageError: for measurements without torques, or a robot that has joint corrections of an earlier fit.
+    """
+    if inputs.earlier is not None and inputs.earlier.corrections is not None:
+        refuse_option(
+            f"compliance {path}",
+            f"{inputs.source} has joint corrections of an earlier fit, which may count it; fit the nominal robot",
+        )
+    check_torques(inputs.fit, path)
+    return replace(inputs, compliance=read_compliance(path, inputs.weighed))
 
 
 def with_unseen(

@@ -38,6 +38,7 @@ class FitSettings:
         deliverable: subject of the verdict: urdf (robot.urdf alone), or corrections (with joint_corrections.csv)
         seed: reproduces everything random
         masses: folder of an identification: compliance is fitted to its gravity torques, not to the description's
+        compliance: joint_compliance.csv of an identification: compliance of joints, with its σ as prior
 
     Raises:
         UsageError: for a value that is none of these.
@@ -54,6 +55,7 @@ class FitSettings:
     deliverable: Deliverable = DELIVERABLES[0]
     seed: Seed = 0
     masses: Text = ""
+    compliance: Text = ""
 
 
 @checked
