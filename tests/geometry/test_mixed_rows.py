@@ -7,6 +7,7 @@ import pytest
 from planted import cell, load, perturb, random_joints
 from scipy.spatial.transform import Rotation
 
+import calib
 from calib.data.poses.measurements import PoseMeasurements, Poses
 from calib.data.poses.plausible import from_angles, to_angles
 from calib.geometry.checks.mixed_rows import mixed_orientations
@@ -122,3 +123,12 @@ def test_positions_in_another_frame_from_a_row_on_are_named():
     assert (finding.values["last"], finding.values["next"]) == (CUT, CUT + 1)
     assert finding.values["changed"] == "what stands beside the arm"
     assert parted_set_up(load("ur5"), replace(moved, position=block.position)) == []
+
+
+def test_a_fit_names_rows_in_another_unit():
+    """A fit of positions whose later rows are in mm, read as m, says so and fails."""
+    block = poses()
+    scale = np.where(np.arange(ROWS) < CUT, 1.0, 1e-3)[:, None]
+    fit = calib.fit_geometry("ur5", replace(block, position=block.position * scale))
+    codes = [note.code for note in fit.outcome.findings.noticed]
+    assert "units-mixed" in codes and fit.verdict.level == "fail"
