@@ -32,6 +32,8 @@ PAGES = (CERTIFICATE, "certificate.pdf", "report.html")
 """The certificate as a page and as a document, and the report with all tables and figures."""
 FIGURES = "figures.json"
 """Figures as data, where no page has them."""
+JOINT_COMPLIANCE, COMPLIANCE = "joint_compliance.csv", "compliance [rad/(N m)]"
+"""Table of the compliance of joints with two encoders, and the heading of its values."""
 OFFSETS, PARAMETERS = "joint_offsets.csv", "parameters.json"
 """Files that identify an export, of a geometry and of dynamics."""
 

@@ -16,16 +16,13 @@ import numpy as np
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, UsageError, finding, one_of, refuse_option
+from calib.folders import COMPLIANCE, JOINT_COMPLIANCE
 from calib.geometry.observation import layout
 from calib.geometry.weighing import GeometricFit
 from calib.records import frozen
 from calib.robot.calibrated import BY_TORQUE, Deflection, Term
 from calib.robot.chain import Chain
 
-COMPLIANCE = "joint_compliance.csv"
-"""Name of the table in the folder of an identification."""
-VALUE = "compliance [rad/(N m)]"
-"""Heading of its column of compliances."""
 MAX_SIGMAS = 4.0
 """Standard deviations between stated compliance and poses from which on they contradict each other (our choice)."""
 BY_GRAVITY = (*BY_TORQUE, "lever")
@@ -63,9 +60,9 @@ def read_compliance(path: str | Path, chain: Chain) -> StatedCompliance:
     """
     path = Path(path)
     if path.is_dir():
-        path = path / COMPLIANCE
+        path = path / JOINT_COMPLIANCE
     table = read_table(path)
-    compliance = table.numbers(VALUE, None)
+    compliance = table.numbers(COMPLIANCE, None)
     sigma = table.numbers("sigma", None)
     terms: list[Term] = []
     rows: list[int] = []
@@ -91,7 +88,7 @@ def _check_row(table: Table, row: int, compliance: np.ndarray, sigma: np.ndarray
         compliance, sigma: its columns [rad/(N m)].
     """
     if not compliance[row] < 0.0:
-        table.fail(f"{compliance[row]:.3g}: expected a negative number, -1 / stiffness", VALUE, row)
+        table.fail(f"{compliance[row]:.3g}: expected a negative number, -1 / stiffness", COMPLIANCE, row)
     if not 0.0 < sigma[row] < np.inf:
         table.fail(f"{sigma[row]:.3g}: expected a positive number", "sigma", row)
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements, take
 from calib.errors import Finding, UsageError, finding, require
+from calib.estimation.robust import spread
 from calib.geometry.static_torques.column_faults import column_fault
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward, gravity_torques, joint_frames
@@ -49,6 +50,10 @@ MILLIMETRES = 200.0
 MIN_AT_REST = 0.5
 # what is said of torques that are zero, and what to do
 ZERO = "they are zero in every row", "is the sensors' signal in other columns?"
+# what to do about torques that are far too large
+IN_MILLIMETRES = "name the columns tau1 [N mm] …"
+Fault = tuple[str, str]
+"""Why torques are not used, and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,15 +90,21 @@ class GravityFit:
         for _ in range(ROUNDS):
             values, covariance = _most_probable(regressor, torque, weights / self.sigma, deviations)
             residual = torque - regressor @ values
-            spread = np.nanmedian(np.abs(residual), axis=0) / 0.6745
-            weights = np.abs(residual) < MAX_RESIDUAL * np.maximum(spread, self.sigma)
+            weights = np.abs(residual) < MAX_RESIDUAL * np.maximum(_spreads(residual), self.sigma)
         return values, _mass_sigma(values, covariance)
 
     def at_rest(self, block: PoseMeasurements) -> np.ndarray:
         """Return whether each measured torque (m, n) of a block is that of the arm at rest with the block's load."""
         load, _ = self.load(block)
         loads = np.tile(load, (len(block), 1))
-        residual = self.balancing(block) - gravity_torques(self.chain, block.q, loads)
+        return self.agrees(self.balancing(block) - gravity_torques(self.chain, block.q, loads))
+
+    def agrees(self, residual: np.ndarray) -> np.ndarray:
+        """Return whether torques (m, n) were measured, and differ from gravity by no more than those of an arm at rest.
+
+        Args:
+            residual: (m, n) measured torques minus those of gravity [N m]; NaN where none was measured.
+        """
         return np.asarray(np.abs(residual) < MAX_RESIDUAL * self.sigma)
 
 
@@ -118,16 +129,17 @@ def without_contradicting_torques(
     return replace(block, measured_torque=None), [unused]
 
 
-def _contradiction(block: PoseMeasurements, gravity: GravityFit) -> tuple[str, str]:
+def _contradiction(block: PoseMeasurements, gravity: GravityFit) -> Fault:
     """Return why torques of a block are not those of the fitted arm with any load, and what to do."""
     torque = np.asarray(block.measured_torque)
+    fault = _nothing_read(torque)
+    if fault is not None:
+        return fault
     finite = np.isfinite(torque)
-    if np.max(np.abs(torque), initial=0.0, where=finite) < MIN_SPREAD:
-        return ZERO
     expected = gravity.sign * gravity_torques(gravity.chain, block.q)
     factor = _factor(expected, torque, finite)
     if abs(factor) > MILLIMETRES:
-        return f"they are {abs(factor):.0f} times the gravity of the fitted files", "name the columns tau1 [N mm] …"
+        return f"they are {abs(factor):.0f} times the gravity of the fitted files", IN_MILLIMETRES
     fault = column_fault(gravity_regressor(gravity.chain, block.q), np.where(finite, torque, 0.0), finite)
     if fault is not None:
         return fault
@@ -251,42 +263,63 @@ def gravity_fit(chain: Chain, blocks: Sequence[PoseMeasurements]) -> tuple[Gravi
         return None, []
     torques = [np.asarray(block.measured_torque) for block in measured]
     torque = np.concatenate(torques)
-    files = sorted({block.file for block in measured})
-    spread = np.nanmax(np.abs(torque), axis=0, initial=0.0, where=np.isfinite(torque))
-    if spread.max() < MIN_SPREAD:
-        reason, advice = ZERO
-        if not np.isfinite(torque).any():
-            reason = "their columns are empty"
-        return None, [finding("torques-unused", files=files, reason=reason, cure=advice)]
-    described = reference_masses(chain)
-    regressor = np.concatenate([gravity_regressor(chain, block.q) for block in measured])
-    expected = regressor @ described[:, 6:].ravel()
     finite = np.isfinite(torque)
-    if finite.any(axis=1).sum() < chain.n:
-        return None, []
-    factor = _factor(expected, torque, finite)
+    fit = None
+    fault = _nothing_read(torque)
+    if fault is None:
+        if finite.any(axis=1).sum() < chain.n:
+            return None, []
+        described = reference_masses(chain)
+        regressor = np.concatenate([gravity_regressor(chain, block.q) for block in measured])
+        factor = _factor(regressor @ described[:, 6:].ravel(), torque, finite)
+        fault = _too_large(chain, described, factor)
+        fault = fault or column_fault(regressor, np.where(finite, torque, 0.0), finite)
+    if fault is None:
+        sign = float(np.sign(factor)) or 1.0
+        fit = _fitted(chain, measured, regressor, sign, abs(factor) * described[:, 6:])
+        fault = _unlike_gravity(fit, measured)
+    if fault is None:
+        return fit, []
+    reason, cure = fault
+    files = sorted({block.file for block in measured})
+    return None, [finding("torques-unused", files=files, reason=reason, cure=cure)]
+
+
+def _nothing_read(torque: np.ndarray) -> Fault | None:
+    """Return that torques (m, n) are zero or empty, and what to do; None where a sensor read something."""
+    finite = np.isfinite(torque)
+    if np.max(np.abs(torque), initial=0.0, where=finite) >= MIN_SPREAD:
+        return None
+    if finite.any():
+        return ZERO
+    return "their columns are empty", ZERO[1]
+
+
+def _too_large(chain: Chain, described: np.ndarray, factor: float) -> Fault | None:
+    """Return that torques are far too large for an arm, and what to do; None where they may be right.
+
+    Args:
+        chain: the arm.
+        described: (n, 10) described standard parameters, as of `reference_masses`.
+        factor: torques over the gravity of these.
+    """
     if chain.inertias is not None and abs(factor) > MILLIMETRES:
-        reason = f"they are {abs(factor):.0f} times the gravity of the described masses"
-        return None, [finding("torques-unused", files=files, reason=reason, cure="name the columns tau1 [N mm] …")]
+        return f"they are {abs(factor):.0f} times the gravity of the described masses", IN_MILLIMETRES
     mass = abs(factor) * float(described[:, 9].sum())
-    heaviest = MAX_MASS * chain.stretched_length() ** 2
-    if mass > heaviest:
+    if mass > MAX_MASS * chain.stretched_length() ** 2:
         reason = f"they are the gravity of an arm of {mass:.0f} kg, which is too heavy for its length"
-        return None, [finding("torques-unused", files=files, reason=reason, cure="name the columns tau1 [N mm] …")]
-    fault = column_fault(regressor, np.where(finite, torque, 0.0), finite)
-    if fault is not None:
-        return None, [finding("torques-unused", files=files, reason=fault[0], cure=fault[1])]
-    sign = float(np.sign(factor)) or 1.0
-    prior = abs(factor) * described[:, 6:]
-    fit = _fitted(chain, measured, regressor, sign, prior)
+        return reason, IN_MILLIMETRES
+    return None
+
+
+def _unlike_gravity(fit: GravityFit, measured: Sequence[PoseMeasurements]) -> Fault | None:
+    """Return that gravity explains too little of the measured torques, and what to ask; None where it explains them."""
     explained = 1.0 - _unexplained(fit, measured)
-    if explained < MIN_EXPLAINED:
-        reason = f"gravity explains {100.0 * explained:.0f} % of their variation only"
-        cure = (
-            "were they read at rest, by sensors at the joints (not currents)? Are they of this arm, in its joint order?"
-        )
-        return None, [finding("torques-unused", files=files, reason=reason, cure=cure)]
-    return fit, []
+    if explained >= MIN_EXPLAINED:
+        return None
+    reason = f"gravity explains {100.0 * explained:.0f} % of their variation only"
+    cure = "were they read at rest, by sensors at the joints (not currents)? Are they of this arm, in its joint order?"
+    return reason, cure
 
 
 def _factor(expected: np.ndarray, torque: np.ndarray, finite: np.ndarray) -> float:
@@ -359,7 +392,7 @@ def _fitted(
     for _ in range(ROUNDS):
         values, covariance = _most_probable(matrix, torque, weights / sigma, deviations)
         residual = np.where(finite, torque - matrix @ values, np.nan)
-        sigma = np.maximum(np.nanmedian(np.abs(residual), axis=0) / 0.6745, MIN_SPREAD)
+        sigma = np.maximum(_spreads(residual), MIN_SPREAD)
         weights = (np.abs(residual) < MAX_RESIDUAL * sigma).astype(float)
     masses = prior + values[: 4 * n].reshape(n, 4)
     sigmas = [0.0]
@@ -369,6 +402,12 @@ def _fitted(
         sigmas.append(_mass_sigma(loads[number], covariance[start : start + 4, start : start + 4]))
     fitted = replace(chain, inertias=_with_parameters(chain, masses))
     return GravityFit(fitted, sign, values[4 * n : 5 * n], sigma, tuple(loads), tuple(sigmas))
+
+
+def _spreads(residual: np.ndarray) -> np.ndarray:
+    """Return the robust standard deviation (n,) of each joint's residuals (m, n); NaN are left out."""
+    spreads = [spread(column[np.isfinite(column)]) for column in residual.T]
+    return np.array(spreads)
 
 
 def _with_parameters(chain: Chain, parameters: np.ndarray) -> np.ndarray:

@@ -11,8 +11,8 @@ from calib.robot.calibrated import BY_TORQUE
 from calib.robot.chain import Chain
 from calib.robot.kinematics import element_jacobian, gravity_moments, sweep
 
-# [rad] prior standard deviation of a joint's turn under its largest torque, as gears wind up
-# (our choice); across the axis half of it
+# [rad] prior standard deviation of a joint's turn under its largest torque, as gears wind up (our choice); across the
+# axis half of it
 TURN = 1e-2
 # [N m/m²] largest torque of a joint without stated effort, over the square of the length
 USUAL_EFFORT = 100.0

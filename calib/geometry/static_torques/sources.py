@@ -11,7 +11,6 @@ from calib.errors import Finding, finding
 from calib.geometry.static_torques.gravity_fit import (
     LEAST_LOAD,
     LOAD_SIGMAS,
-    MAX_RESIDUAL,
     STATED_SHARE,
     GravityFit,
     by_stated_load,
@@ -74,7 +73,7 @@ def driven(block: PoseMeasurements, gravity: GravityFit, source: str = MEASURED)
     torque = modelled
     if source == MEASURED:
         measured = gravity.balancing(block)
-        torque = np.where(_at_rest(gravity, measured - modelled), measured, modelled)
+        torque = np.where(gravity.agrees(measured - modelled), measured, modelled)
     return replace(block, load=loads, torque=torque)
 
 
@@ -168,8 +167,3 @@ def _differs(gravity: GravityFit, mass: float, sigma: float, reference: float) -
     assert gravity.chain.inertias is not None
     smallest = LEAST_LOAD * float(gravity.chain.inertias[:, 9].sum())
     return abs(mass - reference) > max(LOAD_SIGMAS * sigma, smallest)
-
-
-def _at_rest(gravity: GravityFit, residual: np.ndarray) -> np.ndarray:
-    """Return whether a torque (m, n) was measured, and agrees with gravity [N m] as those of an arm at rest do."""
-    return np.asarray(np.abs(residual) < MAX_RESIDUAL * gravity.sigma)

@@ -38,10 +38,10 @@ from calib.units import headings, per_ampere
 # of torques_1.csv [Hz]
 TORQUE_RATE = 100.0
 
-INSTRUMENTAL, COMPLIANCE = "instrumental.csv", "joint_compliance.csv"
+INSTRUMENTAL = "instrumental.csv"
 COMPLIANCE_HEADER = (
     "joint",
-    "compliance [rad/(N m)]",
+    folders.COMPLIANCE,
     "sigma",
     "identified",
     "difference [mrad]",
@@ -57,7 +57,7 @@ OURS = (
     folders.COVARIANCE,
     information.INFORMATION,
     INSTRUMENTAL,
-    COMPLIANCE,
+    folders.JOINT_COMPLIANCE,
     folders.METRICS,
     "drive_gains.csv",
     folders.REPORT,
@@ -262,7 +262,7 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
     difference = encoder_difference(identification.dynamics, inputs.cases)
     if difference is not None:
         compliance_rows = [_compliance_row(joint, inputs.chain.joint_names) for joint in difference.joints]
-        files.write_table(folder / COMPLIANCE, COMPLIANCE_HEADER, compliance_rows)
+        files.write_table(folder / folders.JOINT_COMPLIANCE, COMPLIANCE_HEADER, compliance_rows)
 
     gains = None if inputs.gains is None else GainRecord.of(inputs.gains, inputs.unit)
     model_table = robot.model_table if isinstance(robot, Mechanism) else to_table

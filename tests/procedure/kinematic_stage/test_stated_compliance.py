@@ -8,7 +8,8 @@ from loaded_arm import HEAD, GivingArm, urdf
 
 import calib
 from calib.errors import MeasurementError, UsageError
-from calib.geometry.model_choice.stated_compliance import COMPLIANCE, read_compliance
+from calib.folders import JOINT_COMPLIANCE
+from calib.geometry.model_choice.stated_compliance import read_compliance
 from calib.procedure.dynamic_stage.folder import COMPLIANCE_HEADER
 from calib.robot import calibrated
 from calib.robot.formats import urdf as urdf_format
@@ -32,7 +33,7 @@ def folder(arm, tmp_path_factory):
     arm.write(path / "few.csv", arm.table(16, 1)[:, :10], HEAD[:10])
     arm.write(path / "more.csv", arm.table(40, 1)[:, :10], HEAD[:10])
     arm.write(path / "unseen.csv", arm.table(100, 2)[:, :10], HEAD[:10])
-    write_compliance(path / COMPLIANCE, arm, 1.0)
+    write_compliance(path / JOINT_COMPLIANCE, arm, 1.0)
     write_compliance(path / "wrong.csv", arm, 4.0)
     return path
 
@@ -64,7 +65,7 @@ def contradicted(fit):
 
 def test_few_poses_and_the_table_predict_better_than_the_poses_alone(folder, arm):
     alone = fitted(folder, "few.csv")
-    stated = fitted(folder, "few.csv", COMPLIANCE)
+    stated = fitted(folder, "few.csv", JOINT_COMPLIANCE)
     assert unseen_rms(stated) < 0.7 * unseen_rms(alone)
     assert contradicted(stated) == []
     deflection = stated.outcome.selection.fit.cell.deflection
@@ -82,25 +83,25 @@ def test_poses_contradict_a_wrong_table(folder, arm):
     values = by_joint["joint2"]
     assert values["sigmas"] > 4.0
     assert values["stated"] == pytest.approx(-4.0 * arm.about[1])
-    assert contradicted(fitted(folder, "more.csv", COMPLIANCE)) == []
+    assert contradicted(fitted(folder, "more.csv", JOINT_COMPLIANCE)) == []
 
 
 def test_a_saved_fit_predicts_with_the_compliance(folder, tmp_path):
-    fit = fitted(folder, "few.csv", COMPLIANCE)
+    fit = fitted(folder, "few.csv", JOINT_COMPLIANCE)
     terms = calibrated.read(fit.save(tmp_path / "fit", plots=False)).deflection.terms
     assert [term.basis for term in terms[:2]] == ["torque", "torque"]
     with pytest.raises(UsageError, match="joint corrections of an earlier fit"):
-        fitted(folder, "few.csv", COMPLIANCE, robot=tmp_path / "fit")
+        fitted(folder, "few.csv", JOINT_COMPLIANCE, robot=tmp_path / "fit")
 
 
 def test_compliance_without_torques_is_refused(folder):
     with pytest.raises(UsageError, match="has no torques for it; describe the robot's masses"):
-        fitted(folder, "few.csv", COMPLIANCE, robot="light.urdf")
+        fitted(folder, "few.csv", JOINT_COMPLIANCE, robot="light.urdf")
 
 
 def test_tables_that_state_nothing_are_refused(folder, arm, tmp_path):
     chain = urdf_format.parse(urdf(masses=True), "giving.urdf")
-    path = tmp_path / COMPLIANCE
+    path = tmp_path / JOINT_COMPLIANCE
     write_compliance(path, arm, 1.0, identified="no")
     with pytest.raises(UsageError, match="no revolute joint's compliance is identified"):
         read_compliance(tmp_path, chain)
