@@ -184,19 +184,8 @@ def choose(
     space = limits.space(jacobian)
 
     notes = list(limits.notes)
-    numbers = None
-    if candidates is not None:
-        require(view is None, "candidates: with a [camera], views of the board are drawn; leave them out", UsageError)
-        offered, numbers = _feasible_candidates(candidates, space, chain, settings, m)
-        possible = offered[numbers]
-        if len(possible) < len(offered):
-            notes.append(f"{len(offered) - len(possible)} of the {len(offered)} candidates break the constraints")
-    elif view is not None:
-        if progress:
-            progress(0, 1, "views of the board")
-        possible = _draw_views(view, space, limits, settings, m)
-    else:
-        possible = _draw_feasible(space, limits, settings)
+    possible, numbers, remarks = _possible_poses(candidates, chain, space, limits, settings, m, progress)
+    notes += remarks
 
     # `select_poses` checks it
     index = cast(Any, settings.index)
@@ -211,8 +200,7 @@ def choose(
     search = _search_settings(settings)
     pairs = None
     if settings.loads:
-        require(settings.method in METHODS_BY_CANDIDATES, "--loads: give --method detmax", UsageError)
-        require(view is None, "--loads: with a [camera] loads are not chosen; leave one of them out", UsageError)
+        _check_loads(settings, limits)
         assert isinstance(jacobian, Observation)
         pairs = loaded_candidates(jacobian, limits, possible, settings.loads, existing_q)
         selection = select_poses(pairs.jacobians, m, search, existing=pairs.before, map=map, progress=progress)
@@ -243,11 +231,7 @@ def choose(
     if pairs is not None:
         assert selection.indices is not None and isinstance(jacobian, Observation)
         outlook, loads = _loaded_outlook(jacobian, limits, search, selection, pairs)
-        notes += [remark for remark in (without_masses(chain),) if remark]
-        if existing_q is not None:
-            notes.append("the existing poses count as measured without load")
-        if loads.excluded:
-            notes.append(f"{loads.excluded} pairs of pose and load exceed a joint's largest torque and were left out")
+        notes += _remarks_on_loads(chain, loads, existing_q is not None)
         selection = replace(selection, indices=pairs.pose[selection.indices])
     else:
         outlook = _outlook(jacobian, limits, search, driven.q, exchange, comparable, numbers is None)
@@ -267,6 +251,64 @@ def choose(
         by_images=view is not None,
         loads=loads,
     )
+
+
+def _possible_poses(
+    candidates: Candidates | None,
+    chain: Chain,
+    space: SearchSpace,
+    limits: Limits,
+    settings: SelectionSettings,
+    m: int,
+    progress: Progress | None,
+) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
+    """Return the poses (N, n) [rad or m] to choose from, with their numbers among the candidates, and notes.
+
+    The numbers are None where poses are drawn.
+
+    Args:
+        candidates, settings, m, progress: arguments of `choose`.
+        chain: the arm.
+        space: the space of poses.
+        limits: limits of poses, with the camera's.
+    """
+    view = limits.camera
+    if candidates is not None:
+        require(view is None, "candidates: with a [camera], views of the board are drawn; leave them out", UsageError)
+        offered, numbers = _feasible_candidates(candidates, space, chain, settings, m)
+        infeasible = len(offered) - len(numbers)
+        notes = [f"{infeasible} of the {len(offered)} candidates break the constraints"] * bool(infeasible)
+        return offered[numbers], numbers, notes
+    if view is None:
+        return _draw_feasible(space, limits, settings), None, []
+    if progress:
+        progress(0, 1, "views of the board")
+    return _draw_views(view, space, limits, settings, m), None, []
+
+
+def _check_loads(settings: SelectionSettings, limits: Limits) -> None:
+    """Raise a UsageError where loads cannot be chosen together with poses."""
+    require(settings.method in METHODS_BY_CANDIDATES, "--loads: give --method detmax", UsageError)
+    is_by_points = limits.camera is None
+    require(is_by_points, "--loads: with a [camera] loads are not chosen; leave one of them out", UsageError)
+
+
+def _remarks_on_loads(chain: Chain, loads: LoadOutlook, has_existing: bool) -> list[str]:
+    """Return notes on poses that were chosen together with loads.
+
+    Args:
+        chain: the arm.
+        loads: what was chosen.
+        has_existing: whether poses were measured earlier.
+    """
+    notes = []
+    if without_masses(chain):
+        notes.append(without_masses(chain))
+    if has_existing:
+        notes.append("the existing poses count as measured without load")
+    if loads.excluded:
+        notes.append(f"{loads.excluded} pairs of pose and load exceed a joint's largest torque and were left out")
+    return notes
 
 
 def _feasible_candidates(
