@@ -192,8 +192,6 @@ def _parted_poses(block: Poses, arm: np.ndarray) -> list[Finding]:
         block: the poses.
         arm: (m, 4, 4) poses of the tip in the base.
     """
-    if len(block) < 2 * MIN_PART:
-        return []
     measured = from_quaternion(block.position, block.quaternion)
     end = len(arm)
     step = pose_steps.small_step(arm, measured, place_pose(arm, measured)) or _large_step(arm, measured)
