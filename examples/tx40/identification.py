@@ -38,6 +38,7 @@ from calib.identification.closed_loop.controllers import identify_controller, pd
 from calib.identification.closed_loop.instrumental import Instrumental, Round, identify_instrumental
 from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
 from calib.identification.methods.parameter_constraints import hold, make_constraints
+from calib.identification.rows import ObservationRows
 from calib.simulation import known_robots
 from calib.simulation.known_robots import trapezoidal
 from calib.toolkit.recordings import FilterOptions, Recording, make_motion
@@ -67,12 +68,13 @@ SLIDES = {
 
 @dataclass(frozen=True)
 class Log:
-    """One recorded motion: what was asked, what is true, positions as logged, and the case that identification sees."""
+    """One recorded motion: what was asked, what is true, positions as logged, and what identification sees of them."""
 
     reference: Reference
     run: SimulatedRun
     seen: np.ndarray
     case: Case
+    rows: ObservationRows
 
 
 @dataclass(frozen=True)
@@ -111,10 +113,14 @@ def references(quick: bool, seed: int) -> tuple[Reference, list[Reference]]:
     return training, [draw(1001), draw(1002), moves]
 
 
-def record(study: Study, reference: Reference, kind: str, number: int) -> Log:
-    """Simulate a motion with noise, and log it."""
+def unmodelled(study: Study, reference: Reference) -> np.ndarray:
+    """Return the size of the torque that no model holds (n,) [N m], from the torque of a motion without noise."""
     silent = simulate(study.plant, study.controller, reference, Sensing(every=EVERY))
-    push = UNMODELLED * np.sqrt(np.mean(silent.torque**2, axis=0))
+    return UNMODELLED * np.sqrt(np.mean(silent.torque**2, axis=0))
+
+
+def record(study: Study, reference: Reference, push: np.ndarray, kind: str, number: int) -> Log:
+    """Simulate a motion with noise and unmodelled torque of a size, and log it."""
     sensing = Sensing(np.deg2rad(1e-4), 0.0, 0.05, push, push_band=10.0, every=EVERY)
     if kind == "in the loop":
         sensing = replace(sensing, sigma_q=LOOP, q_band=LOOP_BAND)
@@ -123,7 +129,8 @@ def record(study: Study, reference: Reference, kind: str, number: int) -> Log:
     if kind == "degraded":
         seen = seen + DEGRADED * np.random.default_rng([study.seed, number, 7]).normal(size=seen.shape)
     recording = Recording(run.t, seen, run.tau, "torque", tuple(f"joint_{j + 1}" for j in range(6)), file=kind)
-    return Log(reference, run, seen, make_case(kind, make_motion(recording, FILTERS)))
+    case = make_case(kind, make_motion(recording, FILTERS))
+    return Log(reference, run, seen, case, observe(study.model, study.base.kept, case, case.motion.decimator))
 
 
 def relative(target: np.ndarray, predicted: np.ndarray) -> tuple[float, list[float]]:
@@ -133,10 +140,9 @@ def relative(target: np.ndarray, predicted: np.ndarray) -> tuple[float, list[flo
     return float(100.0 * np.linalg.norm(gone) / np.linalg.norm(size)), joints.tolist()
 
 
-def with_measured(study: Study, log: Log, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def with_measured(log: Log, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return decimated torque and prediction W x, W from the log."""
-    rows = observe(study.model, study.base.kept, log.case, log.case.motion.decimator)
-    return rows.target, rows.matrix @ values
+    return log.rows.target, log.rows.matrix @ values
 
 
 def with_simulated(
@@ -167,7 +173,7 @@ def judge(
 
     def predicted(name: str, log: Log) -> tuple[np.ndarray, np.ndarray]:
         return (
-            with_measured(study, log, values[name])
+            with_measured(log, values[name])
             if name.endswith("LS")
             else with_simulated(study, log, values[name], controller)
         )
@@ -227,7 +233,7 @@ def estimate(study: Study, log: Log, controller: LoopController, method: str) ->
 
 def essential_count(study: Study, training: Log) -> dict[str, Any]:
     """Return the number of base parameters that an F-test keeps on clean data (the slides: 27 of 60)."""
-    rows = observe(study.model, study.base.kept, training.case, training.case.motion.decimator)
+    rows = training.rows
     samples, joints, p = rows.matrix.shape
     group = np.repeat(np.arange(joints), samples)
     matrix, target = rows.matrix.transpose(1, 0, 2).reshape(-1, p), rows.target.T.ravel()
@@ -259,9 +265,10 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
         "by_construction": ["unmodelled torque", "noise of the degraded data", "offsets", "truth"],
         "slides": SLIDES,
     }
+    pushes = [unmodelled(study, reference) for reference in (training, *others)]
     for kind in KINDS[: 2 if quick else None]:
-        log = record(study, training, kind, 0)
-        rest = [record(study, reference, kind, number + 1) for number, reference in enumerate(others)]
+        motions = enumerate(zip((training, *others), pushes))
+        log, *rest = (record(study, reference, push, kind, number) for number, (reference, push) in motions)
         if kind == "clean":
             metrics["essential"] = essential_count(study, log)
         results = {name: estimate(study, log, study.controller, name) for name in ("IV", "PC-IV", "DIDIM")}
@@ -319,7 +326,7 @@ def draw(study: Study, log: Log, found: Instrumental, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     series = {
-        "LS": np.subtract(*with_measured(study, log, found.ordinary.estimate.values)),
+        "LS": np.subtract(*with_measured(log, found.ordinary.estimate.values)),
         "IV": np.subtract(*with_simulated(study, log, found.fit.estimate.values, study.controller)),
     }
     figure, axes = plt.subplots(3, 6, figsize=(15, 7))
