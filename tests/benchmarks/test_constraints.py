@@ -94,13 +94,12 @@ def test_constrained_instruments(recorded, name, free):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [3, 8])
-def test_hardly_stable_step_is_no_dead_end(seed):
+def test_hardly_stable_step_is_no_dead_end():
     """Whichever way the noise, or the processor's kernels, lead the iterations: the bound binds, and the rest fits.
 
-    With these seeds a quarter of the second step could be simulated, and nothing further from there.
+    With this seed a quarter of the second step could be simulated, and nothing further from there.
     """
-    recorded = simulated(seed, 10.0)
+    recorded = simulated(8, 10.0)
     constraints = make_constraints(
         ConstraintSettings(bounds={"ZZ2R": (-np.inf, -0.15)}, signs=False), MODEL, BASE, BASE.names,
         [MODEL.columns[k - MODEL.inertial] if k >= MODEL.inertial else None for k in BASE.kept],
