@@ -39,14 +39,56 @@ def fill_regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, 
     """
     from calib.dynamics import kernels
 
+    amount = _amounts(bodies, q)
+    v = np.ascontiguousarray(v.T)
+    a = np.ascontiguousarray(a.T)
+    kernels.regressor(bodies.links, bodies.constants, bodies.order, amount, v, a, out)
+
+
+def regressor_products(
+    bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, weights: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the torques Y χ (N, n) and the sums Σ weights · Y (10 B,) over samples and joints, without forming Y.
+
+    The result equals that by `regressor` at a fraction of the cost.
+
+    Args:
+        bodies: the robot's bodies.
+        parameters: (10 B,) standard parameters χ.
+        q, v, a: (N, n) joint motion [rad or m, and per s, per s²].
+        weights: (N, n) weight of each torque.
+    """
+    from calib.dynamics import kernels
+
+    q, v, a = _states(bodies, q=q, v=v, a=a)
+    weights = shaped(weights, q.shape, "weights of the torques")
+    chi = kernel_parameters(bodies, parameters)
+    torques = np.zeros((bodies.n, len(q)))
+    sums = np.zeros((bodies.count, 10, kernels.L))
+    kernels.products(
+        bodies.links,
+        bodies.constants,
+        chi,
+        _amounts(bodies, q),
+        np.ascontiguousarray(v.T),
+        np.ascontiguousarray(a.T),
+        np.ascontiguousarray(weights.T),
+        torques,
+        sums.reshape(bodies.count, -1),
+    )
+    pull = np.empty((bodies.count, 10))
+    np.put_along_axis(pull, bodies.order, sums.sum(axis=2), axis=1)
+    return torques.T, pull.ravel()
+
+
+def _amounts(bodies: Bodies, q: np.ndarray) -> np.ndarray:
+    """Return the joint position (B, N) that moves each body [rad or m], below `MAX_ANGLE`, at positions q (N, n)."""
     coordinates = q.T[bodies.coordinates]
     amount = coordinates * bodies.scales[:, None]
     if np.abs(amount).max(initial=0.0) >= MAX_ANGLE:
         is_angle = bodies.kinds[:, None] == REVOLUTE
         amount = np.where(is_angle, np.remainder(amount, 2 * np.pi), amount)
-    v = np.ascontiguousarray(v.T)
-    a = np.ascontiguousarray(a.T)
-    kernels.regressor(bodies.links, bodies.constants, bodies.order, amount, v, a, out)
+    return amount
 
 
 def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:

@@ -61,8 +61,8 @@ MIN_PIECE = 32
 """Decimated samples of such a piece, at least."""
 PIECE = 4096
 """Samples of such a piece at the full rate, about."""
-BLOCK = 256
-"""Samples at a time: the regressor of so many stays in the processor's cache."""
+BLOCK = 4096
+"""Samples at a time: their states stay in the processor's cache."""
 CHUNK = 2000
 """Decimated samples at a time, where each needs its own line of a matrix."""
 NOTHING = 0.01
@@ -491,21 +491,18 @@ def _differences(
     unprojected = replace(torque_rows, projection=None)
     joint_residual = unprojected.fold(joint_residual, (BODIES,))[:, :, 0]
 
-    change = np.zeros((len(pairs), n, len(q)))
+    change = np.zeros((len(pairs), len(q), n))
     pull = np.zeros((inertial, len(pairs)))
     for start in range(0, len(q), BLOCK):
-        part = slice(start, min(start + BLOCK, len(q)))
-        block_residual = np.ascontiguousarray(joint_residual[part].T).ravel()
-        # One array for all pairs: what is zero in one regressor is so in all of them.
-        out = np.zeros((inertial, n, min(BLOCK, len(q) - start)))
-        regressor = out.reshape(inertial, -1)
+        part = slice(start, start + BLOCK)
+        states = (q[part], v[part], a[part])
         for k, pair in enumerate(pairs):
             for bodies, factor in zip(pair, (0.5 / STEP, -0.5 / STEP)):
-                rigid_body.fill_regressor(bodies, q[part], v[part], a[part], out)
-                change[k, :, part] += factor * (parameters @ regressor).reshape(n, -1)
-                pull[:, k] += factor * (regressor @ block_residual)
+                torque, sums = rigid_body.regressor_products(bodies, parameters, *states, joint_residual[part])
+                change[k, part] += factor * torque
+                pull[:, k] += factor * sums
     acts = (BODIES,) * len(pairs)
-    rows = torque_rows.observe(change.transpose(2, 1, 0), acts, q, v)
+    rows = torque_rows.observe(change.transpose(1, 2, 0), acts, q, v)
     of_bodies = base.kept < inertial
     base_pull = np.zeros((base.b, len(pairs)))
     base_pull[of_bodies] = (pull * onboard[:, None])[base.kept[of_bodies]]
