@@ -91,8 +91,10 @@ def test_products_with_the_regressor(name):
     q[0] = 2e6
     chi = random.normal(size=10 * bodies.count)
     formed = rigid_body.regressor(bodies, q, v, a)
-    torque, sums = rigid_body.regressor_products(bodies, chi, q, v, a, weights)
-    assert relative(torque, formed @ chi) < 1e-13
+    lighter = bodies.with_gravity(0.5 * bodies.gravity)
+    (torque, sums), (other, _) = rigid_body.regressor_products([bodies, lighter], chi, q, v, a, weights)
+    assert relative(other.T, rigid_body.regressor(lighter, q, v, a) @ chi) < 1e-13
+    assert relative(torque.T, formed @ chi) < 1e-13
     assert relative(sums, np.tensordot(weights, formed, 2)) < 1e-13
 
 

@@ -491,18 +491,21 @@ def _differences(
     unprojected = replace(torque_rows, projection=None)
     joint_residual = unprojected.fold(joint_residual, (BODIES,))[:, :, 0]
 
-    change = np.zeros((len(pairs), len(q), n))
+    neighbours = [bodies for pair in pairs for bodies in pair]
+    factors = (0.5 / STEP, -0.5 / STEP)
+    change = np.zeros((len(pairs), n, len(q)))
     pull = np.zeros((inertial, len(pairs)))
     for start in range(0, len(q), BLOCK):
         part = slice(start, start + BLOCK)
         states = (q[part], v[part], a[part])
-        for k, pair in enumerate(pairs):
-            for bodies, factor in zip(pair, (0.5 / STEP, -0.5 / STEP)):
-                torque, sums = rigid_body.regressor_products(bodies, parameters, *states, joint_residual[part])
-                change[k, part] += factor * torque
-                pull[:, k] += factor * sums
+        products = rigid_body.regressor_products(neighbours, parameters, *states, joint_residual[part])
+        for number, (torque, sums) in enumerate(products):
+            k = number // 2
+            factor = factors[number % 2]
+            change[k, :, part] += factor * torque
+            pull[:, k] += factor * sums
     acts = (BODIES,) * len(pairs)
-    rows = torque_rows.observe(change.transpose(1, 2, 0), acts, q, v)
+    rows = torque_rows.observe(change.transpose(2, 1, 0), acts, q, v)
     of_bodies = base.kept < inertial
     base_pull = np.zeros((base.b, len(pairs)))
     base_pull[of_bodies] = (pull * onboard[:, None])[base.kept[of_bodies]]
