@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -563,7 +564,6 @@ def _cross_validation(
     if candidates.prior is not None:
         prior_rows = np.sqrt(TEMPERING) * candidates.prior.widened(len(all_terms))
     blocks = 1 + max(int(part.block.max(initial=-1)) for part in rows)
-    case_regimes = regimes(rows, candidates.cases, decimator)
     validation = CrossValidation(
         data,
         rows=rows[0].target.shape[1],
@@ -572,6 +572,6 @@ def _cross_validation(
         inflation=candidates.inflation,
         group=np.array(groups),
         prior=prior_rows,
-        regimes=case_regimes,
+        regimes=partial(regimes, rows, candidates.cases, decimator),
     )
     return validation, columns_of
