@@ -24,7 +24,6 @@ are regularised towards zero, how finely frequency is resolved, and whether an o
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -70,7 +69,6 @@ SKIPPED_START = 0.5
 """Time excluded at the beginning of a recording, where the robot starts [s]."""
 
 
-Turns = TypeVar("Turns", int, np.ndarray)
 Wave = tuple[int, int]
 """Joint whose gear turns, and order per turn of it."""
 
@@ -234,7 +232,7 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     power = {}
     for gear in turns:
         if gear != joint:
-            orders = _lobe_orders(turns[gear])
+            orders = _lobe_orders(np.array(turns[gear]))
             power[gear] = np.maximum(coherence_at(track, gear, residual, orders), 0.0).sum()
     gears = [joint]
     if power:
@@ -403,14 +401,14 @@ def coherence(track: GearTravel, gear: int, residual: np.ndarray) -> np.ndarray:
     return result
 
 
-def coherence_at(track: GearTravel, gear: int, residual: np.ndarray, orders: Sequence[int]) -> np.ndarray:
-    """Return the coherence S(k) of a few orders k of a gear, (len(orders),), equal to those by `coherence`.
+def coherence_at(track: GearTravel, gear: int, residual: np.ndarray, orders: np.ndarray) -> np.ndarray:
+    """Return the coherence S(k) of K orders k of a gear, (K,), equal to those by `coherence`.
 
     Args:
         track: motion of the gears.
         gear: joint of the gear, from 0.
         residual: (N,) high-frequency part of an unexplained torque.
-        orders: orders k per turn.
+        orders: (K,) orders k per turn.
     """
     cell, speed_bin = _cells(track, gear)
     in_block = np.unique(track.block)[:, None] == track.block
@@ -461,12 +459,12 @@ def _lobes(power: np.ndarray) -> np.ndarray:
         power: coherence S(k) of the orders k = 0, 1, …, from `coherence`.
     """
     positive = np.maximum(power, 0.0)
-    return positive[np.stack(_lobe_orders(np.array(TURNS)))].sum(axis=0)
+    return positive[_lobe_orders(np.array(TURNS))].sum(axis=0)
 
 
-def _lobe_orders(turns: Turns) -> tuple[Turns, Turns, Turns]:
-    """Return the orders per turn N, 2 N and 2 N + 2 of a gear with N motor turns per turn."""
-    return turns, 2 * turns, 2 * turns + 2
+def _lobe_orders(turns: np.ndarray) -> np.ndarray:
+    """Return the orders per turn N, 2 N and 2 N + 2 (3, ...) of gears with N motor turns per turn."""
+    return np.stack([turns, 2 * turns, 2 * turns + 2])
 
 
 def _climb(
