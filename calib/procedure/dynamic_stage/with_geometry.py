@@ -19,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import erfc
@@ -32,12 +33,14 @@ from calib.identification.methods.least_squares import LeastSquares
 from calib.identification.prediction import predict
 from calib.identification.registry import method_named
 from calib.identification.uncertainty.geometry_uncertainty import GeometryUncertainty
-from calib.identification.uncertainty.joint_estimate import JointEstimate, identify_jointly
 from calib.procedure.dynamic_stage.held_out_poses import HeldOutErrors, held_out_errors
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.verdict import model_findings
 from calib.robot.calibrated import CalibratedChain
 from calib.units import TORQUE
+
+if TYPE_CHECKING:
+    from calib.identification.uncertainty.joint_estimate import JointEstimate
 
 # ratio of squared errors on held-out torques, and on held-out poses, up to which the joint estimate is not worse
 MAX_HELD_OUT = 1.001
@@ -123,6 +126,8 @@ def run_jointly(
     Raises:
         UsageError: for another robot than an arm, methods without rows, or torques of unknown gain.
     """
+    from calib.identification.uncertainty.joint_estimate import identify_jointly  # slow to load
+
     settings = inputs.options.settings
     _require_usable(inputs)
     plain = identify(inputs.robot, inputs.cases, settings, say)

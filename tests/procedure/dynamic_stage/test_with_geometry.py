@@ -12,6 +12,7 @@ import without_figures
 from calib.folders import read_covariance
 from calib.identification.identify_options import IdentifyOptions
 from calib.identification.settings import IdentificationSettings
+from calib.identification.uncertainty import joint_estimate
 from calib.identification.uncertainty.joint_estimate import JointEstimate, JointIdentification
 from calib.procedure.dynamic_stage import with_geometry
 from calib.procedure.dynamic_stage.held_out_poses import HeldOutErrors
@@ -89,7 +90,7 @@ def test_a_geometry_that_predicts_worse_is_not_delivered(monkeypatch):
     monkeypatch.setattr(with_geometry, "identify", lambda *arguments: plain)
     monkeypatch.setattr(with_geometry, "_doubted_payloads", lambda *arguments: ())
     answer = JointIdentification(worse, inputs.robot, plain)
-    monkeypatch.setattr(with_geometry, "identify_jointly", lambda *arguments, **names: answer)
+    monkeypatch.setattr(joint_estimate, "identify_jointly", lambda *arguments, **names: answer)
     used, found, result = with_geometry.run_jointly(inputs, print)
     assert used is inputs and found is plain and not result.delivered
     assert [item.code for item in result.noticed] == ["geometry-not-better"]
@@ -148,7 +149,7 @@ def test_held_out_poses_of_the_fit_judge_the_geometry(monkeypatch, poses, code, 
     monkeypatch.setattr(with_geometry, "_doubted_payloads", lambda *arguments: ())
     monkeypatch.setattr(with_geometry, "held_out_errors", lambda *arguments: poses)
     answer = JointIdentification(estimate(), robot, identification)
-    monkeypatch.setattr(with_geometry, "identify_jointly", lambda *arguments, **names: answer)
+    monkeypatch.setattr(joint_estimate, "identify_jointly", lambda *arguments, **names: answer)
     monkeypatch.setattr(JointEstimate, "regrouped", lambda joint, chain: joint)
     *_, result = with_geometry.run_jointly(inputs, print)
     assert result.delivered == delivered and result.poses == poses
