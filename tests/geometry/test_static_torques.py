@@ -298,3 +298,39 @@ def test_files_of_a_few_rows_each_or_of_a_single_pose_do_not_contradict_each_oth
         fit, agreeing, findings = agreeing_torques(chain, files)
         assert findings == [] and list(agreeing) == files
         assert len(fit.loads) == len(files)
+
+
+@pytest.mark.parametrize(
+    "heads, says",
+    [
+        (HEAD[:15], "those of joint6, joint7 are missing"),
+        ([*HEAD[:10], *(f"{name} [A]" for name in HEAD[10:])], "their columns are in A"),
+    ],
+)
+def test_torques_that_are_not_read_are_explained(arm, chain, tmp_path, heads, says):
+    measured = block(arm.write(tmp_path / "some.csv", arm.table(10, 1)[:, : len(heads)], heads))
+    fit, _, (unused,) = agreeing_torques(chain, [measured])
+    assert fit is None and says in unused.values["reason"]
+
+
+def test_joints_without_a_sensor_have_empty_columns(chain, folder):
+    def unread(torque):
+        torque[:, 5:] = np.nan
+
+    fit, _, findings = agreeing_torques(chain, [faulty(folder, unread)])
+    assert findings == [] and np.isinf(fit.sigma[5:]).all()
+    loaded = block(folder / "loaded.csv")
+    _, contradicting = without_contradicting_torques(loaded, fit, [loaded])
+    assert contradicting == []
+    (payload,) = load_findings(loaded, fit)
+    assert payload.values["mass"] == pytest.approx(2.5, abs=0.15)
+    assert np.isfinite(driven(loaded, fit).torque).all()
+
+
+def test_a_reversed_column_is_named_beside_joints_without_a_sensor(chain, folder):
+    def unread(torque):
+        torque[:, 5:] = np.nan
+        reverse(torque)
+
+    fit, _, (unused,) = agreeing_torques(chain, [faulty(folder, unread)])
+    assert fit is None and "tau2 reversed" in unused.values["reason"]

@@ -69,6 +69,8 @@ def agreeing_torques(
     """
     result = list(blocks)
     findings: list[Finding] = []
+    for block in blocks:
+        findings += unread_torques(block)
     several = sum(block.measured_torque is not None for block in blocks) > 1
     if several and len(chain.driven) == chain.n:
         for number, block in enumerate(blocks):
@@ -81,6 +83,14 @@ def agreeing_torques(
         findings += _drop_odd_files(chain, result)
     gravity, faults = gravity_fit(chain, result)
     return gravity, tuple(result), findings + faults
+
+
+def unread_torques(block: PoseMeasurements) -> list[Finding]:
+    """Return a finding on torques that are in a block's file, but not read."""
+    if block.torque_fault is None:
+        return []
+    _, remark = _without_torques(block, block.torque_fault)
+    return [remark]
 
 
 def without_contradicting_torques(

@@ -65,7 +65,8 @@ class GravityFit:
     Attributes:
         chain: the arm with the fitted masses; single parameters are not right, their torques are.
         sign: 1.0 where the sensors count the torque that balances the load, -1.0 where they count the load.
-        offset, sigma: (n,) offset of each sensor, and standard deviation of its torques about the model [N m].
+        offset, sigma: (n,) offset of each sensor, and standard deviation of its torques about the model [N m]; infinite
+            for a joint whose torques were not read.
         loads: for each fitted file, its load (4,): first moments [kg m] and mass [kg] in the last body's frame.
         mass_sigmas: for each fitted file, the standard deviation of the load's mass [kg].
         covariance: (5 n, 5 n) of first moments and masses (4 n), and of the sensors' offsets.
@@ -354,8 +355,7 @@ def _unexplained(fit: GravityFit, measured: Sequence[PoseMeasurements]) -> float
         sizes.append(torque)
     torque = np.concatenate(sizes)
     residual = np.concatenate(errors)
-    varying = torque - np.nanmean(torque, axis=0)
-    return float(np.sqrt(np.nansum(residual**2) / max(float(np.nansum(varying**2)), 1e-12)))
+    return float(np.sqrt(np.nansum(residual**2) / max(float(np.sum(_variation(torque) ** 2)), TINY)))
 
 
 def load_deviations(chain: Chain) -> np.ndarray:
@@ -402,13 +402,14 @@ def _fitted(
         columns.append(of_load)
         deviations = np.concatenate([deviations, of_load_prior])
     matrix = np.concatenate(columns, axis=2)
-    sigma = np.maximum(np.nanstd(np.where(finite, torque, np.nan), axis=0), MIN_SPREAD)
+    squares = _variation(np.where(finite, torque, np.nan)) ** 2
+    sigma = np.maximum(np.sqrt(squares.sum(axis=0) / np.maximum(finite.sum(axis=0), 1)), MIN_SPREAD)
     values, covariance = np.zeros(matrix.shape[2]), np.eye(matrix.shape[2])
     weights = finite.astype(float)
     for _ in range(ROUNDS):
         values, covariance = most_probable(matrix, torque, weights / sigma, deviations)
         residual = np.where(finite, torque - matrix @ values, np.nan)
-        sigma = np.maximum(spreads(residual), MIN_SPREAD)
+        sigma = np.where(finite.any(axis=0), np.maximum(spreads(residual), MIN_SPREAD), np.inf)
         weights = (np.abs(residual) < MAX_RESIDUAL * sigma).astype(float)
     masses = prior + values[: 4 * n].reshape(n, 4)
     sigmas = [0.0]

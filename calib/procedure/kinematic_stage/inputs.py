@@ -25,7 +25,7 @@ from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.stated_compliance import StatedCompliance, check_torques, read_compliance
 from calib.geometry.repeatability import repeated, repeated_rows, without_copies
-from calib.geometry.static_torques.agreement import agreeing_torques, without_contradicting_torques
+from calib.geometry.static_torques.agreement import agreeing_torques, unread_torques, without_contradicting_torques
 from calib.geometry.static_torques.gravity_fit import GravityFit
 from calib.geometry.static_torques.sources import MEASURED, driven, load_findings, with_stated_load
 from calib.procedure.kinematic_stage.settings import FitSettings
@@ -270,6 +270,7 @@ def with_unseen(
             name = _free_name(unseen, block.file)
             block, unseen_readings = without_unseen(inputs.weighed, block, "copies" in options.accept)
             noticed += unseen_readings
+            noticed += unread_torques(block)
             if inputs.gravity is not None:
                 block, unused_torques = without_contradicting_torques(block, inputs.gravity, inputs.fit)
                 noticed += [*unused_torques, *load_findings(block, inputs.gravity)]
