@@ -116,6 +116,7 @@ class Motion:
         sampling, cutoffs: reports of resampling and of the choice of cut-offs.
         notes: remarks for the user.
         jumps, faults: those of the recording.
+        hashes: hashes of the recording's samples, sorted, by which it is recognised; None: not computed.
         located: time at which a designed motion, used as the reference, begins [s]; None for another reference.
     """
 
@@ -149,6 +150,7 @@ class Motion:
     jumps: tuple[str, ...] = ()
     faults: tuple[ColumnFault, ...] = ()
     located: float | None = None
+    hashes: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.t)
