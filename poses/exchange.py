@@ -5,7 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .design import Design, Pool, best_addition, best_removal, design_of, first_swap, with_added, with_removed
+from .design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
+from .swaps import first_swap
 
 # function called with each design of the requested size that is better than all before
 Report = Callable[[Design], None]
@@ -14,7 +15,7 @@ Report = Callable[[Design], None]
 TOLERANCE = 1e-9
 # members for which candidates are compared at once: largest number, and largest number of their products with all
 # candidates, which the processor's cache holds
-AT_ONCE = 16
+MEMBERS_AT_ONCE = 16
 NUMBERS_AT_ONCE = 1_000_000
 
 
@@ -47,8 +48,7 @@ def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: 
         report: called with every improved design; None for no report.
         sweeps: largest number of passes over all members.
     """
-    rows = pool.z.shape[1]
-    most = max(1, min(AT_ONCE, NUMBERS_AT_ONCE // (rows**2 * len(pool.z))))
+    max_count = _members_at_once(pool)
     # members in whose place no candidate is better, of the design as it is
     settled: set[int] = set()
     for _ in range(sweeps):
@@ -61,7 +61,7 @@ def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: 
             if swap is None:
                 settled.update(block)
                 waiting = waiting[count:]
-                count = min(2 * count, most)
+                count = min(2 * count, max_count)
                 continue
             waiting = waiting[block.index(swap.leaving) + 1 :]
             count = max(count // 2, 1)
@@ -73,6 +73,13 @@ def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: 
         if design.logdet <= before + TOLERANCE:
             return design
     return design
+
+
+def _members_at_once(pool: Pool) -> int:
+    rows = pool.z.shape[1]
+    numbers = rows**2 * len(pool.z)
+    count = min(MEMBERS_AT_ONCE, NUMBERS_AT_ONCE // numbers)
+    return max(count, 1)
 
 
 def detmax(pool: Pool, design: Design, report: Report | None = None, *, longest: int = 6, failures: int = 40) -> Design:
