@@ -58,7 +58,7 @@ def column_fault(regressor: np.ndarray, torque: np.ndarray, finite: np.ndarray) 
         torque: (m, n) measured torques [N m]; zero where none was measured.
         finite: (m, n) whether a torque was measured; nowhere for a joint without a sensor, which is left out.
     """
-    sensed = finite.any(axis=0)
+    sensed = np.asarray(finite.any(axis=0))
     rows = finite[:, sensed].all(axis=1)
     if rows.sum() < regressor.shape[2]:
         return None
