@@ -8,7 +8,10 @@ so that all candidates are compared by small blocks (rows, rows). The scores d_i
 updated by one product with a matrix of few rows.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +20,10 @@ from .scaled_jacobians import log_det
 # multiple of the identity matrix (the mean information of one candidate) added to every design, so that sets without
 # full rank can be compared (our choice); values reported to the user do not contain it
 RIDGE = 1e-6
+# largest number of gains computed at once, for several members; more are rarely needed
+MOST_GAINS = 500
+# bound of the relative error of sums of squares in single precision
+COARSE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -28,6 +35,28 @@ class Pool:
 
     z: np.ndarray
     known: np.ndarray
+
+    @cached_property
+    def columns(self) -> np.ndarray:
+        """Jacobians as (p, rows · N), candidates last: products with all of them are then sums along the memory."""
+        p = self.z.shape[2]
+        return np.ascontiguousarray(self.z.transpose(2, 1, 0)).reshape(p, -1)
+
+    @cached_property
+    def coarse_columns(self) -> np.ndarray:
+        """`columns` in single precision."""
+        return self.columns.astype(np.float32)
+
+    def squares(self, factor: np.ndarray) -> np.ndarray:
+        """Return the sums of squares (N,) of z Fᵀ of all candidates, for a matrix F (k, p)."""
+        spread = (factor @ self.columns).reshape(-1, len(self.z))
+        return np.einsum("ij,ij->j", spread, spread)
+
+    def coarse_squares(self, factors: np.ndarray) -> np.ndarray:
+        """Return the sums of squares (K, N) as of `squares`, for matrices F (K, k, p), in single precision."""
+        flat = factors.reshape(-1, factors.shape[2]).astype(np.float32)
+        spread = (flat @ self.coarse_columns).reshape(len(factors), -1, len(self.z))
+        return np.einsum("kij,kij->kj", spread, spread)
 
 
 @dataclass(frozen=True)
@@ -62,13 +91,10 @@ def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
     ridge = RIDGE * np.eye(p)
     matrix = pool.known + ridge + rows.T @ rows
     root = np.linalg.inv(np.linalg.cholesky(matrix))
-    rows_spread = pool.z.reshape(-1, p) @ root.T
-    spread = rows_spread.reshape(count, -1)
     is_member = np.zeros(count, dtype=bool)
     is_member[list(members)] = True
-    scores = np.einsum("ij,ij->i", spread, spread)
     logdet = float(log_det(matrix))
-    return Design(members, root.T @ root, scores, logdet, is_member)
+    return Design(members, root.T @ root, pool.squares(root), logdet, is_member)
 
 
 def with_added(pool: Pool, design: Design, i: int) -> Design:
@@ -93,7 +119,7 @@ def with_removed(pool: Pool, design: Design, i: int) -> Design:
     return _changed(pool, design, i, -1.0)
 
 
-def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int = 48) -> tuple[int, float]:
+def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int = 8) -> tuple[int, float]:
     """Return the candidate outside the design that raises log det most, and that gain of log det.
 
     The search is exact, though only few candidates are evaluated. With B (r, r) = z C zᵀ of a candidate, by the
@@ -129,6 +155,73 @@ def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int
         first *= 4
 
 
+class Swap(NamedTuple):
+    """A member that leaves a design, and the design with a candidate in its place."""
+
+    leaving: int
+    design: Design
+
+
+def first_swap(pool: Pool, design: Design, members: Sequence[int], least_gain: float) -> Swap | None:
+    """Return the best swap of the first member that has one, None where none raises log det by more than `least_gain`.
+
+    For many members at once, the candidates that may replace them are found by the scores without each member
+    (`best_addition`), in single precision, and their gains are computed together.
+
+    Args:
+        pool: the candidates.
+        design: the design, which is not changed.
+        members: indices of members of the design.
+        least_gain: smallest gain of log det.
+    """
+    if len(members) == 1:
+        return _swap(pool, design, members[0], least_gain)
+    rows = pool.z.shape[1]
+    half, drop = _without(design, pool.z[list(members)])
+    scores = design.scores + pool.coarse_squares(half)
+    scores[:, design.taken] = -np.inf
+    min_score = rows * np.expm1((least_gain - drop) / rows)
+    number, candidate = np.nonzero(scores * (1.0 + COARSE) > min_score[:, None])
+    if len(number) > MOST_GAINS:
+        middle = len(members) // 2
+        parts = members[:middle], members[middle:]
+        swaps = (first_swap(pool, design, part, least_gain) for part in parts)
+        return next(filter(None, swaps), None)
+    z = pool.z[candidate]
+    across = z @ half[number].transpose(0, 2, 1)
+    blocks = z @ design.inverse @ z.transpose(0, 2, 1) + across @ across.transpose(0, 2, 1)
+    gains = log_det(np.eye(rows) + blocks) + drop[number]
+    if not (gains > least_gain).any():
+        return None
+    first = number[gains > least_gain].min()
+    best = np.argmax(np.where(number == first, gains, -np.inf))
+    thinned = with_removed(pool, design, members[first])
+    return Swap(members[first], with_added(pool, thinned, int(candidate[best])))
+
+
+def _swap(pool: Pool, design: Design, member: int, least_gain: float) -> Swap | None:
+    thinned = with_removed(pool, design, member)
+    drop = thinned.logdet - design.logdet
+    candidate, gain = best_addition(pool, thinned, above=least_gain - drop)
+    if candidate < 0 or gain + drop <= least_gain:
+        return None
+    return Swap(member, with_added(pool, thinned, candidate))
+
+
+def _without(design: Design, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return, for each of K members, h (K, rows, p) with C + hᵀh the inverse without it, and the change of log det.
+
+    Args:
+        design: the design.
+        z: (K, rows, p) Jacobians of the members.
+    """
+    zc = z @ design.inverse
+    blocks = np.eye(z.shape[1]) - zc @ z.transpose(0, 2, 1)
+    root = np.linalg.cholesky((blocks + blocks.transpose(0, 2, 1)) / 2)
+    diagonal = np.diagonal(root, axis1=1, axis2=2)
+    return np.linalg.solve(root, zc), 2.0 * np.log(diagonal).sum(axis=1)
+
+
 def best_removal(pool: Pool, design: Design) -> tuple[int, float]:
     """Return the index of the member whose removal reduces log det least, and the (negative) change of log det.
 
@@ -161,21 +254,18 @@ def gains_of(pool: Pool, design: Design, candidates: np.ndarray, sign: float) ->
 
 def _changed(pool: Pool, design: Design, i: int, sign: float) -> Design:
     z = pool.z[i]
-    count, rows, p = pool.z.shape
+    rows = len(z)
     zc = z @ design.inverse
     block = np.eye(rows) + sign * (zc @ z.T)
     root = np.linalg.cholesky((block + block.T) / 2)
     half = np.linalg.solve(root, zc)
-    rows_spread = pool.z.reshape(-1, p) @ half.T
-    spread = rows_spread.reshape(count, -1)
     is_member = design.taken.copy()
     is_member[i] = sign > 0
     if sign > 0:
         members = (*design.members, i)
     else:
         members = tuple(member for member in design.members if member != i)
-    change = np.einsum("ij,ij->i", spread, spread)
-    scores = np.maximum(design.scores - sign * change, 0.0)
+    scores = np.maximum(design.scores - sign * pool.squares(half), 0.0)
     half_logdet = float(np.log(np.diag(root)).sum())
     logdet = design.logdet + 2.0 * half_logdet
     inverse = design.inverse - sign * (half.T @ half)

@@ -597,12 +597,13 @@ def products(links, constants, parameters, amount, v, a, weights, torque, pull):
         parameters: (10 B,) standard parameters χ in the kernels' frames.
         amount: (B, N) joint position that moves each body [rad or m], below 1e6.
         v, a: (n, N) joint velocities and accelerations.
-        weights: (n, N) weights w of the torques.
+        weights: (n, N) weights w of the torques; (0, N): Y χ alone is computed.
         torque: (n, N) the torques Y χ, increased.
         pull: (B, 10 L) increased; the sum of the L numbers of a body's column, in the kernels' frames, is that of Yᵀ w.
     """
     bodies = amount.shape[0]
     count = amount.shape[1]
+    weighted = weights.shape[0] > 0
     joint = np.zeros(5 * L)
     columns = np.empty(10 * L)
     turns = np.empty((bodies, 12 * L))
@@ -624,15 +625,16 @@ def products(links, constants, parameters, amount, v, a, weights, torque, pull):
             )
             _place_lanes(constants, i, joint, turns[i])
             _advance_lanes(turning, joint, turns[i], motion[p + 1], motion[i + 1])
-            _carry_lanes(turns[i], twists[p + 1], twists[i + 1])
-            if c >= 0:
-                axis = (2 if links[i, KIND] == REVOLUTE else 5) * L
-                for lane in range(width):
-                    twists[i + 1, axis + lane] += constants[i, SCALE] * weights[c, start + lane]
-            _project_lanes(motion[i + 1], twists[i + 1], columns)
-            for k in range(10):
-                for lane in range(k * L, k * L + width):
-                    pull[i, lane] += columns[lane]
+            if weighted:
+                _carry_lanes(turns[i], twists[p + 1], twists[i + 1])
+                if c >= 0:
+                    axis = (2 if links[i, KIND] == REVOLUTE else 5) * L
+                    for lane in range(width):
+                        twists[i + 1, axis + lane] += constants[i, SCALE] * weights[c, start + lane]
+                _project_lanes(motion[i + 1], twists[i + 1], columns)
+                for k in range(10):
+                    for lane in range(k * L, k * L + width):
+                        pull[i, lane] += columns[lane]
             _wrench_lanes(parameters[10 * i : 10 * i + 10], motion[i + 1], wrenches[i + 1])
         for i in range(bodies - 1, -1, -1):
             c = links[i, COORDINATE]

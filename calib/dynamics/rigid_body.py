@@ -209,10 +209,20 @@ def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: n
 
     q, v, a = _states(bodies, q=q, v=v, a=a)
     chi = kernel_parameters(bodies, parameters)
-    amount, cosine, sine = _placed(bodies, q)
-    torques = np.zeros_like(q)
-    kernels.inverse_dynamics(bodies.links, bodies.constants, chi, amount, cosine, sine, v, a, torques)
-    return torques
+    unweighted = np.empty((0, len(q)))
+    torques = np.zeros((bodies.n, len(q)))
+    kernels.products(
+        bodies.links,
+        bodies.constants,
+        chi,
+        _amounts(bodies, q),
+        np.ascontiguousarray(v.T),
+        np.ascontiguousarray(a.T),
+        unweighted,
+        torques,
+        np.empty((bodies.count, 0)),
+    )
+    return np.ascontiguousarray(torques.T)
 
 
 def mass_matrix(bodies: Bodies, parameters: np.ndarray, q: np.ndarray) -> np.ndarray:

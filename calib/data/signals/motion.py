@@ -365,11 +365,15 @@ def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
         cutoff: (n,) cut-offs f_q [Hz].
         order: order of the Butterworth filter in one pass.
     """
+    key = (*cutoff.tolist(), order)
+    if key in sampled.filtered:
+        return sampled.filtered[key]
     # By joints, as all that follows reads them.
     result = np.array(sampled.series["q"], order="F")
     for rows in filtering.segments(sampled.segment):
         for j, f in enumerate(cutoff):
             result[rows, j] = filtering.low_pass(result[rows, j], sampled.rate, float(f), order)
+    sampled.filtered[key] = read_only(result)
     return result
 
 

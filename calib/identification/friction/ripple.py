@@ -24,7 +24,6 @@ are regularised towards zero, how finely frequency is resolved, and whether an o
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 
@@ -70,7 +69,6 @@ SKIPPED_START = 0.5
 """Time excluded at the beginning of a recording, where the robot starts [s]."""
 
 
-Turns = TypeVar("Turns", int, np.ndarray)
 Wave = tuple[int, int]
 """Joint whose gear turns, and order per turn of it."""
 
@@ -461,10 +459,11 @@ def _lobes(power: np.ndarray) -> np.ndarray:
         power: coherence S(k) of the orders k = 0, 1, …, from `coherence`.
     """
     positive = np.maximum(power, 0.0)
-    return positive[np.stack(_lobe_orders(np.array(TURNS)))].sum(axis=0)
+    orders = np.array([_lobe_orders(turns) for turns in TURNS])
+    return positive[orders].sum(axis=1)
 
 
-def _lobe_orders(turns: Turns) -> tuple[Turns, Turns, Turns]:
+def _lobe_orders(turns: int) -> tuple[int, int, int]:
     """Return the orders per turn N, 2 N and 2 N + 2 of a gear with N motor turns per turn."""
     return turns, 2 * turns, 2 * turns + 2
 
