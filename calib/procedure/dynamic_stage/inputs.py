@@ -366,6 +366,18 @@ def read_motion(
     return replace(wider, notes=(*motion.notes, note), hashes=hashes)
 
 
+def rows_per_second(band: float, duration: float) -> float:
+    """Return the least number of rows per second with which `read_motion` lets a recording be identified.
+
+    Windows of the decimation take less than `LOST` of a recording, and its band passes.
+
+    Args:
+        band: identification band of the motion [Hz].
+        duration: duration of the recording [s].
+    """
+    return max(2.0 * band / SHARE, WINDOW / (LOST * duration))
+
+
 def _joints(values: np.ndarray) -> tuple[float, ...]:
     return tuple(map(float, values))
 
