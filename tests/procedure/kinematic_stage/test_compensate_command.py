@@ -283,6 +283,7 @@ def test_unsuited_folders_and_words_fail(fitted, here, calib):
         ((fitted, "t.csv", "--tool", "1,2"), "x,y,z"),
         ((fitted, "t.csv", "--dof", "4"), "expected 6, 5"),
         ((fitted, "t.csv", "--start", "1,2"), "6 finite numbers"),
+        ((fitted, "t.csv", "--payload", "heavy"), "--payload heavy: expected a mass [kg], or mass,x,y,z [kg, m]"),
     ):
         code, _, err = calib("compensate", *arguments, "--out", "commands.csv")
         assert code == 2 and said in err, (arguments, err)

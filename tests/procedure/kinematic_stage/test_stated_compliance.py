@@ -54,6 +54,12 @@ def fitted(folder, measured, compliance="", robot="arm.urdf"):
     return calib.fit_geometry(folder / robot, folder / measured, settings, validate=folder / "unseen.csv")
 
 
+@pytest.fixture(scope="module")
+def stated(folder):
+    """A fit of the few poses with the table."""
+    return fitted(folder, "few.csv", JOINT_COMPLIANCE)
+
+
 def unseen_rms(fit):
     (comparison,) = fit.outcome.assessment.validation.values()
     return float(np.sqrt(np.mean(comparison.errors[1].position ** 2)))
@@ -63,9 +69,8 @@ def contradicted(fit):
     return [note for note in fit.outcome.findings.noticed if note.code == "compliance-contradicted"]
 
 
-def test_few_poses_and_the_table_predict_better_than_the_poses_alone(folder, arm):
+def test_few_poses_and_the_table_predict_better_than_the_poses_alone(folder, arm, stated):
     alone = fitted(folder, "few.csv")
-    stated = fitted(folder, "few.csv", JOINT_COMPLIANCE)
     assert unseen_rms(stated) < 0.7 * unseen_rms(alone)
     assert contradicted(stated) == []
     deflection = stated.outcome.selection.fit.cell.deflection
@@ -86,9 +91,18 @@ def test_poses_contradict_a_wrong_table(folder, arm):
     assert contradicted(fitted(folder, "more.csv", JOINT_COMPLIANCE)) == []
 
 
-def test_a_saved_fit_predicts_with_the_compliance(folder, tmp_path):
-    fit = fitted(folder, "few.csv", JOINT_COMPLIANCE)
-    terms = calibrated.read(fit.save(tmp_path / "fit", plots=False)).deflection.terms
+@pytest.mark.slow
+def test_a_table_that_is_too_stiff_is_told_from_what_bearings_would_give(folder, arm):
+    write_compliance(folder / "stiff.csv", arm, 0.3)
+    fit = fitted(folder, "more.csv", "stiff.csv")
+    exceeded = [note for note in fit.outcome.findings.noticed if note.code == "compliance-exceeded"]
+    assert [note.values["joint"] for note in exceeded] == ["joint2", "joint4"]
+    for note in exceeded:
+        assert 2.0 < note.values["times"] < 5.0
+
+
+def test_a_saved_fit_predicts_with_the_compliance(folder, stated, tmp_path):
+    terms = calibrated.read(stated.save(tmp_path / "fit", plots=False)).deflection.terms
     assert [term.basis for term in terms[:2]] == ["torque", "torque"]
     with pytest.raises(UsageError, match="joint corrections of an earlier fit"):
         fitted(folder, "few.csv", JOINT_COMPLIANCE, robot=tmp_path / "fit")
