@@ -148,6 +148,8 @@ class _Null:
         return frozen(np.where(np.isnan(values), self.value, values))
 
 
+# types of values that are plain JSON as they are; numbers may have to become null
+SCALARS = frozenset((str, int, bool, type(None)))
 Number = Annotated[float, _Null()]
 """A number of a record that may be NaN or infinite; null in JSON, and NaN when read back."""
 Array = Annotated[np.ndarray, _Null(array=True)]
@@ -167,6 +169,11 @@ def plain(value: object, null: bool = False) -> Any:
         value: the record or other value.
         null: True writes a number that is not finite as null; in arrays this is always done.
     """
+    # most values of long lists
+    if type(value) in SCALARS:
+        return value
+    if isinstance(value, float):
+        return None if null and not math.isfinite(value) else float(value)
     if is_dataclass(value) and not isinstance(value, type):
         return {name: plain(getattr(value, name), nullable) for name, nullable in _keys(type(value)).items()}
     if isinstance(value, Mapping):
@@ -176,8 +183,6 @@ def plain(value: object, null: bool = False) -> Any:
         return np.ma.masked_array(value, not_finite).tolist()
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(item, null) for item in value]
-    if isinstance(value, float) and null and not math.isfinite(value):
-        return None
     if isinstance(value, np.generic):
         return value.item()
     return str(value) if isinstance(value, Path) else value

@@ -1,10 +1,11 @@
 """Build the documentation: run the code of its pages, generate the reference, write the HTML.
 
-python docs/build.py [--html] [--record] [--slow] [PAGE ...]
+python docs/build.py [--html] [--record] [--slow] [--without PAGE] [PAGE ...]
 
     PAGE       run these pages only, by their names; default: all
     --html     run no page: pictures are those of the last run
     --slow     run slow blocks, too
+    --without  do not run this page
     --record   write fresh numbers into pages whose commands print others than they show
 """
 
@@ -23,12 +24,12 @@ RUNS, HTML = HERE / "_build/runs", HERE / "_build/html"
 WORKERS = 2
 
 
-def run_pages(names: list[str], record: bool, slow: bool) -> bool:
-    """Run pages, all by default; return whether all that they show holds."""
+def run_pages(names: list[str], without: list[str], record: bool, slow: bool) -> bool:
+    """Run pages, by default all but those left out; return whether all that they show holds."""
     known = {page.stem: page for page in blocks.pages() if blocks.read(page.read_text(encoding="utf-8"))}
-    if unknown := set(names) - set(known):
+    if unknown := {*names, *without} - set(known):
         sys.exit(f"no page with code is called {', '.join(sorted(unknown))}; there are {', '.join(known)}")
-    wanted = {name: known[name] for name in names or known}
+    wanted = {name: known[name] for name in names or known if name not in without}
     for name in wanted:
         shutil.rmtree(RUNS / name, ignore_errors=True)
     good = True
@@ -54,8 +55,9 @@ def main() -> None:
     read.add_argument("--html", action="store_true")
     read.add_argument("--record", action="store_true")
     read.add_argument("--slow", action="store_true")
+    read.add_argument("--without", action="append", default=[], metavar="PAGE")
     given = read.parse_args()
-    good = given.html or run_pages(given.pages, given.record, given.slow)
+    good = given.html or run_pages(given.pages, given.without, given.record, given.slow)
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-j", str(WORKERS), "-b", "html", HERE, HTML]
     command += [] if given.html else ["--fresh-env"]  # notebooks run, too, where only the code has changed
     good = subprocess.run(command).returncode == 0 and good

@@ -17,6 +17,7 @@ from PIL.PngImagePlugin import PngInfo
 from calib.apps.cell_demo import demo
 from calib.apps.cell_demo.step_lines import PICTURE, position_errors, torque_error
 from calib.procedure.export.delivery import prediction
+from calib.procedure.session.folder import Session
 from calib.workers.threads import one_blas_thread
 
 KEPT = Path(__file__).with_name("demo.png")
@@ -31,16 +32,16 @@ FIELD = re.compile(r"\{(\w+):(\S+)\}")
 
 def main() -> None:
     with tempfile.TemporaryDirectory() as place:
-        figures = run(Path(place) / "demo")
+        found = run(Path(place) / "demo")
         about = PngInfo()
-        about.add_text("figures", json.dumps(figures))
+        about.add_text("figures", json.dumps(found))
         with Image.open(Path(place, "demo", PICTURE)) as image:
             image.save(KEPT, pnginfo=about, dpi=image.info["dpi"])
     text = README.read_text(encoding="utf-8")
     for sentence in SENTENCES:
-        text = pattern(sentence).sub(sentence.format(**figures), text)
+        text = pattern(sentence).sub(sentence.format(**found), text)
     README.write_text(text, encoding="utf-8")
-    print(json.dumps(figures, indent=1))
+    print(json.dumps(found, indent=1))
 
 
 def run(folder: Path) -> dict[str, float]:
@@ -48,7 +49,12 @@ def run(folder: Path) -> dict[str, float]:
     began = time.process_time()
     with one_blas_thread():  # as in the command
         found = demo.run(folder, demo.ROBOT, 0, print, lambda words: None, plots="png")
-    seconds, session = time.process_time() - began, found.session
+    seconds = time.process_time() - began
+    return figures(found.session) | {"processor_seconds": seconds, "memory_mb": found.memory}
+
+
+def figures(session: Session) -> dict[str, float]:
+    """Return the figures of a finished demonstration, without time and memory."""
     truth = json.loads(session.path("truth.json").read_text(encoding="utf-8"))
     nominal, calibrated = position_errors(session)
     return {
@@ -57,8 +63,6 @@ def run(folder: Path) -> dict[str, float]:
         "unexplained_percent": torque_error(session),
         "exported_percent": prediction(session.path(session.export)).exported,
         "within_two_sigma_percent": 100.0 * truth["within_two_sigma"],
-        "processor_seconds": seconds,
-        "memory_mb": found.memory,
     }
 
 

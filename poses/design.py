@@ -9,6 +9,7 @@ updated by one product with a matrix of few rows.
 """
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -28,6 +29,31 @@ class Pool:
 
     z: np.ndarray
     known: np.ndarray
+
+    @cached_property
+    def columns(self) -> np.ndarray:
+        """Jacobians as (p, rows · N), candidates last: products with all of them are then sums along the memory."""
+        columns = np.ascontiguousarray(self.z.transpose(2, 1, 0))
+        return columns.reshape(len(columns), -1)
+
+    @cached_property
+    def coarse_columns(self) -> np.ndarray:
+        """`columns` in single precision."""
+        return self.columns.astype(np.float32)
+
+    def squares(self, factor: np.ndarray) -> np.ndarray:
+        """Return the sums of squares (N,) of z Fᵀ of all candidates, for a matrix F (k, p)."""
+        product = factor @ self.columns
+        spread = product.reshape(-1, len(self.z))
+        return np.einsum("ij,ij->j", spread, spread)
+
+    def coarse_squares(self, factors: np.ndarray) -> np.ndarray:
+        """Return the sums of squares (K, N) as of `squares`, for matrices F (K, k, p), in single precision."""
+        count, _, p = factors.shape
+        flat = factors.reshape(-1, p).astype(np.float32)
+        product = flat @ self.coarse_columns
+        spread = product.reshape(count, -1, len(self.z))
+        return np.einsum("kij,kij->kj", spread, spread)
 
 
 @dataclass(frozen=True)
@@ -62,13 +88,10 @@ def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
     ridge = RIDGE * np.eye(p)
     matrix = pool.known + ridge + rows.T @ rows
     root = np.linalg.inv(np.linalg.cholesky(matrix))
-    rows_spread = pool.z.reshape(-1, p) @ root.T
-    spread = rows_spread.reshape(count, -1)
     is_member = np.zeros(count, dtype=bool)
     is_member[list(members)] = True
-    scores = np.einsum("ij,ij->i", spread, spread)
     logdet = float(log_det(matrix))
-    return Design(members, root.T @ root, scores, logdet, is_member)
+    return Design(members, root.T @ root, pool.squares(root), logdet, is_member)
 
 
 def with_added(pool: Pool, design: Design, i: int) -> Design:
@@ -93,7 +116,7 @@ def with_removed(pool: Pool, design: Design, i: int) -> Design:
     return _changed(pool, design, i, -1.0)
 
 
-def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int = 48) -> tuple[int, float]:
+def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int = 8) -> tuple[int, float]:
     """Return the candidate outside the design that raises log det most, and that gain of log det.
 
     The search is exact, though only few candidates are evaluated. With B (r, r) = z C zᵀ of a candidate, by the
@@ -161,21 +184,18 @@ def gains_of(pool: Pool, design: Design, candidates: np.ndarray, sign: float) ->
 
 def _changed(pool: Pool, design: Design, i: int, sign: float) -> Design:
     z = pool.z[i]
-    count, rows, p = pool.z.shape
+    rows = len(z)
     zc = z @ design.inverse
     block = np.eye(rows) + sign * (zc @ z.T)
     root = np.linalg.cholesky((block + block.T) / 2)
     half = np.linalg.solve(root, zc)
-    rows_spread = pool.z.reshape(-1, p) @ half.T
-    spread = rows_spread.reshape(count, -1)
     is_member = design.taken.copy()
     is_member[i] = sign > 0
     if sign > 0:
         members = (*design.members, i)
     else:
         members = tuple(member for member in design.members if member != i)
-    change = np.einsum("ij,ij->i", spread, spread)
-    scores = np.maximum(design.scores - sign * change, 0.0)
+    scores = np.maximum(design.scores - sign * pool.squares(half), 0.0)
     half_logdet = float(np.log(np.diag(root)).sum())
     logdet = design.logdet + 2.0 * half_logdet
     inverse = design.inverse - sign * (half.T @ half)

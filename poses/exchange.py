@@ -6,12 +6,17 @@ from collections.abc import Callable
 import numpy as np
 
 from .design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
+from .swaps import first_swap
 
 # function called with each design of the requested size that is better than all before
 Report = Callable[[Design], None]
 
 # smallest gain of log det that is treated as an improvement (our choice)
 TOLERANCE = 1e-9
+# members for which candidates are compared at once: largest number, and largest number of their products with all
+# candidates, which the processor's cache holds
+MEMBERS_AT_ONCE = 16
+NUMBERS_AT_ONCE = 1_000_000
 
 
 def greedy(pool: Pool, m: int) -> Design:
@@ -43,20 +48,38 @@ def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: 
         report: called with every improved design; None for no report.
         sweeps: largest number of passes over all members.
     """
+    max_count = _members_at_once(pool)
+    # members in whose place no candidate is better, of the design as it is
+    settled: set[int] = set()
     for _ in range(sweeps):
         before = design.logdet
-        for member in design.members:
-            thinned = with_removed(pool, design, member)
-            drop = thinned.logdet - design.logdet
-            candidate, gain = best_addition(pool, thinned, above=-drop + TOLERANCE)
-            if candidate >= 0 and gain + drop > TOLERANCE:
-                design = with_added(pool, thinned, candidate)
-                if report:
-                    report(design)
+        waiting = [member for member in design.members if member not in settled]
+        count = 1
+        while waiting:
+            block = waiting[:count]
+            swap = first_swap(pool, design, block, TOLERANCE)
+            if swap is None:
+                settled.update(block)
+                waiting = waiting[count:]
+                count = min(2 * count, max_count)
+                continue
+            waiting = waiting[block.index(swap.leaving) + 1 :]
+            count = max(count // 2, 1)
+            design = swap.design
+            settled.clear()
+            if report:
+                report(design)
         design = design_of(pool, design.members)
         if design.logdet <= before + TOLERANCE:
             return design
     return design
+
+
+def _members_at_once(pool: Pool) -> int:
+    rows = pool.z.shape[1]
+    numbers = rows**2 * len(pool.z)
+    count = min(MEMBERS_AT_ONCE, NUMBERS_AT_ONCE // numbers)
+    return max(count, 1)
 
 
 def detmax(pool: Pool, design: Design, report: Report | None = None, *, longest: int = 6, failures: int = 40) -> Design:

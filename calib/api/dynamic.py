@@ -23,7 +23,6 @@ from calib.identification.identify_options import IdentifyOptions, IdentifySetti
 from calib.identification.methods.method import Method
 from calib.identification.registry import METHODS
 from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
-from calib.procedure.excitation import coefficients
 from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import Floats, as_numbers, as_subclass, plain, shaped
 from calib.result_kinds import BY_NAME
@@ -248,7 +247,11 @@ def identify_dynamics(
     options = replace(options, settings=replace(options.settings, functions=tuple(terms)))
     if with_geometry is not None:
         options = replace(options, settings=replace(options.settings, with_geometry=with_geometry))
-    designed = [] if excitation is None else [coefficients.read(Path(excitation))]
+    designed = []
+    if excitation is not None:
+        from calib.procedure.excitation import coefficients  # slow to load
+
+        designed.append(coefficients.read(Path(excitation)))
     stage = stage_of(robot, "identify", base, tip)
     if stage is not None:
         require(not terms, "terms: functions are for arms only; parallel robots have the standard friction", UsageError)

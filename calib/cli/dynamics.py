@@ -178,7 +178,7 @@ def _gravity(
     """
     from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage.inputs import with_choices
-    from calib.procedure.dynamic_stage.standing import gravity_result, recorded_poses
+    from calib.procedure.dynamic_stage.standing import recorded_poses
     from calib.procedure.robot_kinds import stage_of
 
     named = [*recordings, *validate]
@@ -190,6 +190,8 @@ def _gravity(
             names = ", ".join(still)
             say(f"standing poses: {names}; the other files are motions. Identify each kind by its own command")
         return False
+    from calib.procedure.dynamic_stage.standing import gravity_result  # slow to load
+
     method, friction, excitation = unused
     with_choices(read_options(options), method, friction, seed)
     names = ("method", "friction", "excitation")

@@ -248,22 +248,25 @@ def reporting(logged: float = inf) -> Iterator[tuple[Callable[..., None], Callab
         yield partial(say, console=console), show
 
 
-def numbers(text: str, count: int, option: str) -> list[float]:
+def numbers(text: str, count: int, option: str, expected: str = "") -> list[float]:
     """Return the finite numbers in an option's text such as ``1,2,3``.
 
     Args:
         text: the text.
         count: expected number of values.
         option: name of the option for the message.
+        expected: what the message says of the values; by default their number.
 
     Raises:
         UsageError: for any other text.
     """
+    if not expected:
+        expected = "a finite number" if count == 1 else f"{count} finite numbers separated by commas"
     try:
         values = [plain_number(part) for part in text.split(",")]
     except ValueError:
         values = []
-    message = f"{option} {text}: expected {count} finite numbers separated by commas"
+    message = f"{option} {text}: expected {expected}"
     require(len(values) == count and all(map(isfinite, values)), message, UsageError)
     return values
 

@@ -545,6 +545,107 @@ def inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, o
 
 
 @njit(**OPTIONS)
+def _wrench_lanes(parameters, motion, wrench):
+    """Compute `_wrench` for L samples of one body.
+
+    Args:
+        parameters: (10,) standard parameters of the body in the kernels' frames.
+        motion: flat (9 L,) w, dw, a of the body.
+        wrench: flat (6 L,) array to write, force and moment about the origin of the body's frame.
+    """
+    h = parameters[6], parameters[7], parameters[8]
+    for k in range(L):
+        w = _lane(motion, 0, k)
+        e = _lane(motion, 3, k)
+        a = _lane(motion, 6, k)
+        centripetal = cross(w, cross(w, h))
+        force = add(add(scaled(parameters[9], a), cross(e, h)), centripetal)
+        gyroscopic = cross(w, inertia_times(parameters, w))
+        moment = add(add(inertia_times(parameters, e), gyroscopic), cross(h, a))
+        _write_lane(wrench, 0, k, force)
+        _write_lane(wrench, 3, k, moment)
+
+
+@njit(**OPTIONS)
+def _return_lanes(turn, wrench, up):
+    """Add a body's wrench to that of its parent, for L samples.
+
+    Args:
+        turn: flat (12 L,) rotation and origin of the body, from `_place_lanes`.
+        wrench: flat (6 L,) force and moment of the body.
+        up: flat (6 L,) those of its parent, which are increased.
+    """
+    for k in range(L):
+        f = _lane(wrench, 0, k)
+        n = _lane(wrench, 3, k)
+        force = dot(_lane(turn, 0, k), f), dot(_lane(turn, 3, k), f), dot(_lane(turn, 6, k), f)
+        moment = dot(_lane(turn, 0, k), n), dot(_lane(turn, 3, k), n), dot(_lane(turn, 6, k), n)
+        lever = _lane(turn, 9, k)
+        _write_lane(up, 0, k, add(_lane(up, 0, k), force))
+        _write_lane(up, 3, k, add(_lane(up, 3, k), add(moment, cross(lever, force))))
+
+
+@njit(**OPTIONS)
+def products(links, constants, parameters, amount, v, a, weights, torque, pull):
+    """Add the products of the regressor Y with parameters and with weights, Y χ and Yᵀ w, without forming Y.
+
+    Column c of body i in the torque row of coordinate j is linear in the twist of i per unit rate of j. So Yᵀ w is the
+    ten columns of each body for its twist at the rates w, and Y χ is recursive Newton-Euler.
+
+    Args:
+        links, constants: those of `Bodies`.
+        parameters: (10 B,) standard parameters χ in the kernels' frames.
+        amount: (B, N) joint position that moves each body [rad or m], below 1e6.
+        v, a: (n, N) joint velocities and accelerations.
+        weights: (n, N) weights w of the torques; (0, N): Y χ alone is computed.
+        torque: (n, N) the torques Y χ, increased.
+        pull: (B, 10 L) increased; the sum of the L numbers of a body's column, in the kernels' frames, is that of Yᵀ w.
+    """
+    bodies = amount.shape[0]
+    count = amount.shape[1]
+    weighted = weights.shape[0] > 0
+    joint = np.zeros(5 * L)
+    columns = np.empty(10 * L)
+    turns = np.empty((bodies, 12 * L))
+    wrenches = np.zeros((bodies + 1, 6 * L))
+    motion = np.zeros((bodies + 1, 9 * L))
+    twists = np.zeros((bodies + 1, 6 * L))
+    for r in range(3):
+        for lane in range((6 + r) * L, (7 + r) * L):
+            motion[0, lane] = -constants[bodies, r]
+    for start in range(0, count, L):
+        width = min(L, count - start)
+        end = start + width
+        for i in range(bodies):
+            p = links[i, PARENT]
+            c = links[i, COORDINATE]
+            turning = 1.0 if links[i, KIND] == REVOLUTE else 0.0
+            _load_lanes(
+                links[i, KIND], constants[i, SCALE], amount[i, start:end], v[c, start:end], a[c, start:end], joint
+            )
+            _place_lanes(constants, i, joint, turns[i])
+            _advance_lanes(turning, joint, turns[i], motion[p + 1], motion[i + 1])
+            if weighted:
+                _carry_lanes(turns[i], twists[p + 1], twists[i + 1])
+                if c >= 0:
+                    axis = (2 if links[i, KIND] == REVOLUTE else 5) * L
+                    for lane in range(width):
+                        twists[i + 1, axis + lane] += constants[i, SCALE] * weights[c, start + lane]
+                _project_lanes(motion[i + 1], twists[i + 1], columns)
+                for k in range(10):
+                    for lane in range(k * L, k * L + width):
+                        pull[i, lane] += columns[lane]
+            _wrench_lanes(parameters[10 * i : 10 * i + 10], motion[i + 1], wrenches[i + 1])
+        for i in range(bodies - 1, -1, -1):
+            c = links[i, COORDINATE]
+            if c >= 0:
+                axis = (5 if links[i, KIND] == REVOLUTE else 2) * L
+                for lane in range(width):
+                    torque[c, start + lane] += constants[i, SCALE] * wrenches[i + 1, axis + lane]
+            _return_lanes(turns[i], wrenches[i + 1], wrenches[links[i, PARENT] + 1])
+
+
+@njit(**OPTIONS)
 def stop(x, width):
     """Return the states (N,) within ±1 of a stop operator of half-width `width` driven by positions x (N,).
 

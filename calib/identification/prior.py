@@ -554,7 +554,7 @@ def tempered_prior(
             candidate = find(rows, start=prior, tempering=tempering)
         inflation = tempering * candidate.first.inflation
         validation = CrossValidation(
-            data, len(std), 1, candidate.first.std, inflation, no_ridges, candidate.rows, regimes
+            data, len(std), 1, candidate.first.std, inflation, no_ridges, candidate.rows, lambda: regimes
         )
         squares = (validation.extrapolated(columns) / std**2).sum(axis=1)
         error = float(np.log(np.maximum(squares, 1e-300)).mean())

@@ -5,7 +5,7 @@ extrapolates to higher speeds and accelerations, to more distant positions, and 
 blocks hardly test this, since each contains some of every range.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -126,7 +126,8 @@ class CrossValidation:
         inflation: (rows,) variance inflation, i.e. number of rows that count as one.
         group: (p,) ridge group of each column, -1 for none.
         prior: (k, p + 1) whitened rows of [W y] of a prior; None without one.
-        regimes: products by range of motion and torque row; None: ranges are not tested.
+        regimes: function that returns products by range of motion and torque row, called when ranges are first tested;
+            None: they are not tested.
     """
 
     data: Triangles
@@ -136,7 +137,7 @@ class CrossValidation:
     inflation: np.ndarray
     group: np.ndarray
     prior: np.ndarray | None = None
-    regimes: Regimes | None = None
+    regimes: Callable[[], Regimes] | None = None
     _results: dict[bytes, np.ndarray] = field(default_factory=dict, init=False)
 
     def errors(self, columns: np.ndarray, folds: int | None = None) -> np.ndarray:
@@ -162,23 +163,23 @@ class CrossValidation:
         Args:
             columns: indices of the model's columns.
         """
-        assert self.regimes is not None
+        regimes = self._regimes
         key = b"ranges" + np.asarray(columns, dtype=int).tobytes()
         if key in self._results:
             return self._results[key]
         index = np.append(columns, self.data.parameters)
         weight = 1.0 / (self.std**2 * self.inflation)
         prior_square = self._prior_square(index)
-        diagonals = self.regimes.total_squares.diagonal(axis1=1, axis2=2)
+        diagonals = regimes.total_squares.diagonal(axis1=1, axis2=2)
         rounding = 1e-9 * (weight @ diagonals)[index]
-        result = np.zeros((len(self.regimes.squares), self.rows))
-        for k, (held_out, counts) in enumerate(zip(self.regimes.squares, self.regimes.counts)):
-            training = np.tensordot(weight, self.regimes.total_squares - held_out, 1)
+        result = np.zeros((len(regimes.squares), self.rows))
+        for k, (held_out, counts) in enumerate(zip(regimes.squares, regimes.counts)):
+            training = np.tensordot(weight, regimes.total_squares - held_out, 1)
             training = training.take(index, 0).take(index, 1)
             # Differences of products are positive definite but for rounding.
             training.flat[:: len(index) + 1] += rounding
             training += prior_square
-            training_rows = int(np.sum((self.regimes.total_counts - counts) / self.inflation))
+            training_rows = int(np.sum((regimes.total_counts - counts) / self.inflation))
             values, _ = _regularised(training, training_rows, self.group[columns], self._kinds[columns])
             combination = np.append(values, -1.0)
             selected = held_out.take(index, 1).take(index, 2)
@@ -215,6 +216,11 @@ class CrossValidation:
         if self.prior is None:
             return 0.0
         return self.prior[:, index].T @ self.prior[:, index]
+
+    @cached_property
+    def _regimes(self) -> Regimes:
+        assert self.regimes is not None
+        return self.regimes()
 
     @cached_property
     def _kinds(self) -> np.ndarray:

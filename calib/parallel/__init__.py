@@ -32,6 +32,13 @@ LIBRARY = Path(__file__).parent / "mechanism" / "library"
 
 def find(robot: object) -> ParallelMechanism | None:
     """Return the parallel robot of a TOML file, a folder with one, or a library name; None for any other robot."""
+    if not isinstance(robot, (str, Path)):
+        return None
+    path = Path(robot)
+    if path.is_file() and path.suffix != ".toml":
+        return None
+    if not path.exists() and not (LIBRARY / f"{robot}.toml").is_file():
+        return None
     from calib.parallel import robots
 
     return robots.find(robot)

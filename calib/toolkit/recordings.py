@@ -11,6 +11,7 @@ from calib.data.recordings.stamps import likely_unit
 from calib.data.recordings.topics import at_times
 from calib.data.signals.bandwidth import USABLE
 from calib.data.signals.filtering import design_decimator
+from calib.data.signals.fingerprint import SKETCH, Fingerprint, common_share, sketch
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.data.signals.resampling import GAP
 from calib.procedure.excitation.coefficients import ARM as ARM_FILE
@@ -26,13 +27,16 @@ __all__ = [
     "PLANNED_FILE",
     "RUN_FILE",
     "SAMPLES_FILE",
+    "SKETCH",
     "SYNONYMS",
     "TRAJECTORY_FILE",
     "USABLE",
     "FilterOptions",
+    "Fingerprint",
     "Recording",
     "at_times",
     "bag_table",
+    "common_share",
     "dataset_table",
     "design_decimator",
     "families",
@@ -44,6 +48,7 @@ __all__ = [
     "read_recording",
     "read_trajectory",
     "series_of",
+    "sketch",
     "time_column",
     "words_of",
 ]

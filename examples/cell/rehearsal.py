@@ -10,11 +10,11 @@ out is compared with the hidden truth, by Pinocchio where it is a robot; the fol
 import argparse
 import ast
 import csv
+import io
 import json
 import re
-import subprocess
-import sys
 from collections.abc import Callable
+from contextlib import chdir, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +23,7 @@ import pinocchio
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from calib import cli
 from calib.robot.kinematics import forward
 from calib.simulation.cell import SimulatedInstrument, measure, true_poses
 from calib.simulation.virtual_cells import virtual_cell
@@ -34,13 +35,18 @@ SETS = {"poses": "measured", "validation_poses": "validation_measured"}
 
 
 def calib(*words: object, folder: Path) -> str:
-    """Type a command; return what it printed. Every command stands in ``commands.txt``."""
+    """Type a command; return what it printed. Every command stands in ``commands.txt``.
+
+    It runs in this process: the start of a process would take longer than most of the commands.
+    """
+    line, out, err = [*map(str, words)], io.StringIO(), io.StringIO()
     with (folder / "commands.txt").open("a") as log:
-        print("calib", *words, file=log)
-    ran = subprocess.run([sys.executable, "-m", "calib", *map(str, words)], cwd=folder, capture_output=True, text=True)
-    if ran.returncode:
-        raise SystemExit(f"calib {' '.join(map(str, words))}\n{ran.stdout}{ran.stderr}")
-    return ran.stdout
+        print("calib", *line, file=log)
+    with chdir(folder), redirect_stdout(out), redirect_stderr(err):
+        code = cli.run(line)
+    if code:
+        raise SystemExit(f"calib {' '.join(line)}\n{out.getvalue()}{err.getvalue()}")
+    return out.getvalue()
 
 
 # ---- What the controller does with a program, and the file of joints that it leaves ----------------------------------

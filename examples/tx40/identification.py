@@ -15,12 +15,13 @@ once: with a wrong controller it grows although the parameters stay right, and o
 that answered the noise, which no prediction can. `torque_error` compares fairly: the torque of another motion,
 noise-free, against the truth. A dash: that estimate could not be simulated along that motion.
 
-    python examples/tx40/identification.py --out tx40-study [--quick] [--seed 0] [--readme]
+    python examples/tx40/identification.py --out tx40-study [--quick] [--seed 0] [--tried NAME …] [--readme]
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Container
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,7 @@ from calib.identification.closed_loop.controllers import identify_controller, pd
 from calib.identification.closed_loop.instrumental import Instrumental, Round, identify_instrumental
 from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
 from calib.identification.methods.parameter_constraints import hold, make_constraints
+from calib.identification.rows import ObservationRows
 from calib.simulation import known_robots
 from calib.simulation.known_robots import trapezoidal
 from calib.toolkit.recordings import FilterOptions, Recording, make_motion
@@ -54,6 +56,7 @@ UNMODELLED = 0.05  # of each joint's rms torque, chosen
 DEGRADED = np.array([2.3, 2.7, 7.0, 9.0, 12.0, 13.0]) * 1e-3  # noise of the logged positions [rad], chosen: see above
 LOOP, LOOP_BAND = 3e-4, 10.0  # noise of the positions that the controller sees [rad], its colour [Hz], chosen
 KINDS = ("clean", "degraded", "in the loop")
+TRIED = ("identified", "kp +30 %, kd -30 %", "bandwidth / 2", "bandwidth / 3")  # controllers, on degraded data
 MARKS = ("<!-- the table is written by --readme -->", "<!-- end of the table -->")
 SLIDES = {
     "clean": {"direct": {"LS": [5.2, 5.0, 5.0, 5.6, 7.2, 7.1], "IV": [5.4, 5.3, 5.1, 5.7, 7.2, 7.5]},
@@ -67,12 +70,13 @@ SLIDES = {
 
 @dataclass(frozen=True)
 class Log:
-    """One recorded motion: what was asked, what is true, positions as logged, and the case that identification sees."""
+    """One recorded motion: what was asked, what is true, positions as logged, and what identification sees of them."""
 
     reference: Reference
     run: SimulatedRun
     seen: np.ndarray
     case: Case
+    rows: ObservationRows
 
 
 @dataclass(frozen=True)
@@ -111,10 +115,14 @@ def references(quick: bool, seed: int) -> tuple[Reference, list[Reference]]:
     return training, [draw(1001), draw(1002), moves]
 
 
-def record(study: Study, reference: Reference, kind: str, number: int) -> Log:
-    """Simulate a motion with noise, and log it."""
+def unmodelled(study: Study, reference: Reference) -> np.ndarray:
+    """Return the size of the torque that no model holds (n,) [N m], from the torque of a motion without noise."""
     silent = simulate(study.plant, study.controller, reference, Sensing(every=EVERY))
-    push = UNMODELLED * np.sqrt(np.mean(silent.torque**2, axis=0))
+    return UNMODELLED * np.sqrt(np.mean(silent.torque**2, axis=0))
+
+
+def record(study: Study, reference: Reference, push: np.ndarray, kind: str, number: int) -> Log:
+    """Simulate a motion with noise and unmodelled torque of a size, and log it."""
     sensing = Sensing(np.deg2rad(1e-4), 0.0, 0.05, push, push_band=10.0, every=EVERY)
     if kind == "in the loop":
         sensing = replace(sensing, sigma_q=LOOP, q_band=LOOP_BAND)
@@ -123,7 +131,8 @@ def record(study: Study, reference: Reference, kind: str, number: int) -> Log:
     if kind == "degraded":
         seen = seen + DEGRADED * np.random.default_rng([study.seed, number, 7]).normal(size=seen.shape)
     recording = Recording(run.t, seen, run.tau, "torque", tuple(f"joint_{j + 1}" for j in range(6)), file=kind)
-    return Log(reference, run, seen, make_case(kind, make_motion(recording, FILTERS)))
+    case = make_case(kind, make_motion(recording, FILTERS))
+    return Log(reference, run, seen, case, observe(study.model, study.base.kept, case, case.motion.decimator))
 
 
 def relative(target: np.ndarray, predicted: np.ndarray) -> tuple[float, list[float]]:
@@ -133,10 +142,9 @@ def relative(target: np.ndarray, predicted: np.ndarray) -> tuple[float, list[flo
     return float(100.0 * np.linalg.norm(gone) / np.linalg.norm(size)), joints.tolist()
 
 
-def with_measured(study: Study, log: Log, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def with_measured(log: Log, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return decimated torque and prediction W x, W from the log."""
-    rows = observe(study.model, study.base.kept, log.case, log.case.motion.decimator)
-    return rows.target, rows.matrix @ values
+    return log.rows.target, log.rows.matrix @ values
 
 
 def with_simulated(
@@ -167,7 +175,7 @@ def judge(
 
     def predicted(name: str, log: Log) -> tuple[np.ndarray, np.ndarray]:
         return (
-            with_measured(study, log, values[name])
+            with_measured(log, values[name])
             if name.endswith("LS")
             else with_simulated(study, log, values[name], controller)
         )
@@ -227,7 +235,7 @@ def estimate(study: Study, log: Log, controller: LoopController, method: str) ->
 
 def essential_count(study: Study, training: Log) -> dict[str, Any]:
     """Return the number of base parameters that an F-test keeps on clean data (the slides: 27 of 60)."""
-    rows = observe(study.model, study.base.kept, training.case, training.case.motion.decimator)
+    rows = training.rows
     samples, joints, p = rows.matrix.shape
     group = np.repeat(np.arange(joints), samples)
     matrix, target = rows.matrix.transpose(1, 0, 2).reshape(-1, p), rows.target.T.ravel()
@@ -240,16 +248,12 @@ def controllers(study: Study, log: Log) -> dict[str, LoopController]:
     """Return the controllers to try on degraded data: identified from that log, and wrong ones."""
     found = identify_controller(log.reference, log.seen, np.asarray(log.run.tau), RATE / EVERY)
     right = study.controller
-    return {
-        "identified": found.controller,
-        "kp +30 %, kd -30 %": pd(1.3 * right.kp, 0.7 * right.kd),
-        "bandwidth / 2": right.slower(2.0),
-        "bandwidth / 3": right.slower(3.0),
-    }
+    assumed = (found.controller, pd(1.3 * right.kp, 0.7 * right.kd), right.slower(2.0), right.slower(3.0))
+    return dict(zip(TRIED, assumed))
 
 
-def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
-    """Run the study; write and return the metrics."""
+def run(out: Path, quick: bool = False, seed: int = 0, tried: Container[str] = TRIED) -> dict[str, Any]:
+    """Run the study, on degraded data with the named ones of the controllers; write and return the metrics."""
     plant = known_robots.plant("tx40", coupled=True, offset=OFFSETS)
     model = known_robots.model(plant)
     study = Study(plant, model, bases.find(model), known_robots.controller("tx40"), seed)
@@ -259,9 +263,10 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
         "by_construction": ["unmodelled torque", "noise of the degraded data", "offsets", "truth"],
         "slides": SLIDES,
     }
+    pushes = [unmodelled(study, reference) for reference in (training, *others)]
     for kind in KINDS[: 2 if quick else None]:
-        log = record(study, training, kind, 0)
-        rest = [record(study, reference, kind, number + 1) for number, reference in enumerate(others)]
+        motions = enumerate(zip((training, *others), pushes))
+        log, *rest = (record(study, reference, push, kind, number) for number, (reference, push) in motions)
         if kind == "clean":
             metrics["essential"] = essential_count(study, log)
         results = {name: estimate(study, log, study.controller, name) for name in ("IV", "PC-IV", "DIDIM")}
@@ -270,12 +275,14 @@ def run(out: Path, quick: bool = False, seed: int = 0) -> dict[str, Any]:
         if kind == "degraded":
             metrics["wrong controllers"] = {}
             for name, controller in controllers(study, log).items():
+                if name not in tried:
+                    continue
                 try:
-                    tried = {each: estimate(study, log, controller, each) for each in ("IV", "PC-IV")}
+                    found = {each: estimate(study, log, controller, each) for each in ("IV", "PC-IV")}
                 except NotConverged as error:  # a wrong controller need not hold the robot
                     metrics["wrong controllers"][name] = {"failed": str(error)}
                 else:
-                    metrics["wrong controllers"][name] = judge(study, log, rest, tried, controller)
+                    metrics["wrong controllers"][name] = judge(study, log, rest, found, controller)
     metrics["parameters"]["essential"] = metrics["essential"]["F"]
     files.write_json(out / "metrics.json", metrics)
     return metrics
@@ -319,7 +326,7 @@ def draw(study: Study, log: Log, found: Instrumental, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     series = {
-        "LS": np.subtract(*with_measured(study, log, found.ordinary.estimate.values)),
+        "LS": np.subtract(*with_measured(log, found.ordinary.estimate.values)),
         "IV": np.subtract(*with_simulated(study, log, found.fit.estimate.values, study.controller)),
     }
     figure, axes = plt.subplots(3, 6, figsize=(15, 7))
@@ -375,10 +382,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for metrics.json")
     parser.add_argument("--quick", action="store_true", help="shorter motions, fewer candidates, two sets")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--tried", nargs="+", choices=TRIED, default=TRIED, help="controllers on degraded data")
     parser.add_argument("--readme", action="store_true", help="put the table into the README beside this script")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
-    metrics = run(options.out, options.quick, options.seed)
+    metrics = run(options.out, options.quick, options.seed, options.tried)
     show(metrics)
     if options.readme:
         write_readme(metrics, Path(__file__).with_name("README.md"))

@@ -4,7 +4,8 @@
     python tests/benchmarks/command_stages.py --beside ../before --page docs/growth.md
 
 Each command runs in a process of its own, the two states in turn, on one thread; of its runs the one with the least
-processor time counts. Stages are exclusive: what is imported while a figure is drawn counts as imports.
+processor time counts. Stages are exclusive: what is imported while a figure is drawn counts as imports. Byte code is
+written, as where the package is installed, so that only the first run compiles modules.
 """
 
 import argparse
@@ -114,7 +115,12 @@ def measured(words: Sequence[str], tree: Path) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         for name in os.listdir():
             os.symlink(Path(name).absolute(), Path(folder, name))
-        places = {"PYTHONPATH": os.pathsep.join([str(tree), str(TOP)]), "OMP_NUM_THREADS": "1"}
+        places = {
+            "PYTHONPATH": os.pathsep.join([str(tree), str(TOP)]),
+            "OMP_NUM_THREADS": "1",
+            "PYTHONDONTWRITEBYTECODE": "",
+            "PYTHONPYCACHEPREFIX": str(Path(tempfile.gettempdir(), "byte_code")),
+        }
         done = subprocess.run(
             [sys.executable, __file__, "--run", *words], capture_output=True, text=True, cwd=folder,
             env=os.environ | places,

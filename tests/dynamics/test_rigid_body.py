@@ -81,6 +81,23 @@ def test_gradient_of_the_regressor(name):
     assert np.allclose(of_torques, of_rows, rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize("name", ["lwr4plus", "motley", "mimic", "payload"])
+def test_products_with_the_regressor(name):
+    """Y χ and Σ w · Y are those of the formed regressor, also where samples fill no whole lane and angles are large."""
+    special = {"mimic": lambda: bodies_of(mimic()), "payload": lambda: with_payload(bodies_of(motley()), np.eye(4))}
+    bodies = special.get(name, lambda: bodies_of(ARMS[name]))()
+    random = np.random.default_rng(7)
+    q, v, a, weights = random.normal(size=(4, 150, bodies.n))
+    q[0] = 2e6
+    chi = random.normal(size=10 * bodies.count)
+    formed = rigid_body.regressor(bodies, q, v, a)
+    lighter = bodies.with_gravity(0.5 * bodies.gravity)
+    (torque, sums), (other, _) = rigid_body.regressor_products([bodies, lighter], chi, q, v, a, weights)
+    assert relative(other.T, rigid_body.regressor(lighter, q, v, a) @ chi) < 1e-13
+    assert relative(torque.T, formed @ chi) < 1e-13
+    assert relative(sums, np.tensordot(weights, formed, 2)) < 1e-13
+
+
 def test_torque_gradient_is_pinocchios():
     """The gradient of torques agrees with Pinocchio in batch."""
     import pinocchio as pin

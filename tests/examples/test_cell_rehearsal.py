@@ -1,10 +1,9 @@
 """Three arms go from `calib new` to a delivered correction by commands alone, on files as an engineer gets them."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from scripts import run_here
 
 EXAMPLE = Path(__file__).parents[2] / "examples/cell"
 
@@ -16,13 +15,10 @@ def rows(text: str) -> dict[str, list[str]]:
 
 
 @pytest.mark.slow
-def test_arms_are_corrected_as_readme_states(tmp_path):
+def test_arms_are_corrected_as_readme_states(tmp_path, capsys):
     """Each arm is corrected, and the README states what a fresh run finds."""
-    ran = subprocess.run(
-        [sys.executable, str(EXAMPLE / "rehearsal.py"), "--out", str(tmp_path / "r")],
-        check=True, capture_output=True, text=True,
-    )  # fmt: skip
-    found, stated = rows(ran.stdout), rows((EXAMPLE / "README.md").read_text())
+    said = run_here(EXAMPLE / "rehearsal.py", "--out", tmp_path / "r", capsys=capsys)
+    found, stated = rows(said), rows((EXAMPLE / "README.md").read_text())
     assert found.keys() == stated.keys() and len(found) == 5
     for name in ("ur5", "lrmate200id", "lwr4plus"):
         controller, verdict, *errors, checked = found[name]

@@ -69,7 +69,7 @@ def test_plain_references_find_simple_arm(tmp_path) -> None:
 @pytest.mark.slow
 def test_document_states_fresh_results(data, tmp_path) -> None:
     """The document states what a fresh run gives."""
-    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "CALIB_DATA": str(DATA)}
+    environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "CALIB_DATA": str(DATA)}
     command = [sys.executable, str(PARTS / "extrapolation.py"), "--out", str(tmp_path), "--only", *CHOSEN]
     said = subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
     found, stated = told(said), told(TEXT)

@@ -25,7 +25,7 @@ def rows(said: str) -> dict[tuple[str, str], tuple[float, float]]:
 
 
 def run(*parts: str) -> str:
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "CALIB_DATA": str(DATA)}
+    environment = os.environ | {"CALIB_DATA": str(DATA)}
     command = [sys.executable, str(ROOT / "examples/interval_coverage.py"), *parts]
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
 

@@ -1,6 +1,5 @@
 """The numbered examples: short, complete, and they do what their first line says."""
 
-import os
 import re
 import subprocess
 import sys
@@ -14,9 +13,8 @@ NUMBERED = sorted(EXAMPLES.glob("0*.py"))
 
 
 def run(name: str, *arguments: object) -> str:
-    environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment)
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,9 @@ import pytest
 from calib import cli
 from calib.data.poses.fit_options import FitOptions
 from calib.data.recordings.recording_files import read_recording
+from calib.procedure.excitation import design
+from calib.procedure.excitation.inputs import ExcitationInputs
+from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.kinematic_stage.inputs import read_file
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.chain import random_joints
@@ -55,6 +59,17 @@ def with_logs(at_a_cell: Path) -> Path:
         motion = random_fourier(0.6 * arm.lower, 0.6 * arm.upper, 0.6 * speed, 15.0, 1000.0, seed=seed)
         write_log(record(moves, motion, seed), at_a_cell / f"{name}.csv")
     return at_a_cell
+
+
+@pytest.fixture
+def short_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the design of a motion end after few evaluations of one start."""
+    searched = design.search_motion
+
+    def ended_soon(inputs: ExcitationInputs, settings: ExcitationSettings, *more: object) -> design.Designed:
+        return searched(inputs, replace(settings, starts=1, evaluations=40), *more)
+
+    monkeypatch.setattr(design, "search_motion", ended_soon)
 
 
 def test_blocks_are_found_and_short() -> None:
@@ -107,6 +122,7 @@ def test_its_session_begins(at_a_cell: Path, capsys: pytest.CaptureFixture) -> N
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("short_search")
 def test_its_commands_run(with_logs: Path, capsys: pytest.CaptureFixture) -> None:
     for arguments in commands(BLOCKS[2]):
         assert cli.run(arguments) == 0, (arguments, capsys.readouterr())

@@ -10,13 +10,9 @@ from loaded_arm import HEAD, GivingArm, urdf
 from calib.data.poses.fit_options import parse_options
 from calib.data.poses.pose_files import read_measurements
 from calib.errors import UsageError
+from calib.geometry.static_torques.agreement import agreeing_torques, without_contradicting_torques
 from calib.geometry.static_torques.column_faults import column_fault
-from calib.geometry.static_torques.gravity_fit import (
-    gravity_fit,
-    gravity_regressor,
-    payload_load,
-    without_contradicting_torques,
-)
+from calib.geometry.static_torques.gravity_fit import gravity_fit, gravity_regressor, payload_load
 from calib.geometry.static_torques.load_errors import load_masses
 from calib.geometry.static_torques.sources import MODELLED, driven, load_changes, load_findings
 from calib.robot.formats import urdf as urdf_format
@@ -205,15 +201,15 @@ def test_loads_by_row_of_one_file_are_those_of_several_files(arm, chain, folder,
 @pytest.mark.parametrize(
     "change, says",
     [
-        (lambda torque: np.negative(torque, out=torque), "the other one than in the fitted files"),
-        (lambda torque: np.multiply(torque, 1000.0, out=torque), "times the gravity of the fitted files"),
+        (lambda torque: np.negative(torque, out=torque), "the other one than in empty.csv"),
+        (lambda torque: np.multiply(torque, 1000.0, out=torque), "times the gravity of empty.csv"),
         (lambda torque: torque.fill(0.0), "zero in every row"),
         (lambda torque: np.multiply(torque, 0.5, out=torque), "no load explains them"),
         (lambda torque: np.negative(torque[:, 1], out=torque[:, 1]), "with tau2 reversed"),
     ],
 )
 def test_torques_of_an_unseen_file_that_contradict_the_fitted_gravity_are_not_used(folder, gravity, change, says):
-    measured, findings = without_contradicting_torques(faulty(folder, change), gravity)
+    measured, findings = without_contradicting_torques(faulty(folder, change), gravity, [block(folder / "empty.csv")])
     assert measured.measured_torque is None
     (unused,) = findings
     assert unused.code == "torques-unused" and says in f"{unused.values['reason']}"
@@ -222,7 +218,7 @@ def test_torques_of_an_unseen_file_that_contradict_the_fitted_gravity_are_not_us
 
 def test_a_loaded_unseen_file_does_not_contradict_the_fitted_gravity(folder, gravity):
     loaded = block(folder / "loaded.csv")
-    measured, findings = without_contradicting_torques(loaded, gravity)
+    measured, findings = without_contradicting_torques(loaded, gravity, [block(folder / "empty.csv")])
     assert measured is loaded
     assert findings == []
 
@@ -256,3 +252,85 @@ def test_empty_torque_columns_are_called_empty(chain, folder):
 def test_a_payload_in_another_unit_is_refused(chain, payload, says):
     with pytest.raises(UsageError, match=says):
         payload_load(chain, payload)
+
+
+def changed(measured, change):
+    torque = np.array(measured.measured_torque)
+    change(torque)
+    return replace(measured, measured_torque=torque, file="changed.csv")
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        (lambda torque: np.negative(torque, out=torque), "the other one than in empty.csv"),
+        (lambda torque: np.multiply(torque, 1000.0, out=torque), "kg"),
+        (exchange, "tau2 and tau4 exchanged"),
+        (reverse, "tau2 reversed"),
+        (lambda torque: np.multiply(torque, 0.5, out=torque), "no load explains them"),
+    ],
+)
+def test_a_second_fitted_file_is_judged_by_the_first_one(chain, folder, gravity, change, says):
+    blocks = [block(folder / "empty.csv"), changed(block(folder / "loaded.csv"), change)]
+    fit, (first, second), (unused,) = agreeing_torques(chain, blocks)
+    assert list(unused.values["files"]) == ["changed.csv"] and says in unused.values["reason"]
+    assert first is blocks[0] and second.measured_torque is None
+    assert np.array_equal(fit.chain.inertias, gravity.chain.inertias)
+
+
+def test_of_three_files_the_one_that_contradicts_two_is_named(arm, chain, folder, tmp_path):
+    others = [block(arm.write(tmp_path / f"{seed}.csv", arm.table(30, seed))) for seed in (5, 6)]
+    odd = changed(block(folder / "empty.csv"), lambda torque: np.negative(torque, out=torque))
+    fit, blocks, (unused,) = agreeing_torques(chain, [odd, *others])
+    assert list(unused.values["files"]) == ["changed.csv"] and "5.csv, 6.csv" in unused.values["reason"]
+    assert [measured.measured_torque is None for measured in blocks] == [True, False, False]
+    assert len(fit.loads) == 2
+
+
+def test_files_of_a_few_rows_each_or_of_a_single_pose_do_not_contradict_each_other(arm, chain, folder, tmp_path):
+    rows = arm.table(24, 5)
+    poses = np.tile(rows[:1, :7], (12, 1)) + 1e-4 * np.arange(12)[:, None]
+    tables = [rows[:8], rows[8:16], rows[16:], arm.table(12, 6, poses=poses), arm.table(12, 7, 2.5, poses=poses)]
+    blocks = []
+    for number, table in enumerate(tables):
+        blocks.append(block(arm.write(tmp_path / f"{number}.csv", table)))
+    for files in (blocks[::-1], [block(folder / "empty.csv"), *blocks[2:]]):
+        fit, agreeing, findings = agreeing_torques(chain, files)
+        assert findings == [] and list(agreeing) == files
+        assert len(fit.loads) == len(files)
+
+
+@pytest.mark.parametrize(
+    "heads, says",
+    [
+        (HEAD[:15], "those of joint6, joint7 are missing"),
+        ([*HEAD[:10], *(f"{name} [A]" for name in HEAD[10:])], "their columns are in A"),
+    ],
+)
+def test_torques_that_are_not_read_are_explained(arm, chain, tmp_path, heads, says):
+    measured = block(arm.write(tmp_path / "some.csv", arm.table(10, 1)[:, : len(heads)], heads))
+    fit, _, (unused,) = agreeing_torques(chain, [measured])
+    assert fit is None and says in unused.values["reason"]
+
+
+def test_joints_without_a_sensor_have_empty_columns(chain, folder):
+    def unread(torque):
+        torque[:, 5:] = np.nan
+
+    fit, _, findings = agreeing_torques(chain, [faulty(folder, unread)])
+    assert findings == [] and np.isinf(fit.sigma[5:]).all()
+    loaded = block(folder / "loaded.csv")
+    _, contradicting = without_contradicting_torques(loaded, fit, [loaded])
+    assert contradicting == []
+    (payload,) = load_findings(loaded, fit)
+    assert payload.values["mass"] == pytest.approx(2.5, abs=0.15)
+    assert np.isfinite(driven(loaded, fit).torque).all()
+
+
+def test_a_reversed_column_is_named_beside_joints_without_a_sensor(chain, folder):
+    def unread(torque):
+        torque[:, 5:] = np.nan
+        reverse(torque)
+
+    fit, _, (unused,) = agreeing_torques(chain, [faulty(folder, unread)])
+    assert fit is None and "tau2 reversed" in unused.values["reason"]

@@ -77,3 +77,6 @@ def test_single_loud_moment_is_incoherent():
     burst = np.where(learnt.block == 3, np.sin(200.0 * learnt.q[:, 0]), 0.0)
     steady = np.sin(200.0 * learnt.q[:, 0])
     assert ripple.coherence(learnt, 0, burst).max() < 1e-6 * ripple.coherence(learnt, 0, steady).max()
+    orders = np.array([16, 32, 101, 640])
+    whole = ripple.coherence(learnt, 0, steady)
+    assert np.allclose(ripple.coherence_at(learnt, 0, steady, orders), whole[orders], rtol=0, atol=1e-9 * whole.max())

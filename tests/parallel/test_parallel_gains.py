@@ -38,7 +38,7 @@ def test_known_payload_gives_gains(name):
 @pytest.mark.slow
 def test_gain_sigmas_hold_under_noise():
     """Six trials with 3 N m of noise on some 20 N m, where least squares draws the gains to zero."""
-    trials = [found("dualv", 3.0, seed, samples=8000) for seed in range(6)]
+    trials = [found("dualv", 3.0, seed, samples=4000) for seed in range(6)]
     away = np.array([(own.gains - gains) / own.sigma for gains, own in trials])
     assert 0.5 < np.sqrt(np.mean(away**2)) < 1.5
 

@@ -80,7 +80,8 @@ def compensate(
     position_mm, turn_mrad = numbers(tolerance, 2, "--tolerance")
     fitted = api.read_fitted(folder)
     if payload:
-        fitted = fitted.carrying(numbers(payload, 4 if "," in payload else 1, "--payload"))
+        count = 4 if "," in payload else 1
+        fitted = fitted.carrying(numbers(payload, count, "--payload", "a mass [kg], or mass,x,y,z [kg, m]"))
     program = None
     suffix = ".csv"
     if controller or is_program(targets):

@@ -48,7 +48,7 @@ from calib.apps.joining.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_ord
 from calib.apps.joining.stated import check_columns, stated
 from calib.apps.joining.streams import join_streams
 from calib.arguments import checked
-from calib.errors import MeasurementError, UsageError, counted, finding, listing, one_of, refuse_data
+from calib.errors import MeasurementError, UsageError, counted, finding, listing, one_of, refuse_data, require
 from calib.records import interpolated
 from calib.toolkit.chains import CalibratedChain, Chain, as_described, controllers, load_calibrated
 from calib.toolkit.installations import check_scale
@@ -117,11 +117,13 @@ def join(
         motion, also the clock (`calib.apps.joining.streams.Streamed`).
 
     Raises:
-        UsageError: an unknown `by`, one for which the files have no columns, or ``motion`` without a robot.
+        UsageError: an unknown `by`, one for which the files have no columns, or ``motion`` or links without a robot.
         MeasurementError: the points were not measured at the poses of the joints' file.
     """
     one_of(by or "row", METHODS, "by", UsageError)
     joints_file, points_file = Path(joints), Path(points)
+    named_links = base is not None or tip is not None
+    require(robot is not None or not named_links, "--base and --tip are links of a robot: give --robot", UsageError)
     if isinstance(robot, str | Path):
         robot = load_calibrated(robot, base, tip)
     if by == "motion":

@@ -359,6 +359,7 @@ class Layout:
         base_sigma, base_sigma_rotation: three names each for the sigmas of the base frame, or none.
         late: four names for the target's velocity and the time, or none.
         torques: n names of the joints' torques at rest, or none.
+        torque_fault: why columns of torques are not read, and what to do; None without such columns.
         payload: name of the column with the mass that the tip carries; "" without one.
         notes: remarks for the user on how the columns were chosen.
     """
@@ -377,6 +378,7 @@ class Layout:
     base_sigma_rotation: tuple[str, ...] = ()
     late: tuple[str, ...] = ()
     torques: tuple[str, ...] = ()
+    torque_fault: tuple[str, str] | None = None
     payload: str = ""
     notes: tuple[str, ...] = ()
 
@@ -407,7 +409,9 @@ def find_layout(sheet: Sheet, joints: Joints | Sequence[str]) -> Layout:
     """
     robot = Joints.of(joints)
     sheet.check_names(robot.names)
-    layout = replace(_layout(sheet, robot), torques=_find_torques(sheet, robot), payload=sheet.find("payload"))
+    torques, torque_fault = _find_torques(sheet, robot)
+    payload = sheet.find("payload")
+    layout = replace(_layout(sheet, robot), torques=torques, torque_fault=torque_fault, payload=payload)
     if not sheet.has_our_names(layout.joints, robot.names):
         note = f"the joints are read from {', '.join(layout.joints)}"
         layout = replace(layout, notes=(note, *layout.notes))
@@ -430,8 +434,8 @@ def find_layout(sheet: Sheet, joints: Joints | Sequence[str]) -> Layout:
     return layout
 
 
-def _find_torques(sheet: Sheet, robot: Joints) -> tuple[str, ...]:
-    """Return the names of the joints' torques, ``tau1`` … or ``tau_<joint name>``; () where not all are there.
+def _find_torques(sheet: Sheet, robot: Joints) -> tuple[tuple[str, ...], tuple[str, str] | None]:
+    """Return the names of the joints' torques, ``tau1`` … or ``tau_<joint name>``, or why they are not read.
 
     Columns in a unit of currents are none: gravity at rest is compared with torques.
 
@@ -439,13 +443,21 @@ def _find_torques(sheet: Sheet, robot: Joints) -> tuple[str, ...]:
         sheet: the table with its options.
         robot: the robot's joints.
     """
-    numbers = range(1, len(robot.names) + 1)
-    for form in ([f"tau{number}" for number in numbers], [f"tau_{name}" for name in robot.names]):
-        columns = tuple(filter(None, map(sheet.find, form)))
-        if len(columns) == len(form):
-            units = {sheet.unit(column, "torque").lower() for column in columns}
-            return columns if units <= {"", *EFFORTS} else ()
-    return ()
+    numbered = [f"tau{number}" for number in range(1, len(robot.names) + 1)]
+    for form in (numbered, [f"tau_{name}" for name in robot.names]):
+        columns = [sheet.find(name) for name in form]
+        present = tuple(filter(None, columns))
+        if not present:
+            continue
+        missing = [name for name, column in zip(robot.names, columns) if not column]
+        if missing:
+            reason = f"those of {listing(missing)} are missing, and gravity is found by the torques of all joints"
+            return (), (reason, "record them, or add empty columns for joints without a sensor")
+        units = {sheet.unit(column, "torque") for column in present}
+        if not {unit.lower() for unit in units} <= {"", *EFFORTS}:
+            return (), (f"their columns are in {listing(sorted(units))}", "torques at rest are read in N m or N mm")
+        return present, None
+    return (), None
 
 
 def _layout(sheet: Sheet, robot: Joints) -> Layout:

@@ -33,6 +33,7 @@ class PoseMeasurements:
             frame; None if not known.
         measured_torque: (m, n) joint torques that the arm measured at rest [N m]; NaN where none was read; None without
             columns of torques.
+        torque_fault: why torques in the file are not read, and what to do; None where they are read, or there are none.
         payload: (m, 4) stated mass [kg] and centre of mass [m] of what the tip carries, in the tip's frame; NaN where
             not stated; None if the file states none.
         ignored: names of columns that were not read, for messages.
@@ -55,6 +56,7 @@ class PoseMeasurements:
     torque: np.ndarray | None = None
     load: np.ndarray | None = None
     measured_torque: np.ndarray | None = None
+    torque_fault: tuple[str, str] | None = None
     payload: np.ndarray | None = None
     ignored: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()

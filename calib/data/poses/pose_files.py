@@ -311,6 +311,7 @@ def _with_loads(sheet: Sheet, layout: Layout, block: PoseMeasurements) -> PoseMe
     if layout.torques:
         torque = sheet.numbers(layout.torques, TORQUE, gaps=True)
         block = replace(block, measured_torque=torque[rows])
+    block = replace(block, torque_fault=layout.torque_fault)
     stated = sheet.options.payload
     if not layout.payload and stated.mass is None:
         return block

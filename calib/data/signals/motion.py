@@ -116,6 +116,7 @@ class Motion:
         sampling, cutoffs: reports of resampling and of the choice of cut-offs.
         notes: remarks for the user.
         jumps, faults: those of the recording.
+        hashes: hashes of the recording's samples, sorted, by which it is recognised; None: not computed.
         located: time at which a designed motion, used as the reference, begins [s]; None for another reference.
     """
 
@@ -149,6 +150,7 @@ class Motion:
     jumps: tuple[str, ...] = ()
     faults: tuple[ColumnFault, ...] = ()
     located: float | None = None
+    hashes: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.t)
@@ -363,11 +365,15 @@ def _smooth(sampled: Resampled, cutoff: np.ndarray, order: int) -> np.ndarray:
         cutoff: (n,) cut-offs f_q [Hz].
         order: order of the Butterworth filter in one pass.
     """
+    key = (*cutoff.tolist(), order)
+    if key in sampled.filtered:
+        return sampled.filtered[key]
     # By joints, as all that follows reads them.
     result = np.array(sampled.series["q"], order="F")
     for rows in filtering.segments(sampled.segment):
         for j, f in enumerate(cutoff):
             result[rows, j] = filtering.low_pass(result[rows, j], sampled.rate, float(f), order)
+    sampled.filtered[key] = read_only(result)
     return result
 
 

@@ -20,7 +20,7 @@ positions. All of this is our choice. In real logs, the Panda's samples have to 
 those of the LWR4+ and TIAGo are even, and the UR10e's stamps are correct.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -332,6 +332,8 @@ class Resampled:
         segment: (N,) number of each sample's segment, increasing.
         rate: sampling rate [Hz].
         report: quality of the recording's time stamps.
+        filtered: positions (N, n) that were filtered before, by cut-offs and order: a motion is made several times with
+            some filters unchanged.
     """
 
     t: np.ndarray
@@ -340,6 +342,7 @@ class Resampled:
     segment: np.ndarray
     rate: float
     report: SamplingReport
+    filtered: dict[tuple[float, ...], np.ndarray] = field(default_factory=dict)
 
 
 def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: float | None = None) -> Resampled:

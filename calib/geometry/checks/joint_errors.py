@@ -18,7 +18,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import fminbound
 
 from calib.data.poses.measurements import Positions
 from calib.errors import Finding, finding
@@ -217,6 +216,8 @@ def _best_ratio(residuals: np.ndarray, shape: np.ndarray) -> tuple[float, float]
         residuals: (m, 3) residuals.
         shape: (m, 3, 3) covariance per s².
     """
+    from scipy.optimize import fminbound  # slow to load
+
     scale = float(np.trace(shape, axis1=1, axis2=2).mean()) / 3.0
 
     def cost(power: float) -> float:

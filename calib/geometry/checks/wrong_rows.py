@@ -5,9 +5,13 @@ Both hypotheses are tested by the least error of the arm over all placements of 
 on the tool. They are linear in B ⊗ p, B and b: 13 numbers per axis of y.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +35,8 @@ MAX_CUTS = 120
 MIN_MIXED = 24
 # largest number of iterations of the assignment of rows to targets; a few are needed
 MAX_ROUNDS = 50
+# size of a combination of columns, relative to the largest, below which it is rounding
+ROUNDING = 1e-10
 Blocks = Sequence[PoseMeasurements]
 
 
@@ -146,13 +152,116 @@ def _best_first(nominal: Installation, block: Positions, shift: int) -> int | No
     if len(numbers) < MIN_SHIFTED or len(_shifted(block, 0, shift)) < MIN_PAIRED * len(block):
         return None
 
-    def error(first: int) -> float:
-        return float(least_error(nominal, [_shifted(block, first, shift)])[0])
-
+    errors = _CutErrors.of(nominal, block, shift)
     coarse = numbers[evenly(len(numbers), MAX_CUTS)]
-    best = int(min(coarse, key=error))
+    best = coarse[np.argmin(errors.at(coarse))]
     around = numbers[np.abs(numbers - best) < max(len(numbers) // MAX_CUTS, 1)]
-    return int(min(around, key=error))
+    return int(around[np.argmin(errors.at(around))])
+
+
+@dataclass(frozen=True, eq=False)
+class _CutErrors:
+    """Errors of a block whose joint values are shifted from some row on, for every such row from the same sums.
+
+    The rows of a target contribute products of their columns, with their own joint values before the cut and with the
+    shifted ones behind it. The least squares of all cuts follow from sums of these products.
+
+    Attributes:
+        gap: number of rows behind the cut that have no joint values.
+        targets: for each target, its rows in order.
+    """
+
+    gap: int
+    targets: tuple[_TargetRows, ...]
+
+    @classmethod
+    def of(cls, nominal: Installation, block: Positions, shift: int) -> _CutErrors:
+        """Return the errors of a block with joint values shifted by `shift` rows, as of `_shifted`."""
+        columns = _independent(_columns(nominal, block))
+        centred = block.position - block.position.mean(axis=0)
+        unshifted = _partners(block.rows, block.rows)
+        shifted = _partners(block.rows, block.rows + shift)
+        order = np.argsort(block.rows, kind="stable")
+        targets = []
+        for tool in np.unique(block.tool):
+            rows = order[block.tool[order] == tool]
+            before = np.hstack([columns[unshifted[rows]], centred[rows]])
+            behind = np.hstack([columns[shifted[rows]], centred[rows]])
+            is_paired = shifted[rows] >= 0
+            behind[~is_paired] = 0.0
+            targets.append(_TargetRows(block.rows[rows], before, behind, is_paired))
+        return cls(max(-shift, 0), tuple(targets))
+
+    def at(self, first: np.ndarray) -> np.ndarray:
+        """Return the mean squared error [m²] with the joint values shifted from each row number `first` (k,) on.
+
+        Args:
+            first: rising row numbers.
+        """
+        squares = np.zeros(len(first))
+        count = np.zeros(len(first))
+        for target in self.targets:
+            cut = np.searchsorted(target.numbers, first)
+            start = np.searchsorted(target.numbers, first + self.gap)
+            behind = _sums_before(target.behind, np.append(start, len(target.numbers)))
+            sums = _sums_before(target.before, cut) + behind[-1] - behind[:-1]
+            squares += _unexplained_squares(sums)
+            paired_before = np.concatenate([[0], np.cumsum(target.is_paired)])
+            count += cut + paired_before[-1] - paired_before[start]
+        return squares / count
+
+
+class _TargetRows(NamedTuple):
+    """Rows of one target by their numbers (m,): columns of the model and positions (m, w), before and behind a cut.
+
+    `is_paired` (m,) tells which rows have joint values behind the cut.
+    """
+
+    numbers: np.ndarray
+    before: np.ndarray
+    behind: np.ndarray
+    is_paired: np.ndarray
+
+
+def _independent(columns: np.ndarray) -> np.ndarray:
+    """Return orthonormal columns (m, r) that span the given columns (m, w)."""
+    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return basis[:, sizes > ROUNDING * sizes[0]]
+
+
+def _sums_before(columns: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """Return the sums of products (k, w, w) of the rows of columns (m, w) before each of the rising `ends` (k,)."""
+    edges = np.concatenate([[0], ends])
+    products = []
+    for start, end in pairwise(edges):
+        part = columns[start:end]
+        products.append(part.T @ part)
+    return np.cumsum(products, axis=0)
+
+
+def _unexplained_squares(sums: np.ndarray) -> np.ndarray:
+    """Return the least sum of squares (k,) of positions, the last three columns, as combinations of all others.
+
+    Args:
+        sums: (k, w, w) sums of products of the columns.
+    """
+    cross = sums[:, :-3, -3:]
+    inverse = np.linalg.pinv(sums[:, :-3, :-3], ROUNDING, hermitian=True)
+    explained = np.einsum("kij,kij->k", cross, inverse @ cross)
+    total = np.trace(sums[:, -3:, -3:], axis1=1, axis2=2)
+    return np.maximum(total - explained, 0.0)
+
+
+def _partners(rows: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return the index of the first row of each number in `numbers` (k,); -1 for absent numbers.
+
+    Args:
+        rows: (m,) row numbers in the file.
+        numbers: row numbers to find.
+    """
+    present, index = np.unique(rows, return_index=True)
+    position = np.minimum(np.searchsorted(present, numbers), len(present) - 1)
+    return np.where(present[position] == numbers, index[position], -1)
 
 
 def _shifted_block(number: int, first: int, shift: int, blocks: Blocks) -> Blocks:
@@ -177,13 +286,12 @@ def _shifted(block: Positions, first: int, shift: int) -> Positions:
         first: row number in the file.
         shift: number of rows; negative: rows further up.
     """
-    numbers, index = np.unique(block.rows, return_index=True)
     source = np.where(block.rows >= first, block.rows + shift, block.rows)
-    position = np.minimum(np.searchsorted(numbers, source), len(numbers) - 1)
+    partner = _partners(block.rows, source)
     # further up, the first rows have the joint values of none
-    is_unpaired = (block.rows >= first) & (source < first) & (numbers[0] < first)
-    present = np.flatnonzero((numbers[position] == source) & ~is_unpaired)
-    return replace(take(block, present), q=block.q[index[position[present]]])
+    is_unpaired = (block.rows >= first) & (source < first) & (block.rows.min() < first)
+    present = np.flatnonzero((partner >= 0) & ~is_unpaired)
+    return replace(take(block, present), q=block.q[partner[present]])
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,7 +117,8 @@ def contradictions(fit: GeometricFit, rigid: GeometricFit, stated: StatedComplia
 
     Where effects of gravity were added to the geometry, they may hide a stated compliance that is too large: a bearing
     that tilts about the axis of a joint turns the arm as the joint does. Compliant bearings only add to the joint's
-    compliance, so that the geometry without them must not be stiffer than stated.
+    compliance, so that the geometry without them must not be stiffer than stated. Where it is softer, either bearings
+    give or the stated compliance is too small, which poses cannot distinguish: a note says so.
 
     Args:
         fit: the chosen model, whose first corrections are those of the stated compliance.
@@ -125,11 +126,18 @@ def contradictions(fit: GeometricFit, rigid: GeometricFit, stated: StatedComplia
         stated: the compliance that was the prior.
     """
     deviations = [entry for entry in _deviations(fit, stated) if abs(entry.sigmas) > MAX_SIGMAS]
-    if all(term.basis in BY_GRAVITY for term in fit.cell.deflection.terms):
-        joints = [entry.joint for entry in deviations]
-        stiffer = [entry for entry in _deviations(rigid, stated) if entry.sigmas > MAX_SIGMAS]
-        deviations += [entry for entry in stiffer if entry.joint not in joints]
-    return [entry.finding() for entry in deviations]
+    findings = [entry.finding() for entry in deviations]
+    if not all(term.basis in BY_GRAVITY for term in fit.cell.deflection.terms):
+        return findings
+    joints = {entry.joint for entry in deviations}
+    for entry in _deviations(rigid, stated):
+        if entry.joint in joints:
+            continue
+        if entry.sigmas > MAX_SIGMAS:
+            findings.append(entry.finding())
+        elif entry.sigmas < -MAX_SIGMAS:
+            findings.append(entry.softer())
+    return findings
 
 
 @dataclass(frozen=True)
@@ -153,6 +161,11 @@ class _Deviation:
     def finding(self) -> Finding:
         """Return the finding of a contradiction."""
         return finding("compliance-contradicted", **{**asdict(self), "sigmas": abs(self.sigmas)})
+
+    def softer(self) -> Finding:
+        """Return the finding of a joint about whose axis the poses show more compliance than stated."""
+        times = self.compliance / self.stated
+        return finding("compliance-exceeded", **{**asdict(self), "sigmas": abs(self.sigmas)}, times=times)
 
 
 def _deviations(fit: GeometricFit, stated: StatedCompliance) -> list[_Deviation]:

@@ -56,13 +56,14 @@ def column_fault(regressor: np.ndarray, torque: np.ndarray, finite: np.ndarray) 
     Args:
         regressor: (m, n, p) gravity regressor of the rows.
         torque: (m, n) measured torques [N m]; zero where none was measured.
-        finite: (m, n) whether a torque was measured.
+        finite: (m, n) whether a torque was measured; nowhere for a joint without a sensor, which is left out.
     """
-    rows = finite.all(axis=1)
+    sensed = np.asarray(finite.any(axis=0))
+    rows = finite[:, sensed].all(axis=1)
     if rows.sum() < regressor.shape[2]:
         return None
     torques = torque[rows] - torque[rows].mean(axis=0)
-    matrix = regressor[rows] - regressor[rows].mean(axis=0)
+    matrix = (regressor[rows] - regressor[rows].mean(axis=0)) * sensed[:, None]
     spread = torques.std(axis=0)
     spread = np.maximum(spread, MIN_SPREAD_SHARE * spread.max())
     feels_gravity = np.abs(matrix).max(axis=(0, 2)) > NO_GRAVITY * spread

@@ -10,7 +10,7 @@ estimated. The first file's load is the stated one, or none: the arm's masses th
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,10 +46,12 @@ MAX_MASS = 800.0
 MAX_PAYLOAD_SHARE = 3.0
 # described gravity is this many times the measured one where torques are in N·mm (our choice)
 MILLIMETRES = 200.0
-# share of a file's rows at rest from which on its torques are those of the arm with some load (our choice)
-MIN_AT_REST = 0.5
 # what is said of torques that are zero, and what to do
 ZERO = "they are zero in every row", "is the sensors' signal in other columns?"
+# sigmas by which a factor of torques has to exceed what an arm may have
+FACTOR_SIGMAS = 4.0
+# [N² m²] sum of squares below which gravity does not vary
+TINY = 1e-12
 # what to do about torques that are far too large
 IN_MILLIMETRES = "name the columns tau1 [N mm] …"
 Fault = tuple[str, str]
@@ -63,9 +65,11 @@ class GravityFit:
     Attributes:
         chain: the arm with the fitted masses; single parameters are not right, their torques are.
         sign: 1.0 where the sensors count the torque that balances the load, -1.0 where they count the load.
-        offset, sigma: (n,) offset of each sensor, and standard deviation of its torques about the model [N m].
+        offset, sigma: (n,) offset of each sensor, and standard deviation of its torques about the model [N m]; infinite
+            for a joint whose torques were not read.
         loads: for each fitted file, its load (4,): first moments [kg m] and mass [kg] in the last body's frame.
         mass_sigmas: for each fitted file, the standard deviation of the load's mass [kg].
+        covariance: (5 n, 5 n) of first moments and masses (4 n), and of the sensors' offsets.
     """
 
     chain: Chain
@@ -74,6 +78,7 @@ class GravityFit:
     sigma: np.ndarray
     loads: tuple[np.ndarray, ...] = ()
     mass_sigmas: tuple[float, ...] = ()
+    covariance: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def balancing(self, block: PoseMeasurements) -> np.ndarray:
         """Return the measured torques (m, n) of a block as those that balance gravity; NaN where none were measured."""
@@ -84,13 +89,13 @@ class GravityFit:
         """Return the load (4,) of a block's rows that explains their torques best, and the sigma of its mass [kg]."""
         torque = self.balancing(block) - gravity_torques(self.chain, block.q)
         regressor = gravity_regressor(self.chain, block.q)[..., -4:]
-        deviations = _load_deviations(self.chain)
+        deviations = load_deviations(self.chain)
         values, covariance = np.zeros(4), np.diag(deviations**2)
         weights = np.isfinite(torque)
         for _ in range(ROUNDS):
-            values, covariance = _most_probable(regressor, torque, weights / self.sigma, deviations)
+            values, covariance = most_probable(regressor, torque, weights / self.sigma, deviations)
             residual = torque - regressor @ values
-            weights = np.abs(residual) < MAX_RESIDUAL * np.maximum(_spreads(residual), self.sigma)
+            weights = np.abs(residual) < MAX_RESIDUAL * np.maximum(spreads(residual), self.sigma)
         return values, _mass_sigma(values, covariance)
 
     def at_rest(self, block: PoseMeasurements) -> np.ndarray:
@@ -106,47 +111,6 @@ class GravityFit:
             residual: (m, n) measured torques minus those of gravity [N m]; NaN where none was measured.
         """
         return np.asarray(np.abs(residual) < MAX_RESIDUAL * self.sigma)
-
-
-def without_contradicting_torques(
-    block: PoseMeasurements, gravity: GravityFit
-) -> tuple[PoseMeasurements, list[Finding]]:
-    """Return a block without its measured torques where no load explains them, and a finding on these.
-
-    Args:
-        block: measurements that were not fitted.
-        gravity: the gravity of the fitted ones.
-    """
-    if block.measured_torque is None:
-        return block, []
-    unmeasured = np.isnan(block.measured_torque)
-    resting = np.all(gravity.at_rest(block) | unmeasured, axis=1)
-    if resting.mean() >= MIN_AT_REST:
-        return block, []
-    reason, cure = _contradiction(block, gravity)
-    files = [block.file]
-    unused = finding("torques-unused", files=files, reason=reason, cure=cure)
-    return replace(block, measured_torque=None), [unused]
-
-
-def _contradiction(block: PoseMeasurements, gravity: GravityFit) -> Fault:
-    """Return why torques of a block are not those of the fitted arm with any load, and what to do."""
-    torque = np.asarray(block.measured_torque)
-    fault = _nothing_read(torque)
-    if fault is not None:
-        return fault
-    finite = np.isfinite(torque)
-    expected = gravity.sign * gravity_torques(gravity.chain, block.q)
-    factor = _factor(expected, torque, finite)
-    if abs(factor) > MILLIMETRES:
-        return f"they are {abs(factor):.0f} times the gravity of the fitted files", IN_MILLIMETRES
-    fault = column_fault(gravity_regressor(gravity.chain, block.q), np.where(finite, torque, 0.0), finite)
-    if fault is not None:
-        return fault
-    if factor < 0.0:
-        return "their sign is the other one than in the fitted files", "reverse the sign of all of them"
-    cure = "were they read at rest, by the same sensors, in the same unit and joint order as those of the fit?"
-    return "with the gravity of the fitted files, no load explains them", cure
 
 
 def by_stated_load(block: PoseMeasurements) -> list[np.ndarray]:
@@ -265,15 +229,13 @@ def gravity_fit(chain: Chain, blocks: Sequence[PoseMeasurements]) -> tuple[Gravi
     torque = np.concatenate(torques)
     finite = np.isfinite(torque)
     fit = None
-    fault = _nothing_read(torque)
+    fault = nothing_read(torque)
     if fault is None:
         if finite.any(axis=1).sum() < chain.n:
             return None, []
         described = reference_masses(chain)
         regressor = np.concatenate([gravity_regressor(chain, block.q) for block in measured])
-        factor = _factor(regressor @ described[:, 6:].ravel(), torque, finite)
-        fault = _too_large(chain, described, factor)
-        fault = fault or column_fault(regressor, np.where(finite, torque, 0.0), finite)
+        factor, fault = _factor_and_fault(chain, described, regressor, torque)
     if fault is None:
         sign = float(np.sign(factor)) or 1.0
         fit = _fitted(chain, measured, regressor, sign, abs(factor) * described[:, 6:])
@@ -285,7 +247,43 @@ def gravity_fit(chain: Chain, blocks: Sequence[PoseMeasurements]) -> tuple[Gravi
     return None, [finding("torques-unused", files=files, reason=reason, cure=cure)]
 
 
-def _nothing_read(torque: np.ndarray) -> Fault | None:
+def fault_of_file(chain: Chain, block: PoseMeasurements) -> Fault | None:
+    """Return why torques of a file contradict each other, or any gravity, and what to do; None if they do not.
+
+    Args:
+        chain: the arm, with its described masses if they are known.
+        block: the measurements of one file, with torques.
+    """
+    torque = np.asarray(block.measured_torque)
+    fault = nothing_read(torque)
+    if fault is not None or len(block) < chain.n:
+        return fault
+    described = reference_masses(chain)
+    regressor = gravity_regressor(chain, block.q)
+    _, fault = _factor_and_fault(chain, described, regressor, torque)
+    return fault
+
+
+def _factor_and_fault(
+    chain: Chain, described: np.ndarray, regressor: np.ndarray, torque: np.ndarray
+) -> tuple[float, Fault | None]:
+    """Return the factor of torques (m, n) over the described gravity, and why they are not those of an arm if so.
+
+    Args:
+        chain: the arm.
+        described: (n, 10) described standard parameters, as of `reference_masses`.
+        regressor: (m, n, 4 n) gravity regressor of the rows.
+        torque: measured torques [N m]; NaN where none was read.
+    """
+    finite = np.isfinite(torque)
+    factor, sigma = gravity_factor(regressor @ described[:, 6:].ravel(), torque)
+    fault = _too_large(chain, described, factor, sigma)
+    if fault is None:
+        fault = column_fault(regressor, np.where(finite, torque, 0.0), finite)
+    return factor, fault
+
+
+def nothing_read(torque: np.ndarray) -> Fault | None:
     """Return that torques (m, n) are zero or empty, and what to do; None where a sensor read something."""
     finite = np.isfinite(torque)
     if np.max(np.abs(torque), initial=0.0, where=finite) >= MIN_SPREAD:
@@ -295,18 +293,19 @@ def _nothing_read(torque: np.ndarray) -> Fault | None:
     return "their columns are empty", ZERO[1]
 
 
-def _too_large(chain: Chain, described: np.ndarray, factor: float) -> Fault | None:
+def _too_large(chain: Chain, described: np.ndarray, factor: float, sigma: float) -> Fault | None:
     """Return that torques are far too large for an arm, and what to do; None where they may be right.
 
     Args:
         chain: the arm.
         described: (n, 10) described standard parameters, as of `reference_masses`.
-        factor: torques over the gravity of these.
+        factor, sigma: torques over the gravity of these, and its standard deviation.
     """
-    if chain.inertias is not None and abs(factor) > MILLIMETRES:
+    least = abs(factor) - FACTOR_SIGMAS * sigma
+    if chain.inertias is not None and least > MILLIMETRES:
         return f"they are {abs(factor):.0f} times the gravity of the described masses", IN_MILLIMETRES
     mass = abs(factor) * float(described[:, 9].sum())
-    if mass > MAX_MASS * chain.stretched_length() ** 2:
+    if mass * least / abs(factor or 1.0) > MAX_MASS * chain.stretched_length() ** 2:
         reason = f"they are the gravity of an arm of {mass:.0f} kg, which is too heavy for its length"
         return reason, IN_MILLIMETRES
     return None
@@ -322,10 +321,28 @@ def _unlike_gravity(fit: GravityFit, measured: Sequence[PoseMeasurements]) -> Fa
     return reason, cure
 
 
-def _factor(expected: np.ndarray, torque: np.ndarray, finite: np.ndarray) -> float:
-    """Return the factor by which expected torques (m, n) explain the variation of the measured ones best."""
-    varying = np.where(finite, expected - np.mean(expected, axis=0, where=finite), 0.0)
-    return float(np.sum(varying * np.where(finite, torque, 0.0)) / max(float(np.sum(varying**2)), 1e-12))
+def gravity_factor(expected: np.ndarray, torque: np.ndarray) -> tuple[float, float]:
+    """Return the factor by which expected torques explain the variation of measured ones, and its standard deviation.
+
+    Args:
+        expected: (m, n) torques of gravity.
+        torque: (m, n) measured torques; NaN where none was read.
+    """
+    expected_variation = _variation(np.where(np.isfinite(torque), expected, np.nan))
+    variation = _variation(torque)
+    squares = max(float(np.sum(expected_variation**2)), TINY)
+    factor = float(np.sum(expected_variation * variation)) / squares
+    residual = variation - factor * expected_variation
+    variance = float(np.sum(residual**2)) / max(int(np.isfinite(torque).sum()), 1)
+    return factor, float(np.sqrt(variance / squares))
+
+
+def _variation(torque: np.ndarray) -> np.ndarray:
+    """Return torques (m, n) minus the mean of their column; 0 where they are NaN."""
+    finite = np.isfinite(torque)
+    values = np.where(finite, torque, 0.0)
+    mean = values.sum(axis=0) / np.maximum(finite.sum(axis=0), 1)
+    return np.where(finite, values - mean, 0.0)
 
 
 def _unexplained(fit: GravityFit, measured: Sequence[PoseMeasurements]) -> float:
@@ -338,11 +355,10 @@ def _unexplained(fit: GravityFit, measured: Sequence[PoseMeasurements]) -> float
         sizes.append(torque)
     torque = np.concatenate(sizes)
     residual = np.concatenate(errors)
-    varying = torque - np.nanmean(torque, axis=0)
-    return float(np.sqrt(np.nansum(residual**2) / max(float(np.nansum(varying**2)), 1e-12)))
+    return float(np.sqrt(np.nansum(residual**2) / max(float(np.sum(_variation(torque) ** 2)), TINY)))
 
 
-def _load_deviations(chain: Chain) -> np.ndarray:
+def load_deviations(chain: Chain) -> np.ndarray:
     """Return the prior standard deviations (4,) of a load: first moments [kg m] and mass [kg], as for the whole arm."""
     mass = float(reference_masses(chain)[:, 9].sum())
     lever = CENTRE + float(np.linalg.norm(chain.tail[:3, 3]))
@@ -372,7 +388,7 @@ def _fitted(
     largest = np.max(np.abs(np.where(finite, torque, 0.0)), axis=0)
     deviations = np.concatenate([deviations, np.maximum(OFFSET * largest, MIN_SPREAD)])
     first = 0
-    load_deviations = _load_deviations(replace(chain, inertias=_with_parameters(chain, prior)))
+    of_load_prior = load_deviations(replace(chain, inertias=_with_parameters(chain, prior)))
     for number, block in enumerate(measured):
         rows = np.arange(first, first + len(block))
         first += len(block)
@@ -384,15 +400,16 @@ def _fitted(
         of_load = np.zeros((len(torque), n, 4))
         of_load[rows] = regressor[rows][..., -4:]
         columns.append(of_load)
-        deviations = np.concatenate([deviations, load_deviations])
+        deviations = np.concatenate([deviations, of_load_prior])
     matrix = np.concatenate(columns, axis=2)
-    sigma = np.maximum(np.nanstd(np.where(finite, torque, np.nan), axis=0), MIN_SPREAD)
+    squares = _variation(np.where(finite, torque, np.nan)) ** 2
+    sigma = np.maximum(np.sqrt(squares.sum(axis=0) / np.maximum(finite.sum(axis=0), 1)), MIN_SPREAD)
     values, covariance = np.zeros(matrix.shape[2]), np.eye(matrix.shape[2])
     weights = finite.astype(float)
     for _ in range(ROUNDS):
-        values, covariance = _most_probable(matrix, torque, weights / sigma, deviations)
+        values, covariance = most_probable(matrix, torque, weights / sigma, deviations)
         residual = np.where(finite, torque - matrix @ values, np.nan)
-        sigma = np.maximum(_spreads(residual), MIN_SPREAD)
+        sigma = np.where(finite.any(axis=0), np.maximum(spreads(residual), MIN_SPREAD), np.inf)
         weights = (np.abs(residual) < MAX_RESIDUAL * sigma).astype(float)
     masses = prior + values[: 4 * n].reshape(n, 4)
     sigmas = [0.0]
@@ -401,13 +418,15 @@ def _fitted(
         loads[number] = values[start : start + 4]
         sigmas.append(_mass_sigma(loads[number], covariance[start : start + 4, start : start + 4]))
     fitted = replace(chain, inertias=_with_parameters(chain, masses))
-    return GravityFit(fitted, sign, values[4 * n : 5 * n], sigma, tuple(loads), tuple(sigmas))
+    offsets = values[4 * n : 5 * n]
+    of_gravity = covariance[: 5 * n, : 5 * n]
+    return GravityFit(fitted, sign, offsets, sigma, tuple(loads), tuple(sigmas), of_gravity)
 
 
-def _spreads(residual: np.ndarray) -> np.ndarray:
+def spreads(residual: np.ndarray) -> np.ndarray:
     """Return the robust standard deviation (n,) of each joint's residuals (m, n); NaN are left out."""
-    spreads = [spread(column[np.isfinite(column)]) for column in residual.T]
-    return np.array(spreads)
+    deviations = [spread(column[np.isfinite(column)]) for column in residual.T]
+    return np.array(deviations)
 
 
 def _with_parameters(chain: Chain, parameters: np.ndarray) -> np.ndarray:
@@ -419,7 +438,7 @@ def _with_parameters(chain: Chain, parameters: np.ndarray) -> np.ndarray:
     return result
 
 
-def _most_probable(
+def most_probable(
     matrix: np.ndarray, torque: np.ndarray, weights: np.ndarray, deviations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the most probable parameters (p,) and their covariance (p, p).

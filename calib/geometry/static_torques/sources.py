@@ -73,7 +73,8 @@ def driven(block: PoseMeasurements, gravity: GravityFit, source: str = MEASURED)
     torque = modelled
     if source == MEASURED:
         measured = gravity.balancing(block)
-        torque = np.where(gravity.agrees(measured - modelled), measured, modelled)
+        usable = gravity.agrees(measured - modelled) & np.isfinite(gravity.sigma)
+        torque = np.where(usable, measured, modelled)
     return replace(block, load=loads, torque=torque)
 
 
@@ -138,8 +139,9 @@ def torques_used(deflection: Deflection, gravity: GravityFit | None, source: str
         MEASURED: "as measured, elsewhere of masses fitted to these",
         MODELLED: "of masses fitted to the measured ones",
     }
-    worst = int(np.argmax(gravity.sigma))
-    sigma = float(np.sqrt(np.mean(gravity.sigma**2)))
+    sensed = np.where(np.isfinite(gravity.sigma), gravity.sigma, 0.0)
+    worst = int(np.argmax(sensed))
+    sigma = float(np.sqrt(np.sum(sensed**2) / np.count_nonzero(sensed)))
     joint = gravity.chain.joint_names[worst]
     worst_sigma = float(gravity.sigma[worst])
     return [finding("torques-used", source=texts[source], sigma=sigma, joint=joint, worst=worst_sigma)]

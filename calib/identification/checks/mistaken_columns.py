@@ -8,7 +8,7 @@ hypothesis is named only where the score becomes much smaller than with the colu
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import cache, lru_cache, partial
 from itertools import combinations, product
 from typing import NamedTuple
 
@@ -113,14 +113,23 @@ def with_torques(matrix: np.ndarray) -> ColumnChange:
     return lambda columns: Columns(columns.samples, matrix @ columns.mixing)
 
 
+def with_motion(change: Callable[[MotionSamples], MotionSamples]) -> ColumnChange:
+    """Return the change of columns that makes a change of the motion alone."""
+    return lambda columns: Columns(change(columns.samples), columns.mixing)
+
+
 def with_positions(matrix: np.ndarray) -> ColumnChange:
     """Return the change that multiplies the positions of all joints by a matrix (n, n)."""
-    return lambda columns: Columns(_changed(columns.samples, matrix), columns.mixing)
+    return with_motion(partial(_changed, matrix=matrix))
 
 
 def with_both(matrix: np.ndarray) -> ColumnChange:
     """Return the change that multiplies positions and torques of all joints by a matrix (n, n)."""
-    return lambda columns: Columns(_changed(columns.samples, matrix), matrix @ columns.mixing)
+    return _in_turn(with_positions(matrix), with_torques(matrix))
+
+
+def _in_turn(first: ColumnChange, second: ColumnChange) -> ColumnChange:
+    return lambda columns: second(first(columns))
 
 
 def with_zero(joint: int, angle: float) -> ColumnChange:
@@ -202,8 +211,11 @@ def _position_changes(samples: MotionSamples) -> list[Change[Columns]]:
         changes.append(Change("position-sign", reversed_position, (joint,), max_left=MAX_LEFT_EXCHANGED))
     for pair in combinations(moving, 2):
         matrix = exchange(n, *pair)
-        changes.append(Change("positions-exchanged", with_positions(matrix), pair, max_left=MAX_LEFT_EXCHANGED))
-        changes.append(Change("columns-exchanged", with_both(matrix), pair, max_left=MAX_LEFT_EXCHANGED))
+        # Both hypotheses share one motion, and so its factorisation.
+        exchanged = with_motion(lru_cache(maxsize=1)(partial(_changed, matrix=matrix)))
+        with_torques_too = _in_turn(exchanged, with_torques(matrix))
+        changes.append(Change("positions-exchanged", exchanged, pair, max_left=MAX_LEFT_EXCHANGED))
+        changes.append(Change("columns-exchanged", with_torques_too, pair, max_left=MAX_LEFT_EXCHANGED))
     bodies = samples.bodies
     turning = np.unique(bodies.coordinates[bodies.kinds == REVOLUTE])
     for joint, angle in product(np.intersect1d(moving, turning).tolist(), ZEROS):

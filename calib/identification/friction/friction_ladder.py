@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -284,26 +285,18 @@ class _Bench:
         if self.forced:
             return columns, self.errors([*selected, *columns]), _flat(at)
 
-        halves_error = self.errors(selected, 2)
-        ranges_error = self.validation.extrapolated(self._with_base(selected))
         side = self.term(columns[0]).side
         accepted = columns
         # Twice: the second time with the terms of those joints only at which they pay.
         for _ in range(2):
             model = [*selected, *accepted]
             new_error = self.errors(model)
-            new_halves_error = self.errors(model, 2)
-            new_ranges_error = self.validation.extrapolated(self._with_base(model))
             improved = []
             for joint_set in at:
                 rows = self._rows(joint_set, side)
-                before = self._whitened(error, rows)
-                after = self._whitened(new_error, rows)
-                pays = _pays(before, after)
-                carries = pays and _carries(self._whitened(halves_error, rows), self._whitened(new_halves_error, rows))
-                if carries and _extrapolates(
-                    self._whitened(ranges_error, rows), self._whitened(new_ranges_error, rows)
-                ):
+                pays = _pays(self._whitened(error, rows), self._whitened(new_error, rows))
+                # Halves and ranges take as long again, and most terms do not pay.
+                if pays and self._carries(selected, model, rows) and self._extrapolates(selected, model, rows):
                     improved.append(joint_set)
             at = tuple(improved)
             tested = accepted
@@ -313,6 +306,31 @@ class _Bench:
             if accepted == tested:
                 return accepted, new_error, _flat(at)
         return accepted, self.errors([*selected, *accepted]), _flat(at)
+
+    def _carries(self, selected: Sequence[int], model: Sequence[int], rows: list[int]) -> bool:
+        """Return whether the rms error of cross-validation with two halves grew by a share of at most `MIN_GAIN`.
+
+        Args:
+            selected, model: columns without and with the tested terms.
+            rows: torque rows that the terms affect.
+        """
+        before = self._whitened(self.errors(selected, 2), rows)
+        after = self._whitened(self.errors(model, 2), rows)
+        return bool(after.sum() <= (1.0 + MIN_GAIN) ** 2 * before.sum())
+
+    def _extrapolates(self, selected: Sequence[int], model: Sequence[int], rows: list[int]) -> bool:
+        """Return whether the squared errors in held-out ranges of motion did not increase, in geometric mean.
+
+        Args:
+            selected, model: columns without and with the tested terms.
+            rows: torque rows that the terms affect.
+        """
+        before = self._whitened(self.validation.extrapolated(self._with_base(selected)), rows)
+        after = self._whitened(self.validation.extrapolated(self._with_base(model)), rows)
+        positive = (before > 0.0) & (after > 0.0)
+        if not positive.any():
+            return True
+        return bool(np.log(after[positive] / before[positive]).mean() <= 0.0)
 
     def _rows(self, joints: tuple[int, ...], side: str) -> list[int]:
         """Return the indices of the torque rows that terms of these joints affect, on one side of the gears.
@@ -382,27 +400,6 @@ def _joints(term: DriveTerm) -> tuple[int, ...]:
 def _flat(joint_sets: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
     """Return the sorted union of sets of joints."""
     return tuple(sorted({joint for joint_set in joint_sets for joint in joint_set}))
-
-
-def _carries(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the rms error of cross-validation with two halves grew by a share of at most `MIN_GAIN`.
-
-    Args:
-        before, after: squared errors per time block without and with the tested terms.
-    """
-    return bool(after.sum() <= (1.0 + MIN_GAIN) ** 2 * before.sum())
-
-
-def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the squared errors in held-out ranges of motion (k,) did not increase, in geometric mean.
-
-    Args:
-        before, after: (k,) squared errors in each range without and with the tested terms.
-    """
-    positive = (before > 0.0) & (after > 0.0)
-    if not positive.any():
-        return True
-    return bool(np.log(after[positive] / before[positive]).mean() <= 0.0)
 
 
 def _pays(before: np.ndarray, after: np.ndarray) -> bool:
@@ -567,7 +564,6 @@ def _cross_validation(
     if candidates.prior is not None:
         prior_rows = np.sqrt(TEMPERING) * candidates.prior.widened(len(all_terms))
     blocks = 1 + max(int(part.block.max(initial=-1)) for part in rows)
-    case_regimes = regimes(rows, candidates.cases, decimator)
     validation = CrossValidation(
         data,
         rows=rows[0].target.shape[1],
@@ -576,6 +572,6 @@ def _cross_validation(
         inflation=candidates.inflation,
         group=np.array(groups),
         prior=prior_rows,
-        regimes=case_regimes,
+        regimes=partial(regimes, rows, candidates.cases, decimator),
     )
     return validation, columns_of

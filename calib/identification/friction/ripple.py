@@ -22,7 +22,7 @@ choice: neither noise nor a single short disturbance contributes). Held-out time
 are regularised towards zero, how finely frequency is resolved, and whether an order is kept.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -232,8 +232,8 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     power = {}
     for gear in turns:
         if gear != joint:
-            lobes = _lobes(coherence(track, gear, residual))
-            power[gear] = lobes[turns[gear] - TURNS[0]]
+            orders = _lobe_orders(np.array(turns[gear]))
+            power[gear] = np.maximum(coherence_at(track, gear, residual, orders), 0.0).sum()
     gears = [joint]
     if power:
         gears.append(max(power, key=power.__getitem__))
@@ -390,6 +390,44 @@ def coherence(track: GearTravel, gear: int, residual: np.ndarray) -> np.ndarray:
         gear: joint of the gear, from 0.
         residual: (N,) high-frequency part of an unexplained torque.
     """
+    cell, speed_bin = _cells(track, gear)
+    numbers, block = np.unique(track.block, return_inverse=True)
+    result = np.zeros(CELLS // 2 + 1)
+    for selected in _speed_bins(speed_bin):
+        index = block[selected] * CELLS + cell[selected]
+        sums = np.bincount(index, residual[selected], len(numbers) * CELLS)
+        spectrum = np.fft.rfft(sums.reshape(len(numbers), CELLS), axis=1)
+        result += _between_blocks(spectrum) / selected.sum()
+    return result
+
+
+def coherence_at(track: GearTravel, gear: int, residual: np.ndarray, orders: np.ndarray) -> np.ndarray:
+    """Return the coherence S(k) of K orders k of a gear, (K,), equal to those by `coherence`.
+
+    Args:
+        track: motion of the gears.
+        gear: joint of the gear, from 0.
+        residual: (N,) high-frequency part of an unexplained torque.
+        orders: (K,) orders k per turn.
+    """
+    cell, speed_bin = _cells(track, gear)
+    in_block = np.unique(track.block)[:, None] == track.block
+    phase = np.outer(cell, orders) % CELLS * (2.0 * np.pi / CELLS)
+    waves = residual[:, None] * np.exp(-1j * phase)
+    result = np.zeros(len(orders))
+    for selected in _speed_bins(speed_bin):
+        spectrum = in_block[:, selected].astype(float) @ waves[selected]
+        result += _between_blocks(spectrum) / selected.sum()
+    return result
+
+
+def _cells(track: GearTravel, gear: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the cell of the turn (N,) and the bin of the velocity (N,) of each sample; bin 0 is the slowest tenth.
+
+    Args:
+        track: motion of the gears.
+        gear: joint of the gear, from 0.
+    """
     q = track.q[:, gear]
     v = track.v[:, gear]
     speed = np.abs(v)
@@ -398,18 +436,20 @@ def coherence(track: GearTravel, gear: int, residual: np.ndarray) -> np.ndarray:
     speed_bin = np.searchsorted(edges, speed, side="right") * direction
     turns = q / (2.0 * np.pi) * CELLS
     cell = np.floor(turns).astype(int) % CELLS
-    numbers, block = np.unique(track.block, return_inverse=True)
-    result = np.zeros(CELLS // 2 + 1)
-    # Bin 0 holds the slowest tenth, which is left out.
+    return cell, speed_bin
+
+
+def _speed_bins(speed_bin: np.ndarray) -> Iterator[np.ndarray]:
+    """Yield the mask (N,) of the samples of each bin but bin 0, the slowest tenth, which is left out."""
     for number in np.unique(speed_bin[speed_bin != 0]):
-        selected = speed_bin == number
-        index = block[selected] * CELLS + cell[selected]
-        sums = np.bincount(index, residual[selected], len(numbers) * CELLS)
-        spectrum = np.fft.rfft(sums.reshape(len(numbers), CELLS), axis=1)
-        together = np.abs(spectrum.sum(axis=0)) ** 2
-        separately = (np.abs(spectrum) ** 2).sum(axis=0)
-        result += (together - separately) / selected.sum()
-    return result
+        yield speed_bin == number
+
+
+def _between_blocks(spectrum: np.ndarray) -> np.ndarray:
+    """Return the power (K,) of the sum of spectra (blocks, K) beyond the sum of their powers."""
+    together = np.abs(spectrum.sum(axis=0)) ** 2
+    separately = (np.abs(spectrum) ** 2).sum(axis=0)
+    return together - separately
 
 
 def _lobes(power: np.ndarray) -> np.ndarray:
@@ -418,9 +458,13 @@ def _lobes(power: np.ndarray) -> np.ndarray:
     Args:
         power: coherence S(k) of the orders k = 0, 1, …, from `coherence`.
     """
-    turns = np.array(TURNS)
     positive = np.maximum(power, 0.0)
-    return positive[turns] + positive[2 * turns] + positive[2 * turns + 2]
+    return positive[_lobe_orders(np.array(TURNS))].sum(axis=0)
+
+
+def _lobe_orders(turns: np.ndarray) -> np.ndarray:
+    """Return the orders per turn N, 2 N and 2 N + 2 (3, ...) of gears with N motor turns per turn."""
+    return np.stack([turns, 2 * turns, 2 * turns + 2])
 
 
 def _climb(

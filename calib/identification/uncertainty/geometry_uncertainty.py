@@ -61,8 +61,8 @@ MIN_PIECE = 32
 """Decimated samples of such a piece, at least."""
 PIECE = 4096
 """Samples of such a piece at the full rate, about."""
-BLOCK = 256
-"""Samples at a time: the regressor of so many stays in the processor's cache."""
+BLOCK = 4096
+"""Samples at a time: their states stay in the processor's cache."""
 CHUNK = 2000
 """Decimated samples at a time, where each needs its own line of a matrix."""
 NOTHING = 0.01
@@ -491,19 +491,19 @@ def _differences(
     unprojected = replace(torque_rows, projection=None)
     joint_residual = unprojected.fold(joint_residual, (BODIES,))[:, :, 0]
 
+    neighbours = [bodies for pair in pairs for bodies in pair]
+    factors = (0.5 / STEP, -0.5 / STEP)
     change = np.zeros((len(pairs), n, len(q)))
     pull = np.zeros((inertial, len(pairs)))
     for start in range(0, len(q), BLOCK):
-        part = slice(start, min(start + BLOCK, len(q)))
-        block_residual = np.ascontiguousarray(joint_residual[part].T).ravel()
-        # One array for all pairs: what is zero in one regressor is so in all of them.
-        out = np.zeros((inertial, n, min(BLOCK, len(q) - start)))
-        regressor = out.reshape(inertial, -1)
-        for k, pair in enumerate(pairs):
-            for bodies, factor in zip(pair, (0.5 / STEP, -0.5 / STEP)):
-                rigid_body.fill_regressor(bodies, q[part], v[part], a[part], out)
-                change[k, :, part] += factor * (parameters @ regressor).reshape(n, -1)
-                pull[:, k] += factor * (regressor @ block_residual)
+        part = slice(start, start + BLOCK)
+        states = (q[part], v[part], a[part])
+        products = rigid_body.regressor_products(neighbours, parameters, *states, joint_residual[part])
+        for number, (torque, sums) in enumerate(products):
+            k = number // 2
+            factor = factors[number % 2]
+            change[k, :, part] += factor * torque
+            pull[:, k] += factor * sums
     acts = (BODIES,) * len(pairs)
     rows = torque_rows.observe(change.transpose(2, 1, 0), acts, q, v)
     of_bodies = base.kept < inertial

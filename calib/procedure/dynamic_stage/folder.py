@@ -11,6 +11,7 @@ import numpy as np
 
 from calib import files, folders
 from calib.data.csv_table import read_table
+from calib.data.signals.fingerprint import Fingerprint, Fingerprints
 from calib.dynamics.base import expressions
 from calib.identification.checks.joint_compliance import JointCompliance, encoder_difference
 from calib.identification.gains import GainRecord
@@ -39,6 +40,7 @@ from calib.units import headings, per_ampere
 TORQUE_RATE = 100.0
 
 INSTRUMENTAL = "instrumental.csv"
+RECORDINGS = "recordings.json"
 COMPLIANCE_HEADER = (
     "joint",
     folders.COMPLIANCE,
@@ -57,6 +59,7 @@ OURS = (
     folders.COVARIANCE,
     information.INFORMATION,
     INSTRUMENTAL,
+    RECORDINGS,
     folders.JOINT_COMPLIANCE,
     folders.METRICS,
     "drive_gains.csv",
@@ -92,6 +95,13 @@ class IdentificationFolder:
     robot = folders.InFolder(calibrated.ROBOT)
     model = folders.InFolder(MODEL)
     numbers = folders.InFolder(folders.METRICS)  # with verdict and findings
+    recordings = folders.InFolder(RECORDINGS)
+
+    def identified_from(self) -> tuple[Fingerprint, ...]:
+        """Read the fingerprints of the recordings that were identified from; folders of earlier versions have none."""
+        if not self.recordings.is_file():
+            return ()
+        return read_json(self.recordings, "identify again", Fingerprints).recordings
 
     @property
     def tables(self) -> tuple[Path, Path]:
@@ -277,6 +287,17 @@ def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
         rows = zip(inputs.chain.joint_names, plain(gains.values), plain(gains.sigma), status)
         files.write_table(folder / "drive_gains.csv", header, rows)
     files.write_json(folder / folders.METRICS, metrics(outcome))
+    files.write_json(folder / RECORDINGS, _fingerprints(inputs.cases))
+
+
+def _fingerprints(cases: Sequence[Case]) -> Fingerprints:
+    """Return the fingerprints of recordings, by which an update recognises them."""
+    recordings: list[Fingerprint] = []
+    for case in cases:
+        motion = case.motion
+        if motion.hashes is not None:
+            recordings += [Fingerprint.of(case.name, motion.file, motion.hashes)]
+    return Fingerprints(tuple(recordings))
 
 
 def _compliance_row(joint: JointCompliance, names: Sequence[str]) -> tuple[object, ...]:

@@ -197,7 +197,7 @@ def on_nominal_geometry(folder: Path) -> Dynamics | None:
 def _ranking(carried: GeometryUncertainty) -> np.ndarray:
     """Return the indices of the geometric elements, sorted by the largest parameter shift that one σ causes.
 
-    Elements without σ are last.
+    Elements without σ are last. Shifts that are equal but for rounding keep the order of the chain.
 
     Args:
         carried: effect of the geometry's uncertainty on the parameters.
@@ -206,7 +206,9 @@ def _ranking(carried: GeometryUncertainty) -> np.ndarray:
     shift_per_unit = _per_sigma(carried).max(axis=0, initial=0.0)
     deviations = np.where(has_sigma, carried.deviations, 0.0)
     size = np.where(has_sigma, shift_per_unit * deviations, shift_per_unit)
-    return np.lexsort((-size, ~has_sigma))
+    with np.errstate(divide="ignore"):
+        magnitude = np.round(np.log(size), 6)
+    return np.lexsort((-magnitude, ~has_sigma))
 
 
 def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:

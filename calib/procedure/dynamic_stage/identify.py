@@ -14,6 +14,7 @@ import numpy as np
 from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, finding
+from calib.identification.checks.gravity import GravityHypotheses
 from calib.identification.friction.passivity import driven
 from calib.identification.identify import Identification, identify
 from calib.identification.loop import LoopController, LoopDisagreement, Replay
@@ -191,6 +192,7 @@ def assess(
     findings: ModelFindings,
     errors: torque_errors.TorqueErrorModel | None = None,
     wrong: Sequence[int] | None = None,
+    hypotheses: GravityHypotheses | None = None,
     progress: Progress | None = None,
 ) -> DynamicsAssessment:
     """Return a model's torque predictions for every recording, the prediction errors, and the verdict.
@@ -201,6 +203,7 @@ def assess(
         findings: findings on the model, from its identification.
         errors: expected torque errors of the model; None if unknown.
         wrong: indices of joints whose friction term adds energy; None: computed by `friction.passivity.driven`.
+        hypotheses: result of `gravity_hypotheses` for these inputs; None: computed.
         progress: called with a text on each step; None: silent.
     """
     say = progress or silent
@@ -210,7 +213,7 @@ def assess(
 
     say("judging")
     labels = inputs.options.settings.torque_rows.numbered(inputs.chain.n)
-    implausible = plausibility.implausible(inputs, findings.contradiction, findings.unlike)
+    implausible = plausibility.implausible(inputs, findings.contradiction, findings.unlike, hypotheses)
     figures, rules = judging.judge(scored.fit, scored.proofs, scored.repeated, scored.excitation, labels)
     drives = judging.friction_drives(joint + 1 for joint in wrong)
     if drives:
@@ -318,13 +321,15 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     if settings.with_geometry:
         inputs = replace(inputs, options=replace(inputs.options, settings=settings))
         return judged(*with_geometry.run_jointly(inputs, progress or silent), progress=progress)
-    return judged(inputs, identify(inputs.robot, inputs.cases, settings, progress), progress=progress)
+    found = identify(inputs.robot, inputs.cases, settings, progress)
+    return judged(inputs, found, hypotheses=hypotheses, progress=progress)
 
 
 def judged(
     inputs: IdentificationInputs,
     found: Identification,
     jointly: with_geometry.GeometryFromTorques | None = None,
+    hypotheses: GravityHypotheses | None = None,
     progress: Progress | None = None,
 ) -> IdentificationOutcome:
     """Return the outcome of a finished identification: torque predictions for every recording, errors, and the verdict.
@@ -333,6 +338,7 @@ def judged(
         inputs: robot, recordings and options.
         found: the identification.
         jointly: geometry estimated together with the dynamics; None if it was not requested.
+        hypotheses: result of `gravity_hypotheses` for these inputs; None: computed.
         progress: called with a text on each step; None: silent.
 
     Raises:
@@ -358,7 +364,7 @@ def judged(
         unlike=found.loop.disagreement,
         plain=tuple(plain.plain_values(found).tolist()),
     )
-    assessment = assess(inputs, found.dynamics, findings, errors, wrong, progress=say)
+    assessment = assess(inputs, found.dynamics, findings, errors, wrong, hypotheses, progress=say)
     return IdentificationOutcome(
         **field_values(assessment),
         inputs=inputs,

@@ -14,6 +14,7 @@ from calib.data.recordings.recording import Recording, earlier, in_pieces, parse
 from calib.data.recordings.recording_files import read_recording
 from calib.data.schema import Joints
 from calib.data.signals.filtering import SHARE
+from calib.data.signals.fingerprint import sample_hashes
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, with_reference
 from calib.data.signals.resampling import Resampled, resample
 from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, refused_as, suggestion
@@ -339,6 +340,8 @@ def read_motion(
         recording = read_recording(given, joints, own.recording, companions)
     sampled = resample(recording, own.filter.clock, own.filter.gap)
 
+    hashes = sample_hashes([recording.q, recording.effort])
+
     options = own.filter
     same_band = like is not None and own.filter.band is None
     if like is not None and same_band and like.band * np.median(np.diff(recording.t)) < MAX_CUTOFF:
@@ -346,6 +349,7 @@ def read_motion(
     motion = make_motion(recording, options, sampled)
     if own.filter.cutoff is None:
         motion = _sharper(recording, motion, options, sampled)
+    motion = replace(motion, hashes=hashes)
     # windows of the decimation take too much of the ends of a short recording
     max_factor = LOST * len(motion) / WINDOW
     if options.band is not None or motion.decimator.factor <= max(max_factor, 1.0):
@@ -359,7 +363,19 @@ def read_motion(
     )
     wider = make_motion(recording, wider_options, sampled, motion.cutoffs)
     note = f"identification band f_p = {wider.band:.3g} Hz instead, to keep the ends of a short recording"
-    return replace(wider, notes=(*motion.notes, note))
+    return replace(wider, notes=(*motion.notes, note), hashes=hashes)
+
+
+def rows_per_second(band: float, duration: float) -> float:
+    """Return the least number of rows per second with which `read_motion` lets a recording be identified.
+
+    Windows of the decimation take less than `LOST` of a recording, and its band passes.
+
+    Args:
+        band: identification band of the motion [Hz].
+        duration: duration of the recording [s].
+    """
+    return max(2.0 * band / SHARE, WINDOW / (LOST * duration))
 
 
 def _joints(values: np.ndarray) -> tuple[float, ...]:

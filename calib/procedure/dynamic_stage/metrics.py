@@ -18,12 +18,13 @@ from calib.estimation.essential import EliminationStep
 from calib.identification.friction.friction_ladder import FrictionTrial
 from calib.identification.friction.ripple import RippleWaves
 from calib.identification.gains import GainRecord
-from calib.identification.identify import Identification
+from calib.identification.identify import Identification, common_decimator
 from calib.identification.loop import LoopMetrics, Replay
 from calib.identification.methods.constraint_settings import Binding
 from calib.identification.prediction import Score, relative_error_sigma
 from calib.identification.registry import METHODS
 from calib.identification.rows import Case
+from calib.identification.uncertainty.error_bands import ErrorBands, error_bands
 from calib.identification.uncertainty.error_growth import error_growth
 from calib.procedure.dynamic_stage import geometry_tables, with_geometry
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome, ModelFindings
@@ -177,6 +178,9 @@ class ModelMetrics(JudgedMetrics):
         findings: findings that the verdict needs besides the recordings; None in files of earlier versions.
         error_density: (rows,) spectral density of the torque errors [N² m² s or N² s]; None in files of earlier
             versions.
+        error_growth, torque_variance: (rows,) share of the density that grows with the torque, and the variance of the
+            torques from which it was estimated [N² m² or N²]; None in files of earlier versions.
+        error_bands: the density in wider bands; None in files of earlier versions.
         seed: seed of all random numbers.
         schema: version of the file's format.
     """
@@ -204,6 +208,7 @@ class ModelMetrics(JudgedMetrics):
     error_density: Array | None = None
     error_growth: Array | None = None
     torque_variance: Array | None = None
+    error_bands: ErrorBands | None = None
     seed: int = 0
     schema: int = SCHEMA
 
@@ -239,6 +244,8 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
     method = identification.fitted.method
     filters = {case.name: FilterMetrics.of(case.motion) for case in (*inputs.cases, *inputs.unseen)}
     growth = error_growth(identification.rows, identification.fitted.estimate.values)
+    decimator = common_decimator(inputs.cases, identification.settings)
+    bands = error_bands(inputs.cases, outcome.predictions, identification.rows, decimator)
     return ModelMetrics(
         **_judged(outcome),
         rows=identification.settings.torque_rows.numbered(inputs.chain.n),
@@ -265,6 +272,7 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         error_density=_error_density(identification, inputs.cases),
         error_growth=growth.share,
         torque_variance=growth.torque_variance,
+        error_bands=bands,
         seed=outcome.seed,
     )
 

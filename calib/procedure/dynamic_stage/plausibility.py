@@ -11,6 +11,7 @@ import numpy as np
 from calib.column_changes import Change, Explanation
 from calib.data.recordings.checks import LIMITS as RECORDED
 from calib.errors import Finding, finding
+from calib.identification.checks.gravity import GravityHypotheses
 from calib.identification.checks.recording_sizes import FOLLOWS, ClockRatio, RecordingSizes, compare_sizes, signs_of
 from calib.identification.checks.torque_lag import Lag
 from calib.identification.loop import LoopDisagreement
@@ -54,7 +55,10 @@ MAX_UNIT_ERROR = 0.01
 
 
 def implausible(
-    inputs: IdentificationInputs, impossible_by: Contradiction | None, loop: LoopDisagreement | None
+    inputs: IdentificationInputs,
+    impossible_by: Contradiction | None,
+    loop: LoopDisagreement | None,
+    hypotheses: GravityHypotheses | None = None,
 ) -> tuple[Finding, ...]:
     """Return all findings on implausible recordings, descriptions and estimates; accepted findings are marked.
 
@@ -63,11 +67,12 @@ def implausible(
         impossible_by: distance of the estimate from every physically consistent robot; None: unknown.
         loop: disagreement of recorded torques with an estimate that relies on the stated control loop; None: no
             disagreement.
+        hypotheses: gravity, for columns as recorded; None: computed.
     """
     chain, gravity = inputs.chain, inputs.options.settings.gravity
     cases = [*inputs.cases, *inputs.unseen]
     columns = {case.name: signs_of(case, chain, gravity) for case in cases}
-    hypotheses = likelier_gravity(inputs, gravity_hypotheses(inputs), columns)
+    hypotheses = likelier_gravity(inputs, hypotheses or gravity_hypotheses(inputs), columns)
     if hypotheses is not None and hypotheses.direction is not None:
         # columns that seem exchanged or coupled under a wrong gravity need not be
         x, y, z = hypotheses.direction.tolist()

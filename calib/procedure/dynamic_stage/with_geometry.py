@@ -10,7 +10,8 @@ Files in addition to those of every identification::
     joint_covariance.csv               of elements, tilts and dynamic parameters, with their correlations
 
 The two stages stand beside as the plain reference. They are kept where the joint estimate predicts held-out torques
-worse, and where the torques contradict the geometry before: a log of another arm must not move it.
+or the fit's held-out poses worse, and where the torques contradict the geometry before: a log of another arm must not
+move it.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import erfc
@@ -31,13 +33,16 @@ from calib.identification.methods.least_squares import LeastSquares
 from calib.identification.prediction import predict
 from calib.identification.registry import method_named
 from calib.identification.uncertainty.geometry_uncertainty import GeometryUncertainty
-from calib.identification.uncertainty.joint_estimate import JointEstimate, identify_jointly
+from calib.procedure.dynamic_stage.held_out_poses import HeldOutErrors, held_out_errors
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, Progress
 from calib.procedure.dynamic_stage.verdict import model_findings
 from calib.robot.calibrated import CalibratedChain
 from calib.units import TORQUE
 
-# ratio of squared errors on held-out torques up to which the joint estimate is not worse
+if TYPE_CHECKING:
+    from calib.identification.uncertainty.joint_estimate import JointEstimate
+
+# ratio of squared errors on held-out torques, and on held-out poses, up to which the joint estimate is not worse
 MAX_HELD_OUT = 1.001
 # probability below which torques and geometry contradict each other, by the largest of all distances (our choice)
 CONTRADICTION = 1e-4
@@ -57,6 +62,7 @@ class GeometryFromTorques:
         noticed: findings.
         unseen: ratio of squared errors on held-out recordings to those of the two stages; None without such recordings.
         regrouped: the estimate by independent elements.
+        poses: errors of the fit's held-out poses with its geometry and with this one; None without such poses.
     """
 
     estimate: JointEstimate
@@ -64,6 +70,7 @@ class GeometryFromTorques:
     noticed: tuple[Finding, ...]
     unseen: float | None
     regrouped: JointEstimate
+    poses: HeldOutErrors | None = None
 
     @property
     def held_out(self) -> float:
@@ -95,6 +102,7 @@ class GeometryFromTorquesMetrics:
         widening: factor by which the variance of the torques was raised, median over combinations of elements.
         elements: free elements, and tilts of gravity.
         gains: gain of each torque row, measured over true torque, with its standard deviation.
+        poses: errors of the fit's held-out poses with its geometry and with this one; None without such poses.
     """
 
     delivered: bool
@@ -103,6 +111,7 @@ class GeometryFromTorquesMetrics:
     widening: float
     elements: tuple[ElementChange, ...]
     gains: tuple[tuple[float, float], ...] = ()
+    poses: HeldOutErrors | None = None
 
 
 def run_jointly(
@@ -117,6 +126,8 @@ def run_jointly(
     Raises:
         UsageError: for another robot than an arm, methods without rows, or torques of unknown gain.
     """
+    from calib.identification.uncertainty.joint_estimate import identify_jointly  # slow to load
+
     settings = inputs.options.settings
     _require_usable(inputs)
     plain = identify(inputs.robot, inputs.cases, settings, say)
@@ -132,13 +143,26 @@ def run_jointly(
             return inputs, plain, GeometryFromTorques(by_torques, False, contradicting, None, by_torques)
     joint, robot, joint_identification = identify_all(progress=say)
     unseen = _unseen_ratio(inputs, plain, joint_identification)
-    result = GeometryFromTorques(joint, True, (), unseen, joint.regrouped(inputs.robot.complete))
-    if result.held_out > MAX_HELD_OUT:
-        noticed = finding("geometry-not-better", ratio=result.held_out)
-        return inputs, plain, replace(result, delivered=False, noticed=(noticed,))
+    poses = held_out_errors(inputs.source, inputs.robot.complete, robot.complete)
+    result = GeometryFromTorques(joint, True, (), unseen, joint.regrouped(inputs.robot.complete), poses)
+    worse = _worse_on_held_out(result)
+    if worse is not None:
+        return inputs, plain, replace(result, delivered=False, noticed=(worse,))
+    if poses is None:
+        result = replace(result, noticed=(finding("geometry-without-poses"),))
     gravity = joint_identification.settings.gravity
     options = replace(inputs.options, settings=replace(inputs.options.settings, gravity=gravity))
     return replace(inputs, robot=robot, options=options), joint_identification, result
+
+
+def _worse_on_held_out(result: GeometryFromTorques) -> Finding | None:
+    """Return a finding if the joint estimate is worse on held-out torques or poses than the two stages; else None."""
+    if result.held_out > MAX_HELD_OUT:
+        return finding("geometry-not-better", ratio=result.held_out)
+    poses = result.poses
+    if poses is not None and poses.after**2 > MAX_HELD_OUT * poses.before**2:
+        return finding("geometry-worse-on-poses", poses=poses.poses, before=poses.before, after=poses.after)
+    return None
 
 
 def _require_usable(inputs: IdentificationInputs) -> None:
@@ -280,4 +304,5 @@ def metrics(result: GeometryFromTorques) -> GeometryFromTorquesMetrics:
         widening=joint.widening,
         elements=changes(result.regrouped),
         gains=tuple(gains),
+        poses=result.poses,
     )

@@ -7,10 +7,13 @@ from typing import Protocol, cast
 
 import numpy as np
 
-from calib.dynamics.base import information
+from calib.dynamics.base import information, places
 from calib.errors import UsageError
+from calib.estimation.triangles import retriangulate
 from calib.folders import COVARIANCE
 from calib.identification.identify_options import FileSettings
+from calib.identification.physical_consistency.information import INFORMATION, read
+from calib.identification.uncertainty.error_bands import ErrorBands
 from calib.identification.uncertainty.error_growth import ErrorGrowth
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.geometry_tables import TORQUE_COVARIANCE
@@ -63,14 +66,18 @@ class PriorMotions:
         information: (b, b) ∫ ωᵀω dt of the regressor ω (rows, b), restricted to the columns of the design, with the
             rows divided by `sigmas`.
         sigmas: (rows,) square root of the torque errors' spectral density that an identification states; None: 1.
-        growth: how these errors grow with the motion; None if unknown.
+        data: (b, b) part of the information that is due to recordings, without priors; None: all of it.
+        growth: how the errors of the torques grow with the motion; None if unknown.
+        bands: how their density depends on the identification band; None if unknown.
     """
 
     names: tuple[str, ...]
     seconds: float
     information: np.ndarray
     sigmas: np.ndarray | None = None
+    data: np.ndarray | None = None
     growth: ErrorGrowth | None = None
+    bands: ErrorBands | None = None
 
     def per_sample(self, count: int, duration: float) -> np.ndarray:
         """Return the information (b, b) of the earlier motions in units of one sample of a new motion.
@@ -111,13 +118,15 @@ def read_prior(
         return None
     column_count = len(model.exact.names)
     total = np.zeros((column_count, column_count))
-    sigmas = growth = None
+    sigmas = growth = bands = data = None
     names: list[str] = []
     identified: tuple[str, ...] = ()
     if after is not None:
         total, sigmas = _identified_information(after, model, geometry)
         names.append("what is identified")
         growth = _growth(after, model)
+        bands = _bands(after, model)
+        data = _data_information(after, model)
         identified = tuple(IdentificationFolder(after).metrics().identification)
     row_sigmas = noise if sigmas is None else sigmas
     seconds = 0.0
@@ -128,9 +137,12 @@ def read_prior(
             q, v, a, rate = designed_orders(Path(text), chain)
         else:
             q, v, a, rate = _recorded(text, chain)
-        total += information(model.exact, q, v, a, row_sigmas) / rate
+        motion_information = information(model.exact, q, v, a, row_sigmas) / rate
+        total += motion_information
+        if data is not None:
+            data += motion_information
         seconds += len(q) / rate
-    return PriorMotions((*names, *paths), seconds, total, sigmas, growth)
+    return PriorMotions((*names, *paths), seconds, total, sigmas, data, growth, bands)
 
 
 def _identified_information(
@@ -184,6 +196,31 @@ def _growth(folder: Path, model: ExcitedModel) -> ErrorGrowth | None:
         return None
     loads = len(model.exact.loads)
     return ErrorGrowth(np.tile(metrics.error_growth, loads), np.tile(metrics.torque_variance, loads))
+
+
+def _bands(folder: Path, model: ExcitedModel) -> ErrorBands | None:
+    """Return how the errors of an identification depend on the band; None for files of earlier versions."""
+    bands = IdentificationFolder(folder).metrics().error_bands
+    if bands is None:
+        return None
+    return ErrorBands(bands.rows_per_second, np.tile(bands.density, len(model.exact.loads)))
+
+
+def _data_information(folder: Path, model: ExcitedModel) -> np.ndarray | None:
+    """Return the information (b, b) of an identification's recordings, without priors; None if there were no priors.
+
+    Columns that are not designed are marginalised.
+    """
+    if not (folder / INFORMATION).is_file():
+        return None
+    stored = read(folder)
+    index = places(model.exact.names, stored.names, model.exact.model.names)
+    if index is None:
+        return None
+    other = np.setdiff1d(np.arange(stored.b), index)
+    triangle = retriangulate(stored.factor[:, [*other, *index]])
+    of_design = triangle[len(other) :, len(other) :]
+    return of_design.T @ of_design
 
 
 def designed_orders(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:

@@ -27,7 +27,7 @@ from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.measuring.moveit import limit_tables, moveit_files
 from calib.robot.chain import Chain
 from calib.robot.collision import find_mesh, urdf_meshes
-from calib.robot.descriptions.xacro_files import split
+from calib.robot.descriptions.xacro_arguments import split
 from calib.robot.formats.urdf_tree import edited, set_attributes, text
 from calib.robot.formats.urdf_tree import read as read_tree
 

@@ -25,7 +25,8 @@ from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.stated_compliance import StatedCompliance, check_torques, read_compliance
 from calib.geometry.repeatability import repeated, repeated_rows, without_copies
-from calib.geometry.static_torques.gravity_fit import GravityFit, gravity_fit, without_contradicting_torques
+from calib.geometry.static_torques.agreement import agreeing_torques, unread_torques, without_contradicting_torques
+from calib.geometry.static_torques.gravity_fit import GravityFit
 from calib.geometry.static_torques.sources import MEASURED, driven, load_findings, with_stated_load
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.undecided_files import decided
@@ -204,15 +205,15 @@ def gather(
         if held_out is not None:
             unseen[_free_name(unseen, block.file)] = Unseen(held_out, held_out=True)
 
-    gravity, torque_findings = gravity_fit(weighed, fitted_blocks)
+    gravity, fit_blocks, torque_findings = agreeing_torques(weighed, fitted_blocks)
     noticed += torque_findings
     if gravity is not None:
-        for block in fitted_blocks:
+        for block in fit_blocks:
             noticed += load_findings(block, gravity)
         masses = gravity.chain.inertias
     elif masses is not None:
         notes += (f"gravity torques of the compliance are those of the masses identified in {settings.masses}",)
-    inputs = Inputs(chain, robot_file, tuple(fitted_blocks), unseen, notes, earlier, masses, tuple(noticed), gravity)
+    inputs = Inputs(chain, robot_file, fit_blocks, unseen, notes, earlier, masses, tuple(noticed), gravity)
     inputs = with_unseen(inputs, validate, options, settings)
     if settings.compliance:
         inputs = _with_compliance(inputs, settings.compliance)
@@ -269,8 +270,9 @@ def with_unseen(
             name = _free_name(unseen, block.file)
             block, unseen_readings = without_unseen(inputs.weighed, block, "copies" in options.accept)
             noticed += unseen_readings
+            noticed += unread_torques(block)
             if inputs.gravity is not None:
-                block, unused_torques = without_contradicting_torques(block, inputs.gravity)
+                block, unused_torques = without_contradicting_torques(block, inputs.gravity, inputs.fit)
                 noticed += [*unused_torques, *load_findings(block, inputs.gravity)]
             if settings.refit_frames:
                 unseen[name] = Unseen(block, own_frames=True, seen=fitted)

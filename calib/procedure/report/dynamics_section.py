@@ -612,6 +612,12 @@ def _joint_blocks(jointly: GeometryFromTorquesMetrics | None) -> list[page.Block
         f"torques determine {jointly.combinations} combinations of {len(jointly.elements)} elements; offsets of the "
         "first and the last joint are not identifiable",
     ]
+    poses = jointly.poses
+    if poses is not None:
+        lines.append(
+            f"{poses.poses} held-out poses of the fit: {1e3 * poses.before:.4f} mm rms before the torques, "
+            f"{1e3 * poses.after:.4f} mm after"
+        )
     if resting:
         lines.append(f"determined by poses or their prior rather than by torques: {listing(resting, 8)}")
     rows = []

@@ -84,6 +84,8 @@ class RowErrors:
         q: (rows, n) joint values [rad or m]; empty if several rows share an error, as are `points` and `rows`.
         points: (rows, 3) target positions in the arm's base frame [m].
         rows: row numbers in the file.
+        files: names of the files of the rows.
+        file: index of each row's file.
         worst: the row with the calibrated arm's largest error, if the set is only a sample of the rows; otherwise None.
     """
 
@@ -98,6 +100,8 @@ class RowErrors:
     urdf_alone: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     rows: tuple[int, ...] = ()
     worst: RowErrors | None = None
+    files: tuple[str, ...] = ()
+    file: tuple[int, ...] = ()
 
     def judged(self, deliverable: str) -> Mapping[str, tuple[float, ...]]:
         """Return the errors of the deliverable that is judged, by nature (position, orientation, distance) [m, rad].
@@ -314,6 +318,9 @@ def _errors_by_row(name: str, comparison: Comparison, unseen: bool, selection: s
     q = np.concatenate([block.q for block in comparison.blocks])
     numbers = np.concatenate([block.rows for block in comparison.blocks])
     points = _points(comparison)
+    names = [Path(block.file).name for block in comparison.blocks]
+    files = list(dict.fromkeys(names))
+    file_numbers = np.repeat([files.index(name) for name in names], [len(block) for block in comparison.blocks])
     expected: tuple[float, ...] = ()
     if comparison.intervals is not None:
         expected = _plain(comparison.intervals.radius[selection])
@@ -323,6 +330,8 @@ def _errors_by_row(name: str, comparison: Comparison, unseen: bool, selection: s
         points=_plain(points[selection]),
         expected=expected,
         rows=tuple(map(int, numbers[selection])),
+        files=tuple(files),
+        file=tuple(map(int, file_numbers[selection])),
     )
 
 

@@ -36,6 +36,8 @@ PALE = "#c3ccd6"
 LOGARITHMIC_RATIO = 6.0
 # edges of the bins of a histogram
 BIN_EDGES = 31
+# most files of a set that have a panel each in the chart of errors by row (our choice)
+MAX_FILES = 6
 
 
 def error_histogram(
@@ -369,6 +371,8 @@ def _point_values(report: Report, errors: RowErrors) -> dict[str, np.ndarray]:
         errors: errors of the rows.
     """
     values = {"row": np.array(errors.rows, dtype=float)}
+    if errors.files:
+        values["file"] = np.array(errors.file, dtype=float)
     if errors.expected:
         values["95 % expected within [mm]"] = 1e3 * np.array(errors.expected)
     joint_values = np.array(errors.q)
@@ -381,7 +385,7 @@ def _point_values(report: Report, errors: RowErrors) -> dict[str, np.ndarray]:
 
 
 def errors_by_row(report: Report, nature: str) -> Chart:
-    """Return a chart of the delivered arm's errors over the rows of the files, a panel per set of rows.
+    """Return a chart of the delivered arm's errors over the rows of the files: a panel per file, or per set of many.
 
     Args:
         report: results of the fit.
@@ -395,13 +399,17 @@ def errors_by_row(report: Report, nature: str) -> Chart:
         if nature not in delivered or len(errors.rows) != len(delivered[nature]):
             continue
         sizes = factor * np.array(delivered[nature])
-        title = "fitted rows"
-        if errors.unseen:
-            title = f"unseen rows of {errors.name}"
-        if errors.worst is not None:
-            title = f"{len(sizes)} of the {title}, at random"
-        points = Line(np.array(errors.rows), sizes, ".", AFTER, size=4.5)
-        panels.append(Panel([points], title, "row", f"error [{unit}]", grid="y"))
+        rows, files = np.array(errors.rows), np.array(errors.file)
+        kind = "unseen rows" if errors.unseen else "fitted rows"
+        parts = [(name, files == number) for number, name in enumerate(errors.files)]
+        if not 0 < len(parts) <= MAX_FILES:
+            parts = [(errors.name if errors.unseen else "", np.ones(len(rows), dtype=bool))]
+        for file, selected in parts:
+            title = f"{kind} of {file}" if file else kind
+            if errors.worst is not None:
+                title = f"{int(selected.sum())} of the {title}, at random"
+            points = Line(rows[selected], sizes[selected], ".", AFTER, size=4.5)
+            panels.append(Panel([points], title, "row", f"error [{unit}]", grid="y", file=file))
     return Chart(panels or [Panel([])], 0.5 + 1.2 * max(1, len(panels)))
 
 
@@ -439,7 +447,7 @@ def captioned(report: Report) -> dict[str, Captioned]:
         before, after = np.array(proof.nominal[nature]), np.array(delivered[nature])
         chart = residuals_by_joint(np.array(proof.q), before, after, report.joints, report.prismatic, nature, arm)
         points = _point_values(report, proof)
-        chart = replace(chart, points=points)
+        chart = replace(chart, points=points, files=proof.files)
         result["joints"] = chart, f"Errors against each joint, {label}: a trend shows an unmodelled effect."
 
         # intervals hold the joint corrections' errors: they say nothing of the robot without them
@@ -448,7 +456,7 @@ def captioned(report: Report) -> dict[str, Captioned]:
         quantity = report.metrics.fit.words(nature)
         caption = f"Remaining {quantity} error over the workspace, {label}"
         caption += "; below: radius expected to contain 95 % of the errors." if expected else "."
-        result["map"] = replace(chart, points=points), caption
+        result["map"] = replace(chart, points=points, files=proof.files), caption
         chart = errors_by_row(report, nature)
         result["rows"] = (
             chart,

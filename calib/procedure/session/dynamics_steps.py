@@ -68,13 +68,9 @@ def options_of(session: Session) -> IdentifyOptions:
     settings = options.settings
     if not section.options:
         rows = torque_rows(section.torques)
-        settings = replace(
-            settings,
-            torque_rows=rows,
-            friction=section.friction,
-            method=section.method,
-            with_geometry=section.with_geometry,
-        )
+        settings = replace(settings, torque_rows=rows, friction=section.friction, method=section.method)
+    if section.with_geometry:
+        settings = replace(settings, with_geometry=True)
     payloads = dict(section.payloads) | dict(settings.payloads)
     settings = replace(settings, payloads=payloads, seed=session.settings.seed)
     by_file = dict(options.files)

@@ -218,7 +218,8 @@ def _gains(designed: design.Designed, joints: list[_ShortParameter], parameters:
         if row.name in parameters and row.value and row.sigma_before and row.rsd is not None:
             before = 100.0 * row.sigma_before / abs(row.value)
             parts.append(f"σ of {row.name} from {before:.2g} to {row.rsd:.2g} %")
-    return [f"a further motion of {seconds:.0f} s, designed for this, is expected to change {listing(parts, 6)}"]
+    changes = f"a further motion of {seconds:.0f} s, designed for this, is expected to change {listing(parts, 6)}"
+    return [f"{changes} ({prediction.reached_range()})"]
 
 
 def promised(session: Session) -> tuple[str, ...]:

@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation
 from calib.config_types import number
 from calib.errors import RobotError, one_of, refuse_robot, refused_as, require
 from calib.files import shipped_text
-from calib.robot.descriptions.xacro_files import split
+from calib.robot.descriptions.xacro_arguments import split
 from calib.robot.formats.urdf_tree import UNLIMITED
 from calib.robot.formats.urdf_write import add_joint, xml_text
 from calib.transforms import invert, pose

@@ -3,15 +3,15 @@
 from functools import lru_cache
 from pathlib import Path
 
-from calib.robot.descriptions import mjcf, ur_calibration, xacro_files
+from calib.robot.descriptions.xacro_arguments import split
 
-READERS = {".xacro": xacro_files.expand, ".xml": mjcf.convert, ".mjcf": mjcf.convert, ".conf": ur_calibration.convert}
+SUFFIXES = (".xacro", ".xml", ".mjcf", ".conf")
 
 
 def takes(path: str) -> bool:
     """Return whether `urdf` can convert the file at `path`, and the file exists."""
-    file = Path(xacro_files.split(path)[0])
-    return file.suffix in READERS and file.is_file()
+    file = Path(split(path)[0])
+    return file.suffix in SUFFIXES and file.is_file()
 
 
 def urdf(path: str) -> str:
@@ -23,9 +23,17 @@ def urdf(path: str) -> str:
     Raises:
         RobotError: a file that cannot be converted.
     """
-    return _converted(path, Path(xacro_files.split(path)[0]).stat().st_mtime_ns)
+    return _converted(path, Path(split(path)[0]).stat().st_mtime_ns)
 
 
 @lru_cache(maxsize=8)  # one command reads its robot's file several times
 def _converted(path: str, changed: int) -> str:
-    return READERS[Path(xacro_files.split(path)[0]).suffix](path)
+    # Converters are slow to load, and few robots need one.
+    suffix = Path(split(path)[0]).suffix
+    if suffix == ".xacro":
+        from calib.robot.descriptions.xacro_files import expand as convert
+    elif suffix == ".conf":
+        from calib.robot.descriptions.ur_calibration import convert
+    else:
+        from calib.robot.descriptions.mjcf import convert
+    return convert(path)

@@ -14,7 +14,6 @@ rewritten.
 
 import os
 import re
-import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, suppress
@@ -27,30 +26,11 @@ from xml.etree import ElementTree as ET
 
 from calib.errors import RobotError, refuse_robot, suggestion
 from calib.robot.collision import PACKAGE_PATH, package_folders
+from calib.robot.descriptions.xacro_arguments import split
 
-_ARGUMENTS = re.compile(r"(?:(?<=\.xacro)|(?<=\.conf))\s+(?=\w+:=)")
 _MISSING = re.compile(r"Undefined substitution argument (\w+)")
 # Folders above the file in which packages are looked for (our choice).
 MAX_ABOVE = 4
-
-
-def split(path: str) -> tuple[str, dict[str, str]]:
-    """Return the file and the xacro arguments in a text such as ``arm.urdf.xacro name:=value``.
-
-    Args:
-        path: the text; without arguments, the path alone.
-    """
-    file, *arguments_text = _ARGUMENTS.split(path, maxsplit=1)
-    arguments: dict[str, str] = {}
-    if arguments_text:
-        for argument in shlex.split(arguments_text[0]):
-            name, separator, value = argument.partition(":=")
-            if not separator:
-                refuse_robot(
-                    file, f"'{argument}' is no xacro argument; write name:=value, values with blanks in quotes"
-                )
-            arguments[name] = value
-    return file, arguments
 
 
 class _Arguments(dict[str, str]):

@@ -150,6 +150,12 @@ def test_slow_blocks_run(page: Path, tmp_path: Path) -> None:
     assert blocks.run(page, tmp_path / "run", slow=True).complaints == []
 
 
+def test_no_page_runs_twice() -> None:
+    """The build of `.ci/run` leaves out the pages that the slow test runs, and no other."""
+    script = (DOCS.parent / ".ci/run").read_text(encoding="utf-8")
+    assert re.findall(r"--without (\S+)", script) == [page.stem for page in SLOW]
+
+
 @pytest.mark.parametrize("topic", commands.pages())
 def test_a_page_is_shown_where_no_pages_are_built(topic, capsys) -> None:
     """Each page is shown as its text, without directives of the builder."""

@@ -95,6 +95,8 @@ def test_wrong_order_or_arm_is_noticed(tmp_path, joints, arm, q):
     other = write(tmp_path / "o.csv", POINT, seen(arm, random_joints(arm, 40, 9)))
     with pytest.raises(MeasurementError, match="do not fit the 40 poses in any order"):
         calib.join(joints, other, robot="lwr4plus")
+    with pytest.raises(UsageError, match="links of a robot: give --robot"):
+        calib.join(joints, joints, tip="tool0")
     with pytest.raises(UsageError, match="by 'rows' is not one of name, time, row, geometry"):
         calib.join(joints, other, by="rows")
 

@@ -11,9 +11,10 @@ import pytest
 import calib
 from calib import folders
 from calib.apps.monitoring.learning.dynamics_update import DRIFT, LOG_TABLE, DynamicsUpdate
-from calib.apps.monitoring.learning.logs import common_share, dated, sketch
+from calib.apps.monitoring.learning.logs import dated
 from calib.apps.monitoring.learning.update import update_dynamics
 from calib.data.csv_table import read_table
+from calib.data.signals.fingerprint import common_share, sketch
 from calib.errors import MeasurementError, UsageError
 from calib.procedure.report.figures import figure_data
 from calib.result_kinds import kind_of
@@ -198,3 +199,35 @@ def test_a_sketch_recognises_a_part_of_a_log():
     assert common_share(hashes, sketch(hashes)) == 1.0
     assert common_share(hashes[::2], sketch(hashes)) == pytest.approx(0.5, abs=0.05)
     assert common_share(hashes + np.uint64(1), sketch(hashes)) == 0.0
+
+
+def test_the_log_of_the_identification_is_not_counted_twice(identified: Path, tmp_path: Path):
+    series = planted.series(0)
+    half = {name: values[: len(values) // 2 : 2] for name, values in series.items()}
+    piece = tmp_path / "piece_2026-03-01.npz"
+    np.savez(piece, **half)
+    table = tmp_path / "table_2026-03-02.csv"
+    names = [f"{name}{joint}" for name in ("q", "tau") for joint in (1, 2, 3)]
+    columns = np.column_stack([series["t"], series["q"], series["tau"]])
+    np.savetxt(table, columns, delimiter=",", header=",".join(["t", *names]), comments="")
+    update = update_dynamics(identified, [str(piece), str(table), log(tmp_path, "2026-03-03", 31)])
+    assert codes(update) == ["log-repeated", "log-repeated"]
+    assert {remark.values["before"] for remark in update.noticed} == {"first.npz"}
+    assert [record.learnt for record in update.logs] == [False, False, True]
+    again = update_dynamics(
+        update.save(tmp_path / "today", plots=False), [str(table.rename(tmp_path / "2026-03-04.csv"))]
+    )
+    assert codes(again) == ["log-repeated"]
+
+
+def test_a_log_older_than_the_identification_is_not_learnt_from(identified: Path, tmp_path: Path):
+    folder = shutil.copytree(identified, tmp_path / "first")
+    recordings = folder / "recordings.json"
+    recordings.write_text(recordings.read_text().replace("first.npz", "first_2026-03-05.npz"))
+    logs = [log(tmp_path, f"2026-03-{day:02}", day) for day in (4, 5)]
+    update = update_dynamics(folder, logs)
+    assert codes(update) == ["log-older"]
+    assert update.noticed[0].values["before_date"] == "2026-03-05"
+    assert [record.name for record in update.logs] == ["log_2026-03-05.npz"]
+    with pytest.raises(UsageError, match="older than first_2026-03-05"):
+        update_dynamics(folder, logs[:1])

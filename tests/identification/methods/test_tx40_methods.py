@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calib.apps.studies.conditions import Condition
-from calib.apps.studies.experiment import make_experiment
+from calib.apps.studies.experiment import Experiment, make_experiment
 from calib.identification.registry import METHODS
 
 # torque error [%] on unseen motion, and size of the errors in stated standard deviations (None: biased by more than
@@ -15,10 +15,14 @@ EXPECTED = {
 }  # fmt: skip
 
 
+@pytest.fixture(scope="module")
+def data() -> Experiment:
+    return make_experiment(Condition("lowest noise", "tx40", np.deg2rad(1e-4), 0.05), 0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EXPECTED)
-def test_a_tx40_is_recovered(name):
-    data = make_experiment(Condition("lowest noise", "tx40", np.deg2rad(1e-4), 0.05), 0)
+def test_a_tx40_is_recovered(name, data):
     found, (percent, sigmas) = METHODS[name].estimate(data.problem), EXPECTED[name]
     assert found.found
     assert name != "cloe" or found.iterations <= 10  # slopes pass the low-pass of the positions; 18 where they did not

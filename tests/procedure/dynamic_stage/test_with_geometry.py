@@ -10,9 +10,14 @@ import pytest
 import without_figures
 
 from calib.folders import read_covariance
+from calib.identification.identify_options import IdentifyOptions
 from calib.identification.settings import IdentificationSettings
+from calib.identification.uncertainty import joint_estimate
 from calib.identification.uncertainty.joint_estimate import JointEstimate, JointIdentification
 from calib.procedure.dynamic_stage import with_geometry
+from calib.procedure.dynamic_stage.held_out_poses import HeldOutErrors
+from calib.procedure.dynamic_stage.inputs import IdentificationInputs
+from calib.procedure.dynamic_stage.recorded_gains import FoundGains
 from calib.procedure.dynamic_stage.with_geometry import contradictions
 from calib.procedure.findings import lines_of
 from calib.robot import calibrated
@@ -75,6 +80,7 @@ def test_a_geometry_that_predicts_worse_is_not_delivered(monkeypatch):
     worse = estimate(held_out=1.01)
     inputs = SimpleNamespace(
         robot=CalibratedChain(planted.arm()),
+        source=Path("planted.toml"),
         cases=(),
         unseen=(),
         unit="N m",
@@ -84,7 +90,7 @@ def test_a_geometry_that_predicts_worse_is_not_delivered(monkeypatch):
     monkeypatch.setattr(with_geometry, "identify", lambda *arguments: plain)
     monkeypatch.setattr(with_geometry, "_doubted_payloads", lambda *arguments: ())
     answer = JointIdentification(worse, inputs.robot, plain)
-    monkeypatch.setattr(with_geometry, "identify_jointly", lambda *arguments, **names: answer)
+    monkeypatch.setattr(joint_estimate, "identify_jointly", lambda *arguments, **names: answer)
     used, found, result = with_geometry.run_jointly(inputs, print)
     assert used is inputs and found is plain and not result.delivered
     assert [item.code for item in result.noticed] == ["geometry-not-better"]
@@ -122,3 +128,29 @@ def test_methods_without_rows_are_refused(robot, tmp_path, capsys):
     arguments = ("identify", robot, log, "--method", "pc-wls", "--with-geometry", "--out", tmp_path / "out")
     assert without_figures.run(*arguments) != 0
     assert "--with-geometry: method 'pc-wls'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "poses, code, delivered",
+    [
+        (HeldOutErrors(20, 1e-4, 1.1e-4), "geometry-worse-on-poses", False),
+        (HeldOutErrors(20, 1e-4, 0.9e-4), None, True),
+        (None, "geometry-without-poses", True),
+    ],
+)
+def test_held_out_poses_of_the_fit_judge_the_geometry(monkeypatch, poses, code, delivered):
+    robot = CalibratedChain(planted.arm())
+    gains = FoundGains(IdentifyOptions(), None, None, "N m", ())
+    inputs = IdentificationInputs(robot, Path("planted.toml"), (), (), IdentifyOptions(), (), gains)
+    identification = SimpleNamespace(
+        friction=SimpleNamespace(chosen="standard"), settings=SimpleNamespace(gravity=None)
+    )
+    monkeypatch.setattr(with_geometry, "identify", lambda *arguments: identification)
+    monkeypatch.setattr(with_geometry, "_doubted_payloads", lambda *arguments: ())
+    monkeypatch.setattr(with_geometry, "held_out_errors", lambda *arguments: poses)
+    answer = JointIdentification(estimate(), robot, identification)
+    monkeypatch.setattr(joint_estimate, "identify_jointly", lambda *arguments, **names: answer)
+    monkeypatch.setattr(JointEstimate, "regrouped", lambda joint, chain: joint)
+    *_, result = with_geometry.run_jointly(inputs, print)
+    assert result.delivered == delivered and result.poses == poses
+    assert [item.code for item in result.noticed] == ([code] if code else [])

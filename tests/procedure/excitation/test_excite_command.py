@@ -291,7 +291,7 @@ def test_a_shorter_period():
 @pytest.mark.parametrize("whom", ["the terminal's group", "the command alone"])
 def test_ctrl_c_in_worker_processes(tmp_path, whom):
     words = ["excite", "tx40", "--out", str(tmp_path / "e"), "--starts", "20", "--workers", "2"]
-    for patience in (7, 15, 30, 60):  # [s] until the workers of a busy machine have found something
+    for patience in (4, 10, 25, 60):  # [s] until the workers of a busy machine have found something
         run = subprocess.Popen(
             [sys.executable, "-m", "calib", *words], stdout=subprocess.PIPE, text=True, start_new_session=True
         )

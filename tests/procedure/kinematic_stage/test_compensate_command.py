@@ -283,6 +283,7 @@ def test_unsuited_folders_and_words_fail(fitted, here, calib):
         ((fitted, "t.csv", "--tool", "1,2"), "x,y,z"),
         ((fitted, "t.csv", "--dof", "4"), "expected 6, 5"),
         ((fitted, "t.csv", "--start", "1,2"), "6 finite numbers"),
+        ((fitted, "t.csv", "--payload", "heavy"), "--payload heavy: expected a mass [kg], or mass,x,y,z [kg, m]"),
     ):
         code, _, err = calib("compensate", *arguments, "--out", "commands.csv")
         assert code == 2 and said in err, (arguments, err)
@@ -315,13 +316,11 @@ CASES = [  # folder, robot, file, held-out share, goal [mm]
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("folder", "robot", "file", "share", "goal"), CASES)
-def test_measured_poses_give_their_joints(data, tmp_path, capsys, folder, robot, file, share, goal):
+def test_measured_poses_give_their_joints(data, real_fit, capsys, folder, robot, file, share, goal):
     """Commands for measured poses are the joints they were measured at."""
+    fitted = joint_commands.read(real_fit(folder, robot, file, share))
     robot, file = data / folder / robot, data / folder / file
-    arguments = ["fit", robot, file, "--holdout", share, "--out", tmp_path / "done", "--no-plots"]
-    assert cli.run([str(each) for each in arguments]) == 0
     unseen = inputs.gather(robot, [file], settings=FitSettings(holdout=share)).unseen[file.name].block
-    fitted = joint_commands.read(tmp_path / "done")
     turns = from_quaternion(unseen.position, unseen.quaternion)[:, :3, :3] if isinstance(unseen, Poses) else None
     targets = Targets(unseen.q, unseen.position, turns, file=file.name)
     found = joint_commands.computed(

@@ -22,10 +22,10 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_ur5_tracker(data, calib, here):
+def test_ur5_tracker(real_fit):
     """0.11 mm with the plain geometry; 0.07 mm is the goal."""
-    folder = data / "ur5_gts3800"
-    found, _ = metrics_of(calib, folder / "model.urdf", folder / "grid_800.csv", "--holdout", "0.25", "--seed", "0")
+    out = real_fit("ur5_gts3800", "model.urdf", "grid_800.csv", 0.25)
+    found = json.loads((out / "metrics.json").read_text())
     unseen = found["validation"]["grid_800.csv"]
     assert (found["fit"]["poses"], unseen["poses"]) == (600, 200)
     assert unseen["nominal"]["position_mm"]["rms"] > 0.5
@@ -54,10 +54,10 @@ def test_tolerance_holds_for_delivered_files(data, calib, here):
         assert calib("export", "done", "--urdf", folder / "model.urdf", "--out", "one.urdf", *more)[0] == code
 
 
-def test_ur10_pose(data, calib, here):
+def test_ur10_pose(real_fit):
     """0.44 mm with the plain geometry; 0.12 mm is the goal."""
-    folder = data / "ur10_ipa"
-    found, _ = metrics_of(calib, folder / "model.urdf", folder / "A_grid_2500.csv", "--holdout", "0.4")
+    out = real_fit("ur10_ipa", "model.urdf", "A_grid_2500.csv", 0.4)
+    found = json.loads((out / "metrics.json").read_text())
     unseen = found["validation"]["A_grid_2500.csv"]
     assert unseen["poses"] == 1000
     assert unseen["calibrated"]["position_mm"]["rms"] < 0.12

@@ -91,6 +91,16 @@ def test_poses_contradict_a_wrong_table(folder, arm):
     assert contradicted(fitted(folder, "more.csv", JOINT_COMPLIANCE)) == []
 
 
+@pytest.mark.slow
+def test_a_table_that_is_too_stiff_is_told_from_what_bearings_would_give(folder, arm):
+    write_compliance(folder / "stiff.csv", arm, 0.3)
+    fit = fitted(folder, "more.csv", "stiff.csv")
+    exceeded = [note for note in fit.outcome.findings.noticed if note.code == "compliance-exceeded"]
+    assert [note.values["joint"] for note in exceeded] == ["joint2", "joint4"]
+    for note in exceeded:
+        assert 2.0 < note.values["times"] < 5.0
+
+
 def test_a_saved_fit_predicts_with_the_compliance(folder, stated, tmp_path):
     terms = calibrated.read(stated.save(tmp_path / "fit", plots=False)).deflection.terms
     assert [term.basis for term in terms[:2]] == ["torque", "torque"]

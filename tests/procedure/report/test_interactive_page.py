@@ -17,7 +17,7 @@ from calib import files
 from calib.procedure.report.certificate import rendering
 from calib.procedure.report.certificate.record import Page
 from calib.procedure.report.figures import figure_data, figure_files
-from calib.procedure.report.figures.charts import Captioned, Chart, Line, Panel
+from calib.procedure.report.figures.charts import MAX_NAME, MAX_TITLE, MAX_UPRIGHT_NAME, Captioned, Chart, Line, Panel
 from calib.procedure.report.figures.drawing import figure
 from calib.procedure.report.figures.svg import svg
 from calib.procedure.report.geometry_figures import (
@@ -203,6 +203,62 @@ def test_points_tell_row_and_sigma_and_findings_lead_to_them(browser, tmp_path):
     head.send_keys(" ")
     assert browser.execute_script(names) == "beta,alpha,gamma", "what is no number stands last"
     assert not browser.get_log("browser")
+
+
+@pytest.mark.slow
+def test_links_mark_rows_of_the_file_that_the_finding_names(browser, tmp_path):
+    """Row 3 of b.csv is marked in the panel of b.csv alone, and among points of both files once."""
+    rows = np.arange(1.0, 11.0)
+    panels = [
+        Panel([Line(rows, rows, ".")], f"fitted rows of {name}", "row", file=name) for name in ("ab.csv", "b.csv")
+    ]
+    details = {"row": np.tile(rows, 2), "file": np.repeat([0.0, 1.0], 10)}
+    by_joint = Panel([Line(np.arange(20.0), np.ones(20), ".")], x="q1")
+    charts = {
+        "rows": (Chart(panels, 3.0), "by row"),
+        "joints": (Chart([by_joint], 2.0, points=details, files=("ab.csv", "b.csv")), "by joint"),
+    }
+    report = Page(
+        "Report",
+        "",
+        "",
+        "",
+        [
+            Section(
+                "Part",
+                [
+                    Pictures("Figures", list(chart_pictures(charts).values())),
+                    Text("Notes", ["outliers: row 3 of b.csv", "ab.csv: rows 2 and 3 differ", "row 3 is far off"]),
+                ],
+            )
+        ],
+    )
+    opened(browser, files.write(tmp_path / "report.html", rendering.html(report)))
+    links = browser.find_elements("css selector", "a.rows")
+    assert [link.get_attribute("data-file") for link in links] == ["b.csv", "ab.csv", ""]
+    pictures = "return [...document.querySelectorAll('.panel .u-wrap canvas')].map(c => c.toDataURL())"
+    plain = browser.execute_script(pictures)
+    expected = [(False, True, True), (True, False, True), (True, True, True)]
+    for link, changed in zip(links, expected):
+        link.click()
+        settled(
+            browser,
+            f"return [...document.querySelectorAll('.panel .u-wrap canvas')][2].toDataURL() != {json.dumps(plain[2])}",
+        )
+        now = browser.execute_script(pictures)
+        assert tuple(before != after for before, after in zip(plain, now)) == changed
+    assert "file b.csv" in hover(browser, "#figure-joints .panel .u-over", 0.75, 0.5)
+
+
+def test_long_names_keep_their_ends():
+    names = [f"robot_cell_left_arm_long_shoulder_joint_{number}" for number in range(1, 4)]
+    chart = Chart([Panel([], name, f"{name} [deg]", ynames=names, xnames=names) for name in names], 2.0, columns=3)
+    panel = chart.panels[1]
+    assert panel.title.endswith("joint_2") and panel.x.endswith("joint_2 [deg]") and len(panel.x) == MAX_TITLE
+    assert panel.xnames[2].endswith("joint_3") and len(panel.xnames[2]) == MAX_UPRIGHT_NAME
+    assert panel.ynames[0].startswith("robot_") and len(panel.ynames[0]) == MAX_NAME
+    alike = [f"joint_{middle}_of_the_left_arm_of_the_robot_cell" for middle in "ab"]
+    assert Panel([], xnames=alike).xnames == alike
 
 
 @pytest.mark.slow

@@ -13,9 +13,10 @@ from calib.procedure.answers import CAMERA, Answers
 from calib.procedure.kinematic_stage import inputs
 from calib.procedure.session import drift
 from calib.procedure.session.dynamics_steps import options_of
-from calib.procedure.session.folder import Session
+from calib.procedure.session.folder import Session, open_session
 from calib.procedure.session.geometry_steps import chain_of, read_measured, readback
 from calib.procedure.session.questions import QUESTIONS, checked, with_answer
+from calib.procedure.session.settings import written
 from calib.robot.chain import random_joints
 from calib.simulation.cell import measure, wandering
 from calib.simulation.virtual_cells import virtual_cell
@@ -58,6 +59,15 @@ def test_recording_name_states_its_payload(tmp_path) -> None:
     found = options_of(session)
     assert found.settings.payloads["loaded"].mass == 3.28 and found.settings.torque_rows.name == "both"
     assert {name: one.payload for name, one in found.files.items()} == {"training_loaded.csv": ("loaded",)}
+
+
+def test_geometry_from_torques_is_asked_for_beside_an_options_file(tmp_path) -> None:
+    session = begin(tmp_path / "cell", "lwr4plus", "cmm", 5, 0)
+    session.path("dynamics.toml").write_text('method = "ols"\n')
+    dynamics = replace(session.settings.dynamics, options="dynamics.toml", with_geometry=True)
+    session.path("session.toml").write_text(written(replace(session.settings, dynamics=dynamics)))
+    settings = options_of(open_session(session.path(""))).settings
+    assert settings.method == "ols" and settings.with_geometry
 
 
 def test_answers_are_checked_as_they_come() -> None:

@@ -6,10 +6,12 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import demo_picture
 import numpy as np
 import pytest
 from without_figures import run
 
+from calib.apps.cell_demo import demo
 from calib.apps.cell_demo.step_lines import SECONDS, Telling
 from calib.procedure.session import steps
 from calib.procedure.session.folder import open_session
@@ -19,6 +21,8 @@ from calib.robot.library import load
 from calib.simulation.virtual_arm import sensed
 
 MAX_LINES, MAX_WIDTH = 25, 60
+# of the picture's figures, relative: where linear algebra rounds otherwise the short search for motions ends elsewhere
+BOUNDS = {"nominal_mm": 0.01, "calibrated_mm": 0.01, "unexplained_percent": 0.05, "within_two_sigma_percent": 0.12}
 
 
 def errors(out: Path) -> dict[str, float]:
@@ -28,9 +32,9 @@ def errors(out: Path) -> dict[str, float]:
 
 @pytest.mark.slow
 def test_both_halves_pass_with_short_console(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    """Both halves pass, and the console is short."""
+    """Both halves pass, the console is short, and the README's picture is of such a run."""
     out = tmp_path / "d"
-    assert run("demo", "--out", out) == 0
+    assert run("demo", "--out", out, "--plots", "png") == 0
     said = capsys.readouterr().out.splitlines()
     verdicts = json.loads((out / "verdict.json").read_text())
     assert verdicts["geometry"]["verdict"] == verdicts["dynamics"]["verdict"] == "pass"
@@ -40,7 +44,12 @@ def test_both_halves_pass_with_short_console(tmp_path: Path, capsys: pytest.Capt
     assert max(map(len, told)) <= MAX_WIDTH and not blank
     assert all(Path(line.split(maxsplit=1)[1]).exists() for line in files)
     assert 0.3 < errors(out)["nominal"] < 3.0 and 0.05 < errors(out)["urdf_alone"] < 0.3  # as real arms: see the cell
-    assert {state.kind for state in steps.states(open_session(out))} == {steps.DONE}
+    session, drawn = open_session(out), demo_picture.drawn()
+    assert {state.kind for state in steps.states(session)} == {steps.DONE}
+    fresh = demo_picture.figures(session)
+    assert {name: drawn[name] for name in BOUNDS} == {
+        name: pytest.approx(fresh[name], rel=bound) for name, bound in BOUNDS.items()
+    }
     assert run("demo", "--out", out) == 2
 
 
@@ -61,13 +70,17 @@ def test_hard_arm_says_what_marginal_means(tmp_path: Path, capsys: pytest.Captur
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["ur10e", "rv2sq"])
-def test_demo_of_other_robots(robot: str, tmp_path: Path) -> None:
+def test_demo_of_other_robots(robot: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(demo.MOTION, "evaluations", 50)
+    monkeypatch.setitem(demo.MOTION, "period", 6.0)
     assert run("demo", "--out", tmp_path / "demo", "--plots", "png", "--robot", robot, "--seed", "3") == 0
 
 
 @pytest.mark.slow
-def test_demo_by_camera_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_demo_by_camera_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """To the end, and again by `calib view`: validation images measure no positions, which are empty cells."""
+    monkeypatch.setattr(demo, "FIT", 24)
+    monkeypatch.setattr(demo, "VALIDATION", 8)
     out = tmp_path / "cell"
     assert run("demo", "--instrument", "camera", "--geometry-only", "--plots", "png", "--out", out) == 0
     truth = errors(out)

@@ -308,6 +308,7 @@ def test_front_motion_is_picked(waiting: Session, capsys: pytest.CaptureFixture)
     path = waiting.path("session.toml")
     edit(path, "goals = []", 'goals = ["wrist=0.5"]')
     edit(path, "front = 0", "front = 3")
+    edit(path, "evaluations = 100", "evaluations = 30")
     capsys.readouterr()
     assert run("next", waiting.folder) == 0
     words = " ".join(capsys.readouterr().out.split())

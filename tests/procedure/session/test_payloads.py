@@ -8,6 +8,7 @@ import pytest
 from sessions import begin
 from without_figures import run
 
+from calib.apps.cell_demo.demo import MOTION
 from calib.errors import CalibError, UsageError
 from calib.identification.settings import Payload
 from calib.procedure.session.commands import _present_logs
@@ -15,6 +16,13 @@ from calib.procedure.session.dynamics_steps import options_of, unrecorded_payloa
 from calib.procedure.session.folder import open_session
 from calib.procedure.session.questions import stated_payloads
 from calib.procedure.session.settings import read_settings, written
+
+
+@pytest.fixture
+def short_motions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the demonstration design shorter motions by a shorter search."""
+    monkeypatch.setitem(MOTION, "period", 6.0)
+    monkeypatch.setitem(MOTION, "evaluations", 40)
 
 
 @pytest.mark.parametrize(
@@ -99,6 +107,7 @@ def test_misspelt_log_is_named_while_waiting(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("short_motions")
 def test_loaded_logs_are_taken_and_judged(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """A rehearsal with a payload waits for loaded logs, judges them, and fails where logs are exchanged."""
     cell = tmp_path / "cell"
@@ -130,6 +139,7 @@ def test_loaded_logs_are_taken_and_judged(tmp_path: Path, capsys: pytest.Capture
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("short_motions")
 def test_mass_is_identified_from_its_runs(tmp_path: Path) -> None:
     """Without a stated mass or centre it is identified, and exchanged recordings are named as such."""
     cell = tmp_path / "cell"

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.apps.monitoring.learning.dynamics_update import DynamicsUpdate, PredictedLog
-from calib.apps.monitoring.learning.logs import DatedLog, common_share, dated, sample_hashes, sketch
+from calib.apps.monitoring.learning.logs import DatedLog, dated
 from calib.apps.monitoring.learning.working_state import LogRecord, WorkingState, read_state
 from calib.errors import Finding, MeasurementError, UsageError, finding, listing, require
 from calib.toolkit.model_identification import (
@@ -30,8 +30,7 @@ from calib.toolkit.model_identification import (
     read_identify_options,
     torque_shares,
 )
-from calib.toolkit.recordings import read_recording
-from calib.toolkit.result_folders import joints_of
+from calib.toolkit.recordings import common_share, sketch
 from calib.toolkit.torque_models import Case, predict
 
 MIN_RANGE = 1e-3
@@ -85,6 +84,8 @@ def update_dynamics(
     if not ordered[0].date:
         findings.append(finding("logs-undated", file=Path(ordered[0].path).name))
     _check_order(state, ordered)
+    ordered, older_logs = _without_older(state, ordered)
+    findings += older_logs
 
     earlier_count = len(state.record.logs)
     predicted = None
@@ -166,9 +167,8 @@ def _next_step(state: WorkingState, log: DatedLog, options: IdentifyOptions) -> 
     first = predict(state.model.dynamics, case)
     torque = predict(state.model.updated(mean), case) + first * mean[state.model.k :]
 
-    recording_options = options.file_settings(log.path).recording
-    recording = read_recording(log.path, joints_of(state.robot.chain), recording_options)
-    hashes = sample_hashes(recording)
+    hashes = case.motion.hashes
+    assert hashes is not None
     findings = []
     repeated = _repeated(state, hashes)
     judgement = judge(state.model, bank, rows)
@@ -243,17 +243,54 @@ def _unexplained(case: Case, torque: np.ndarray) -> float:
 
 
 def _repeated(state: WorkingState, hashes: np.ndarray) -> str:
-    """Return the name of an earlier log that has common samples with a log; empty if there is none.
+    """Return the name of a recording of the model that has common samples with a log; empty if there is none.
 
     Args:
-        state: the state with the earlier logs.
+        state: the state with the recordings of its identification and the earlier logs.
         hashes: hashes of the log's samples.
     """
+    sketches = [(recording.name, recording.hashes) for recording in state.identified_from]
     learnt = [record.name for record in state.record.logs if record.learnt]
-    for name, earlier in zip(learnt, state.sketches):
+    for name, earlier in [*sketches, *zip(learnt, state.sketches)]:
         if common_share(hashes, earlier) > 0.0:
             return name
     return ""
+
+
+def _without_older(state: WorkingState, logs: Sequence[DatedLog]) -> tuple[list[DatedLog], list[Finding]]:
+    """Return the logs that are no older than the identification's recordings, and findings on the others.
+
+    A log of the same day counts as no older, since its name may lack the time.
+
+    Args:
+        state: the state with the recordings of its identification.
+        logs: dated logs, or logs without dates, which are all accepted.
+
+    Raises:
+        UsageError: if all logs are older.
+    """
+    recordings = []
+    for recording in state.identified_from:
+        recordings += dated([recording.file], 1)
+    dated_recordings = [recording for recording in recordings if recording.date]
+    if not dated_recordings or not logs[0].date:
+        return list(logs), []
+    latest = max(dated_recordings, key=lambda recording: recording.day)
+    before = Path(latest.path).name
+    accepted: list[DatedLog] = []
+    findings = []
+    for log in logs:
+        if int(log.day) >= int(latest.day):
+            accepted.append(log)
+            continue
+        name = Path(log.path).name
+        findings.append(finding("log-older", file=name, date=log.date, before=before, before_date=latest.date))
+    message = (
+        f"{listing([log.path for log in logs])}: older than {before} of {latest.date}, from which {state.folder} was "
+        "identified; give all recordings together to calib identify"
+    )
+    require(accepted, message, UsageError)
+    return accepted, findings
 
 
 def _not_as_predicted(state: WorkingState, name: str, judgement: Judgement) -> Finding:

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from calib import files, folders
-from calib.apps.monitoring.learning.logs import SKETCH
 from calib.config_types import ParsedTable
 from calib.errors import RobotError, UsageError, refuse_option, refused_as, require
 from calib.records import read_json
 from calib.toolkit.chains import CalibratedChain, read_calibrated
 from calib.toolkit.model_identification import DriftBank, WorkingModel, from_table
+from calib.toolkit.recordings import SKETCH, Fingerprint
 from calib.toolkit.result_folders import IdentificationFolder
 from calib.toolkit.torque_models import estimated_columns, read_model_table
 
@@ -86,6 +86,7 @@ class WorkingState:
         record: first model and logs.
         sketches: (logs, 64) sketches of the logs that were learnt from.
         unit: unit of the torques.
+        identified_from: the recordings of the first identification.
     """
 
     folder: Path
@@ -95,6 +96,7 @@ class WorkingState:
     record: LearningRecord
     sketches: np.ndarray
     unit: str
+    identified_from: tuple[Fingerprint, ...] = ()
 
     @property
     def drifting(self) -> np.ndarray:
@@ -141,7 +143,9 @@ def read_state(path: str | Path) -> WorkingState:
     if "gravity" not in table or "bodies" not in table:
         refuse_option(folder, "is not of a serial arm, which calib update needs: identify it from all logs together")
     robot = read_calibrated(folder)
-    metrics = IdentificationFolder(folder).metrics()
+    identification = IdentificationFolder(folder)
+    metrics = identification.metrics()
+    recordings = identification.identified_from()
     if metrics.error_density is None or metrics.findings is None:
         raise RobotError(f"{folder}/metrics.json has no error_density of the torque rows; identify again")
     names, covariance = folders.read_covariance(folder)
@@ -169,10 +173,11 @@ def read_state(path: str | Path) -> WorkingState:
     unit = table.get("unit", "N m")
     if record is not None:
         bank, sketches = _read_bank(folder, len(model.names))
-        return WorkingState(folder, robot, model, bank, record, sketches, unit)
+        return WorkingState(folder, robot, model, bank, record, sketches, unit, recordings)
     bank = model.first_state(covariance[np.ix_(estimated, estimated)])
     record = LearningRecord(table, model.names, model.units, tuple(model.values.tolist()))
-    return WorkingState(folder, robot, model, bank, record, np.zeros((0, SKETCH), np.uint64), unit)
+    sketches = np.zeros((0, SKETCH), np.uint64)
+    return WorkingState(folder, robot, model, bank, record, sketches, unit, recordings)
 
 
 def _read_record(folder: Path) -> LearningRecord | None:

@@ -11,7 +11,6 @@ import numpy as np
 
 from calib.config_types import Plots
 from calib.folders import METRICS
-from calib.procedure.excitation import coefficients
 from calib.procedure.findings import sentence
 from calib.procedure.report.certificate.record import StageRecord
 from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of, rms_words, warnings_of
@@ -196,6 +195,7 @@ def trained_on(folder: Path, joints: Sequence[Joint]) -> Captioned:
         folder: folder of the designed motion.
         joints: the robot's joints.
     """
+    from calib.procedure.excitation import coefficients
     from calib.procedure.report.motion_figures import motion_sheet
 
     motion = coefficients.read(folder)

@@ -6,11 +6,35 @@ in the browser from the text of `figure_data`.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from numpy.typing import ArrayLike
 
 from calib.procedure.report.figures.style import AFTER, INK, MARK, PAGE_WIDTH
+
+# most letters of a name at an axis: beside it, upright below it, and of title and label of one of several panels in a
+# row; longer ones lose their middle (our choice, by the space of the three readers)
+MAX_NAME, MAX_UPRIGHT_NAME, MAX_TITLE = 30, 18, 28
+# panels in a row from which on titles and labels have that little space
+NARROW_COLUMNS = 3
+
+
+def shortened(text: str, letters: int) -> str:
+    """Return a text of at most so many letters: of a longer one a third is its beginning, the rest its end."""
+    if len(text) <= letters:
+        return text
+    beginning = letters // 3
+    return f"{text[:beginning]}…{text[len(text) - letters + beginning + 1 :]}"
+
+
+def _distinct(names: Sequence[str], letters: int) -> Sequence[str]:
+    """Return names of one line shortened; unchanged where two of them would become equal."""
+    if any("\n" in name for name in names):
+        return names
+    short = [shortened(name, letters) for name in names]
+    if len(set(short)) < len(set(names)):
+        return names
+    return short
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,12 +218,14 @@ class Panel:
         title, x, y: title, and labels of the axes.
         xlim, ylim: limits of the axes; None: chosen by the content.
         log: letters of the logarithmic axes, whose limits are required.
-        xnames, ynames: labels at 0, 1, … instead of numbers; x labels of one line are vertical; None: numbers.
+        xnames, ynames: labels at 0, 1, … instead of numbers; upright along x if of one line. Long ones lose their
+            middle. None: numbers.
         grid: axes with grid lines: ``x``, ``y``, ``both`` or empty.
         equal: whether both axes have the same scale.
         symlog: the y axis is linear between ± this value and logarithmic beyond; 0: linear everywhere.
         ticks: approximate largest number of ticks per axis; 0: default.
         switch: name of the switch of a page that shows and hides the panel, such as a joint's; empty: none.
+        file: name of the file whose rows are along x; empty: of several, or none.
     """
 
     layers: Sequence[Layer]
@@ -216,6 +242,13 @@ class Panel:
     symlog: float = 0.0
     ticks: int = 0
     switch: str = ""
+    file: str = ""
+
+    def __post_init__(self) -> None:
+        for field_name, letters in (("xnames", MAX_UPRIGHT_NAME), ("ynames", MAX_NAME)):
+            names = getattr(self, field_name)
+            if names is not None:
+                object.__setattr__(self, field_name, _distinct(names, letters))
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +281,9 @@ class Chart:
         shared: letters of the axes whose labels are drawn only at the edge of the grid: ``x`` at the lowest panel of
             each column, ``y`` at the first panel of each row.
         linked: charts of a page with the same word share zoom and cursor along x; empty: not linked.
-        points: name -> (k,) values that a page shows under the pointer, for layers of k points: row, σ, joint values.
+        points: name -> (k,) values that a page shows under the pointer, for layers of k points: row, σ, joint values;
+            ``file`` is an index into `files`.
+        files: names of the files of the points.
         cloud: the points in space; None: the chart is no map.
     """
 
@@ -261,6 +296,16 @@ class Chart:
     linked: str = ""
     points: Mapping[str, ArrayLike] = field(default_factory=dict)
     cloud: Cloud | None = None
+    files: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        if self.columns < NARROW_COLUMNS:
+            return
+        panels = []
+        for panel in self.panels:
+            title, label = shortened(panel.title, MAX_TITLE), shortened(panel.x, MAX_TITLE)
+            panels.append(replace(panel, title=title, x=label))
+        object.__setattr__(self, "panels", panels)
 
 
 Captioned = tuple[Chart, str]  # with what it shows, in a sentence

@@ -7,10 +7,10 @@ are points, a 72th of an inch.
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import singledispatch
+from html import escape
 from itertools import pairwise
 from math import isfinite
 from operator import attrgetter, itemgetter
-from xml.sax.saxutils import escape
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -446,7 +446,7 @@ def _text(
     """
     weight = ' font-weight="bold"' if bold else ""
     position = f'x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" text-anchor="{anchor}" fill="{colour}"'
-    return f"<text {position}{weight}{extra}>{escape(text)}</text>"
+    return f"<text {position}{weight}{extra}>{escape(text, quote=False)}</text>"
 
 
 def _path(d: str, colour: str, width: float, extra: str = "") -> str:

@@ -18,7 +18,8 @@
   const WIDTH = 210, SMALL_WIDTH = 125; // least width of a panel, and of one that shares the labels of both axes
   const NEAR = 24; // CSS pixels within which the pointer reads a point
   const hidden = new Set(); // switches that are off
-  const marked = new Set(); // rows that a finding names
+  const marked = { rows: new Set(), file: "" }; // rows that a finding names, and their file, if it names one
+  const isMarked = (row, file) => marked.rows.has(row) && (!marked.file || !file || marked.file === file);
   const drawn = [];
   let printing = false;
   const darkness = matchMedia("(prefers-color-scheme: dark)");
@@ -503,12 +504,12 @@
     }
     // around the points of the rows that a finding names
     rings(c, at) {
-      if (!marked.size) return;
+      if (!marked.rows.size) return;
       const byRow = this.panel.x === "row" && this.layers[0] ? this.layers[0].x : [];
       const rows = this.figure.points.row || byRow;
       c.strokeStyle = ink(MARK); c.lineWidth = 1.8;
       for (const layer of this.layers) if (layer.x && layer.x.length === rows.length && shown(layer)) {
-        for (let i = 0; i < rows.length; i++) if (marked.has(rows[i])) {
+        for (let i = 0; i < rows.length; i++) if (isMarked(rows[i], this.panel.file || this.figure.fileOf(i))) {
           c.beginPath(); c.arc(at.x(layer.x[i]), at.y(layer.y[i]), 7, 0, 6.3); c.stroke();
         }
       }
@@ -727,7 +728,7 @@
         c.fillStyle = shade("cividis_r", (this.values[i] - this.cloud.low) / (this.cloud.high - this.cloud.low || 1));
         c.strokeStyle = ink(QUIET);
         c.beginPath(); c.arc(x, y, 4, 0, 6.3); c.fill(); c.stroke();
-        if (rows && rows.length === this.values.length && marked.has(rows[i])) {
+        if (rows && rows.length === this.values.length && isMarked(rows[i], this.figure.fileOf(i))) {
           c.strokeStyle = ink(MARK); c.lineWidth = 1.8; c.beginPath(); c.arc(x, y, 8, 0, 6.3); c.stroke(); c.lineWidth = 0.5;
         }
       }
@@ -868,8 +869,10 @@
     }
     visible() { return this.panels.filter(panel => panel.plot && !panel.box.hidden); }
     back(panel) { for (const one of this.link ? linked(this.link) : [panel]) { one.quiet = true; one.back(); one.quiet = false; } }
+    // the file of a point
+    fileOf(i) { return (this.chart.files || [])[(this.points.file || [])[i]] || ""; }
     details(count, i) {
-      return Object.entries(this.points).filter(([, values]) => values.length === count).map(([name, values]) => `${name} ${rounded(values[i])}`);
+      return Object.entries(this.points).filter(([, values]) => values.length === count).map(([name, values]) => `${name} ${name === "file" ? this.fileOf(i) : rounded(values[i])}`);
     }
     layout() {
       const width = printing ? PRINT_WIDTH * (this.element.classList.contains("wide") ? 1 : 0.48) : this.box.clientWidth;
@@ -971,6 +974,7 @@
   function rowLinks(item) {
     const target = Object.entries(figures).find(([, chart]) => chart.panels.some(panel => panel.x === "row"));
     if (!target || item.closest("nav")) return;
+    const files = target[1].panels.map(panel => panel.file).filter(Boolean);
     const walker = document.createTreeWalker(item, NodeFilter.SHOW_TEXT), texts = [];
     while (walker.nextNode()) texts.push(walker.currentNode);
     for (const node of texts) {
@@ -980,13 +984,14 @@
         const link = document.createElement("a");
         link.href = "#figure-" + target[0]; link.className = "rows"; link.textContent = match[0];
         link.dataset.rows = [...rowsOf(match[0])].join(",");
+        link.dataset.file = fileIn(item.textContent, files, item.textContent.indexOf(match[0]));
         link.addEventListener("click", () => {
-          marked.clear();
-          for (const row of link.dataset.rows.split(",")) marked.add(+row);
+          marked.rows = new Set(link.dataset.rows.split(",").map(Number));
+          marked.file = link.dataset.file;
           draw(document.getElementById("figure-" + target[0]));
           for (const figure of drawn) figure.redraw();
           const rows = drawn.find(one => one.name === target[0]);
-          const present = rows.panels.some(panel => panel.layers.some(layer => layer.x && layer.x.some(row => marked.has(row))));
+          const present = rows.panels.some(one => one.layers.some(layer => layer.x && layer.x.some(row => isMarked(row, one.panel.file))));
           rows.note(present ? "" : `None of ${match[0]} is among the points drawn; residuals.csv has every row.`);
         });
         parts.push(node.data.slice(last, match.index), link);
@@ -994,6 +999,19 @@
       }
       if (parts.length) node.replaceWith(...parts, node.data.slice(last));
     }
+  }
+
+  // the file that a sentence names last before a place, else first behind it; empty: none
+  function fileIn(sentence, files, place) {
+    const found = [];
+    for (const file of new Set(files)) {
+      for (let at = sentence.indexOf(file); at >= 0; at = sentence.indexOf(file, at + 1)) {
+        if (!/[\w.-]/.test(sentence[at - 1] || " ") && !/[\w-]/.test(sentence[at + file.length] || " ")) found.push([at, file]);
+      }
+    }
+    found.sort((a, b) => a[0] - b[0]);
+    const before = found.filter(([at]) => at < place);
+    return ((before.length ? before[before.length - 1] : found[0]) || [0, ""])[1];
   }
 
   // called by a file of samples

@@ -1,0 +1,280 @@
+"""Measured torques of several files, each judged by the gravity that the others tell: do they agree?
+
+A file agrees if some load, and the gravity of the others within its covariance, explain the torques of most of its
+rows. Where it does not, changes that would cure it are tried: another sign, columns exchanged, another unit.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from calib.data.poses.measurements import PoseMeasurements
+from calib.errors import Finding, finding, listing
+from calib.geometry.static_torques.gravity_fit import (
+    GAIN,
+    IN_MILLIMETRES,
+    MAX_RESIDUAL,
+    MILLIMETRES,
+    ROUNDS,
+    Fault,
+    GravityFit,
+    by_stated_load,
+    fault_of_file,
+    gravity_factor,
+    gravity_fit,
+    gravity_regressor,
+    load_deviations,
+    most_probable,
+    nothing_read,
+    spreads,
+)
+from calib.robot.chain import Chain
+from calib.robot.kinematics import gravity_torques
+
+# share of a file's rows at rest from which on its torques are those of the arm with some load (our choice)
+MIN_AT_REST = 0.5
+
+
+class Agreement(NamedTuple):
+    """How far torques of a file agree with a gravity.
+
+    Attributes:
+        at_rest: share of the rows whose torques are explained.
+        distance: mean of the squared residuals over the largest ones of an arm at rest, each 1 at most.
+    """
+
+    at_rest: float
+    distance: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the torques are those of the arm with some load."""
+        return self.at_rest >= MIN_AT_REST
+
+
+def agreeing_torques(
+    chain: Chain, blocks: Sequence[PoseMeasurements]
+) -> tuple[GravityFit | None, tuple[PoseMeasurements, ...], list[Finding]]:
+    """Return the gravity of files whose torques agree, the blocks without torques that do not, and findings on these.
+
+    The odd file is the one without which the others agree best; of two it is the one with fewer rows, or the later.
+
+    Args:
+        chain: the arm, with its described masses if they are known.
+        blocks: the blocks of measurements.
+    """
+    result = list(blocks)
+    findings: list[Finding] = []
+    for block in blocks:
+        findings += unread_torques(block)
+    several = sum(block.measured_torque is not None for block in blocks) > 1
+    if several and len(chain.driven) == chain.n:
+        for number, block in enumerate(blocks):
+            fault = None
+            if block.measured_torque is not None:
+                fault = fault_of_file(chain, block)
+            if fault is not None:
+                result[number], remark = _without_torques(block, fault)
+                findings.append(remark)
+        findings += _drop_odd_files(chain, result)
+    gravity, faults = gravity_fit(chain, result)
+    return gravity, tuple(result), findings + faults
+
+
+def unread_torques(block: PoseMeasurements) -> list[Finding]:
+    """Return a finding on torques that are in a block's file, but not read."""
+    if block.torque_fault is None:
+        return []
+    _, remark = _without_torques(block, block.torque_fault)
+    return [remark]
+
+
+def without_contradicting_torques(
+    block: PoseMeasurements, gravity: GravityFit, fitted: Sequence[PoseMeasurements]
+) -> tuple[PoseMeasurements, list[Finding]]:
+    """Return a block without its measured torques where no load explains them, and a finding on these.
+
+    Args:
+        block: measurements that were not fitted.
+        gravity: the gravity of the fitted ones.
+        fitted: the fitted blocks, whose files are named.
+    """
+    if block.measured_torque is None or agreement(block, gravity).agrees:
+        return block, []
+    block, remark = _without_torques(block, contradiction(block, gravity, fitted))
+    return block, [remark]
+
+
+def agreement(block: PoseMeasurements, gravity: GravityFit) -> Agreement:
+    """Return how far the measured torques of a block agree with a gravity, with any load.
+
+    Args:
+        block: measurements with torques.
+        gravity: the gravity of other files.
+    """
+    return _LoadedGravity.at(block, gravity).agreement(np.asarray(block.measured_torque))
+
+
+def contradiction(block: PoseMeasurements, gravity: GravityFit, reference: Sequence[PoseMeasurements]) -> Fault:
+    """Return why torques of a block are not those of the arm with any load, and what to do.
+
+    Args:
+        block: measurements with torques.
+        gravity: the gravity of other files.
+        reference: their blocks.
+    """
+    torque = np.asarray(block.measured_torque)
+    fault = nothing_read(torque)
+    if fault is not None:
+        return fault
+    names = listing(sorted({Path(peer.file).name for peer in reference if peer.measured_torque is not None}))
+    expected = gravity.sign * gravity_torques(gravity.chain, block.q)
+    factor, _ = gravity_factor(expected, torque)
+    if abs(factor) > MILLIMETRES:
+        return f"they are {abs(factor):.0f} times the gravity of {names}", IN_MILLIMETRES
+    loaded = _LoadedGravity.at(block, gravity)
+    smallest = np.inf
+    cure = "were they read at rest, by the same sensors, in the same unit and joint order as those of the fit?"
+    fault = f"with the gravity of {names}, no load explains them", cure
+    for changed, explanation in _changes(torque, names):
+        changed_agreement = loaded.agreement(changed)
+        if changed_agreement.agrees and changed_agreement.distance < smallest:
+            smallest, fault = changed_agreement.distance, explanation
+    return fault
+
+
+def _changes(torque: np.ndarray, names: str) -> Iterator[tuple[np.ndarray, Fault]]:
+    """Yield torques (m, n) with another sign or with columns exchanged, and what each change would mean.
+
+    Args:
+        torque: the recorded torques [N m].
+        names: names of the files that they are compared with.
+    """
+    yield -torque, (f"their sign is the other one than in {names}", "reverse the sign of all of them")
+    joints = range(torque.shape[1])
+    for joint in joints:
+        changed = torque.copy()
+        changed[:, joint] *= -1.0
+        name = f"tau{joint + 1}"
+        reason = f"with {name} reversed gravity explains them, as recorded it does not"
+        yield changed, (reason, f"reverse the sign of {name}")
+    for first, second in combinations(joints, 2):
+        changed = torque.copy()
+        changed[:, [first, second]] = torque[:, [second, first]]
+        pair = f"tau{first + 1} and tau{second + 1}"
+        reason = f"with {pair} exchanged gravity explains them, as recorded it does not"
+        yield changed, (reason, f"exchange the names of {pair} in the header")
+
+
+@dataclass(frozen=True, eq=False)
+class _LoadedGravity:
+    """Gravity at a block's rows, which may change within its covariance, and by any load of each group of rows.
+
+    Attributes:
+        gravity: the gravity of other files.
+        groups: rows of the same load.
+        torque: (m, n) torques of this gravity without load [N m].
+        matrix: (m, n, 5 n + 4) their changes by one standard deviation of each direction.
+    """
+
+    gravity: GravityFit
+    groups: list[np.ndarray]
+    torque: np.ndarray
+    matrix: np.ndarray
+
+    @classmethod
+    def at(cls, block: PoseMeasurements, gravity: GravityFit) -> "_LoadedGravity":
+        """Return a gravity at the rows of a block."""
+        n = gravity.chain.n
+        regressor = gravity_regressor(gravity.chain, block.q)
+        variances, directions = np.linalg.eigh(gravity.covariance)
+        root = directions * np.sqrt(np.maximum(variances, 0.0))
+        offsets = np.tile(np.eye(n), (len(block), 1, 1))
+        of_gravity = np.concatenate([regressor, offsets], axis=2) @ root
+        of_load = regressor[..., -4:] * load_deviations(gravity.chain)
+        torque = gravity_torques(gravity.chain, block.q)
+        return cls(gravity, by_stated_load(block), torque, np.concatenate([of_gravity, of_load], axis=2))
+
+    def agreement(self, torque: np.ndarray) -> Agreement:
+        """Return how far torques (m, n) of these rows agree with the gravity, with any load."""
+        balancing = self.gravity.sign * torque - self.gravity.offset
+        at_rest, distance = [], []
+        for rows in self.groups:
+            ratio = self._residual_ratio(balancing[rows], rows)
+            at_rest += np.all(~(ratio >= 1.0), axis=1).tolist()
+            distance += np.minimum(ratio[np.isfinite(ratio)], 1.0).tolist()
+        return Agreement(float(np.mean(at_rest)), float(np.mean(np.square(distance or [0.0]))))
+
+    def _residual_ratio(self, balancing: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """Return the residuals (r, n) over the largest ones of an arm at rest; NaN where no torque was read.
+
+        Args:
+            balancing: (r, n) torques that balance gravity in rows of the same load [N m].
+            rows: (r,) numbers of these rows.
+        """
+        deviation = balancing - self.torque[rows]
+        matrix = self.matrix[rows]
+        unit = np.ones(matrix.shape[2])
+        sigma = np.hypot(self.gravity.sigma, GAIN * np.nan_to_num(np.abs(balancing)))
+        residual = deviation
+        weights = np.isfinite(deviation)
+        for _ in range(ROUNDS):
+            changes, _ = most_probable(matrix, deviation, weights / sigma, unit)
+            residual = deviation - matrix @ changes
+            weights = np.abs(residual) < MAX_RESIDUAL * np.maximum(spreads(residual), sigma)
+        return np.abs(residual) / (MAX_RESIDUAL * sigma)
+
+
+def _drop_odd_files(chain: Chain, blocks: list[PoseMeasurements]) -> list[Finding]:
+    """Take the torques from blocks, in place, until those of all agree with the others'; return the findings.
+
+    Args:
+        chain: the arm.
+        blocks: the blocks of measurements.
+    """
+    findings = []
+    numbers = [number for number, block in enumerate(blocks) if block.measured_torque is not None]
+    while _disagreement(chain, [blocks[number] for number in numbers]) > 0.0:
+        distances = []
+        for number in numbers:
+            reference = [blocks[peer] for peer in numbers if peer != number]
+            distances.append((_disagreement(chain, reference), len(blocks[number]), -number))
+        odd = -min(distances)[-1]
+        numbers.remove(odd)
+        reference = [blocks[number] for number in numbers]
+        gravity, _ = gravity_fit(chain, reference)
+        assert gravity is not None
+        fault = contradiction(blocks[odd], gravity, reference)
+        blocks[odd], remark = _without_torques(blocks[odd], fault)
+        findings.append(remark)
+    return findings
+
+
+def _disagreement(chain: Chain, blocks: Sequence[PoseMeasurements]) -> float:
+    """Return the sum of distances of files from the gravity of the others; 0 where all agree.
+
+    Args:
+        chain: the arm.
+        blocks: blocks with torques.
+    """
+    total = 0.0
+    for number, block in enumerate(blocks):
+        reference = [*blocks[:number], *blocks[number + 1 :]]
+        gravity, _ = gravity_fit(chain, reference)
+        if gravity is None:
+            continue
+        result = agreement(block, gravity)
+        if not result.agrees:
+            total += result.distance
+    return total
+
+
+def _without_torques(block: PoseMeasurements, fault: Fault) -> tuple[PoseMeasurements, Finding]:
+    """Return a block without its measured torques, and the finding on their fault."""
+    reason, cure = fault
+    remark = finding("torques-unused", files=[block.file], reason=reason, cure=cure)
+    return replace(block, measured_torque=None), remark
