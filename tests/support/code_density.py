@@ -95,9 +95,9 @@ def statement_tokens(statement: ast.stmt, starts: list[tuple[int, int]], lines: 
     return behind - first
 
 
-def simple_statements(tree: ast.Module) -> Iterator[ast.stmt]:
-    """Yield the simple statements of a module but its docstrings and bare constants."""
-    for node in ast.walk(tree):
+def simple_statements(nodes: list[ast.AST]) -> Iterator[ast.stmt]:
+    """Yield the simple statements among a module's nodes but its docstrings and bare constants."""
+    for node in nodes:
         if not isinstance(node, SIMPLE_STATEMENTS):
             continue
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
@@ -105,9 +105,9 @@ def simple_statements(tree: ast.Module) -> Iterator[ast.stmt]:
         yield node
 
 
-def bound_names(tree: ast.Module) -> Iterator[str]:
+def bound_names(nodes: list[ast.AST]) -> Iterator[str]:
     """Yield the name of every parameter and of every assigned variable but self, cls and _."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.arg):
             name = node.arg
         elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
@@ -127,18 +127,18 @@ def density_of(texts: list[str]) -> Density:
     """Return the density of modules by their source texts."""
     statements = tokens = condensed = nested = bindings = empty = skips = unchecked = 0
     for text in texts:
-        tree = ast.parse(text)
+        nodes = list(ast.walk(ast.parse(text)))
         starts = token_starts(text)
         lines = text.split("\n")
         skips += text.count("fmt: skip")
-        for statement in simple_statements(tree):
+        for statement in simple_statements(nodes):
             statements += 1
             tokens += statement_tokens(statement, starts, lines)
             count = sum(isinstance(node, CONDENSED_EXPRESSIONS) for node in ast.walk(statement))
             condensed += count
             nested += count >= NESTED_STATEMENT
-        unchecked += sum(isinstance(node, ast.Name) and node.id == "Any" for node in ast.walk(tree))
-        for name in bound_names(tree):
+        unchecked += sum(isinstance(node, ast.Name) and node.id == "Any" for node in nodes)
+        for name in bound_names(nodes):
             bindings += 1
             empty += name.strip("_") in EMPTY_NAMES
     return Density(

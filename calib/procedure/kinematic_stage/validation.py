@@ -240,7 +240,8 @@ def _gross(proof: _Proof, reach: float) -> Iterator[Finding]:
     after = proof.rows.errors[1].main
     gross = _far_above_median(before) & _far_above_median(after)
     rows = _row_texts(proof.rows, gross)
-    if rows:
+    # errors of zero are of rows that determine themselves, such as three points of a plane
+    if rows and np.any(after[~gross]):
         without = float(np.sqrt(np.mean(after[~gross] ** 2)))
         share = min(proof.before, proof.after) / reach
         yield finding("gross-unseen-rows", rows=rows, without=without, times=proof.after / without, share=share)

@@ -78,6 +78,8 @@ SCALE = finding("lengths-grew", factor=1.01, sigma=1e-4, explained=0.9, off=0.01
         ({"a": with_row_off(1.0, 0.1, 30.0, 30.0)}, {"tolerance": 1e-3}, "fail", "above-tolerance"),
         ({"a": with_row_off(1.0, 0.1, 1.0, 30.0)}, {}, "fail", "worse-than-nominal"),
         ({"a": with_row_off(1.0, 0.1, 30.0, 0.1)}, {}, "pass", ""),
+        # rows that determine themselves, such as three points of a plane, have no error to compare others with
+        ({"a": with_row_off(0.0, 0.0, 30.0, 30.0)}, {}, "fail", "refuted"),
         # nothing to gain, like beside like
         ({"a": rows(0.3, 0.299)}, {"reach": 1.0}, "pass", ""),
         ({"a": rows(0.3, 0.299)}, {"reach": 1.0, "blind": ("b",)}, "marginal", "transfer-untested"),
