@@ -139,9 +139,15 @@ def test_excite_writes_motion_within_limits(tmp_path):
 
 @pytest.mark.slow
 def test_new_motion_adds_to_both_loads(folder, tmp_path):
-    """Predicted σ are those of (C⁻¹ + ∫ Σ WᵀW / s²)⁻¹, W of the encoders' rows; a payload's come from its own run."""
+    """Predicted σ are those of (C⁻¹ + ∫ Σ WᵀW / s²)⁻¹, W of the encoders' rows; a payload's come from its own run.
+
+    The errors s are those of the identification's own band.
+    """
     files, options = [folder / "empty.csv", folder / "load.csv"], folder / "options.toml"
     assert calib("identify", "dualv", *files, "--options", options, "--out", tmp_path / "id", "--no-plots") == 0
+    stored = json.loads((tmp_path / "id" / "metrics.json").read_text())
+    assert stored.pop("error_bands")["density"][0] == pytest.approx(3 * [1.0])
+    (tmp_path / "id" / "metrics.json").write_text(json.dumps(stored))
     settings = api.ExcitationSettings(
         period=1.0, harmonics=2, starts=1, evaluations=4, outlook=False, loads=("none", "5"), columns=("essential",)
     )

@@ -7,6 +7,7 @@ and z are instead the R factor of the data alone (``information.csv``), so that 
 
 from __future__ import annotations
 
+import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -155,6 +156,21 @@ def read(folder: str | Path, model: tuple[Chain, Dynamics] | None = None) -> Inf
         if covariance.shape != (len(names), len(names)) or factor.shape[1] != len(names) + 1:
             raise ValueError("files of different sizes")
     return Information(chain, dynamics, names, units, values, covariance, transform, factor)
+
+
+def read_factor(folder: Path) -> tuple[tuple[str, ...], np.ndarray]:
+    """Return the names of the b parameters in a folder's ``information.csv``, and the rows [R z] (k, b + 1).
+
+    Raises:
+        RobotError: if the file is missing or damaged.
+    """
+    path = folder / INFORMATION
+    with refused_as(RobotError, (OSError, ValueError), f"{path} cannot be read ({{}}); identify again"):
+        with path.open(encoding="utf-8", newline="") as file:
+            names = next(csv.reader(file), [])[:-1]
+        factor = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
+        require(factor.shape[1] == len(names) + 1, "names and columns differ in number", ValueError)
+    return tuple(names), factor
 
 
 def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], standard: tuple[str, ...]) -> np.ndarray:

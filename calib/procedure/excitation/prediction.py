@@ -18,7 +18,7 @@ models. It is taken from the limits file ([noise]), or assumed as a share of the
 After an identification, σ_j² is the spectral density of the errors that it left. Its share that grew with the torques'
 rates of change is scaled by the torques' variance on the new motion (`calib.identification.uncertainty.error_growth`),
 and all of it is taken from the band in which the recordings are then identified together
-(`calib.identification.uncertainty.error_bands`). The earlier recordings are weighed with the same σ_j.
+(`calib.identification.uncertainty.error_bands`), in which the earlier recordings are weighed anew.
 """
 
 from collections.abc import Callable, Sequence
@@ -376,8 +376,9 @@ def _prediction(
     # rows are weighted by the stated density of the torques' errors, else by the noise of each independent row
     sigmas = inputs.columns.sigmas
     if sigmas is not None and inputs.errors_known:
-        growth = _growth(inputs, regressor, rows_per_second(band, period * repeat))
-        earlier = _information_root(inputs, _reweighted(regressor[:, :, columns] / sigmas[:, None], growth))
+        wider = _wider(inputs, regressor, rows_per_second(band, period * repeat))
+        earlier = _information_root(inputs, _reweighted(regressor[:, :, columns] / sigmas[:, None], wider))
+        growth = wider * _growth(inputs, regressor)
         sigmas = sigmas * growth
         weight = period * repeat / PERIOD_SAMPLES
     else:
@@ -398,26 +399,30 @@ def _prediction(
     return prediction, root, shifts
 
 
-def _growth(inputs: ExcitationInputs, regressor: np.ndarray, rate: float) -> np.ndarray:
-    """Return the factor (rows,) of the torque errors' σ with another motion; 1 as far as it is not known.
+def _growth(inputs: ExcitationInputs, regressor: np.ndarray) -> np.ndarray:
+    """Return the factor (rows,) of the torque errors' σ on a motion with this regressor (N, rows, b); 1: not known."""
+    values = inputs.model.values
+    if inputs.prior is None or inputs.prior.growth is None or values is None:
+        return np.ones(regressor.shape[1])
+    torques = regressor @ values
+    return np.sqrt(inputs.prior.growth.factor(torques.var(axis=0)))
+
+
+def _wider(inputs: ExcitationInputs, regressor: np.ndarray, rate: float) -> np.ndarray:
+    """Return the factor (rows,) of all torque errors' σ with the rows per second of a further motion; 1: not known.
 
     Args:
         inputs: the earlier motions.
         regressor: (N, rows, b) regressor of the motion.
         rate: rows per second with which the motion is identified.
     """
-    squares = np.ones(regressor.shape[1])
-    prior, values = inputs.prior, inputs.model.values
-    if prior is not None and prior.growth is not None and values is not None:
-        torques = regressor @ values
-        squares = squares * prior.growth.factor(torques.var(axis=0))
-    if prior is not None and prior.bands is not None:
-        squares = squares * prior.bands.factor(rate)
-    return np.sqrt(squares)
+    if inputs.prior is None or inputs.prior.bands is None:
+        return np.ones(regressor.shape[1])
+    return np.sqrt(inputs.prior.bands.factor(rate))
 
 
 def _reweighted(whitened: np.ndarray, growth: np.ndarray) -> np.ndarray:
-    """Return the factor (c,) of the earlier recordings' rows, as all recordings are weighed with the same errors.
+    """Return the factor (c,) of the earlier recordings' rows in a wider band.
 
     The rows of each parameter are taken to share its information as in the new motion.
 

@@ -12,7 +12,7 @@ from calib.errors import UsageError
 from calib.estimation.triangles import retriangulate
 from calib.folders import COVARIANCE
 from calib.identification.identify_options import FileSettings
-from calib.identification.physical_consistency.information import INFORMATION, read
+from calib.identification.physical_consistency.information import INFORMATION, read_factor
 from calib.identification.uncertainty.error_bands import ErrorBands
 from calib.identification.uncertainty.error_growth import ErrorGrowth
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
@@ -213,12 +213,12 @@ def _data_information(folder: Path, model: ExcitedModel) -> np.ndarray | None:
     """
     if not (folder / INFORMATION).is_file():
         return None
-    stored = read(folder)
-    index = places(model.exact.names, stored.names, model.exact.model.names)
+    names, factor = read_factor(folder)
+    index = places(model.exact.names, names, model.exact.model.names)
     if index is None:
         return None
-    other = np.setdiff1d(np.arange(stored.b), index)
-    triangle = retriangulate(stored.factor[:, [*other, *index]])
+    other = np.setdiff1d(np.arange(len(names)), index)
+    triangle = retriangulate(factor[:, [*other, *index]])
     of_design = triangle[len(other) :, len(other) :]
     return of_design.T @ of_design
 
