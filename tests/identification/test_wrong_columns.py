@@ -9,7 +9,7 @@ import pytest
 from calib.column_changes import exchange, reversal
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics
-from calib.identification.checks.mistaken_columns import corrected, wrong_joints
+from calib.identification.checks.mistaken_columns import corrected, without_offsets, wrong_joints
 from calib.identification.checks.recorded_motion import MotionSamples
 from calib.procedure.dynamic_stage import plausibility
 from calib.robot.library import load
@@ -82,6 +82,15 @@ def test_wrong_column_is_named_without_masses(number):
     assert [(change.code, change.joints) for change in explanation.changes] == [(code, joints)]
     (found,) = plausibility.wrong_joints({"log": explanation}, load("tx40").joint_names)
     assert found.code == code and found.values["explained"] > 0.9
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_shares_do_not_depend_on_rounding(robot):
+    """Columns that the bodies explain wholly have no part in them: the order of the samples changes nothing."""
+    samples = recorded(robot, 0)
+    backwards = {name: getattr(samples, name)[::-1] for name in ("index", "q", "v", "a")}
+    shares = without_offsets(replace(samples, **backwards))
+    assert shares == pytest.approx(without_offsets(samples), rel=1e-9)
 
 
 def test_corrected_columns_are_those_that_were_recorded():

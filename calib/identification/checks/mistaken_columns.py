@@ -48,6 +48,8 @@ MAX_FACTOR_STEP = float(np.log(FACTORS[1] / FACTORS[0]))
 """Range of the search around the best of them, as a logarithm."""
 MAX_WORSE = 1.02
 """Unexplained share after a change by the described masses, over that before, by the common score: no worse."""
+ROUNDING = 1e-8
+"""Share of a column's size up to which what is left of it after a projection is rounding."""
 CACHED = 4
 """Number of changed positions whose factorisations are kept: they are large."""
 
@@ -263,7 +265,11 @@ def _unexplained_function(samples: MotionSamples, offsets: bool = True) -> Calla
     free = free @ spanning(free.T @ free)
     positive = weighted_rows(drives[..., :3].reshape(m, n, -1))
     positive /= np.maximum(np.abs(positive).max(axis=0), 1e-12)
+    size = np.linalg.norm(positive, axis=0)
     positive -= free @ (free.T @ positive)
+    # what bodies and offsets explain wholly leaves rounding, which as a column would explain some noise
+    is_independent = np.linalg.norm(positive, axis=0) > ROUNDING * size
+    positive = positive[:, is_independent]
     orthonormal, triangle = np.linalg.qr(positive)
 
     def unexplained(mixing: np.ndarray) -> np.ndarray:
