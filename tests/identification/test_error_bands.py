@@ -53,5 +53,13 @@ def test_a_narrower_band_changes_nothing():
     assert bands.factor(1e3) == pytest.approx([1.0, 4.0])
 
 
+def test_a_row_without_errors_keeps_its_density():
+    blue = np.diff(np.random.default_rng(0).normal(size=COUNT + 1))
+    bands = _bands(np.column_stack([blue, np.zeros(COUNT)]))
+    assert bands is not None
+    blue_factor, quiet_factor = bands.factor(4.0 * RATE / FACTOR)
+    assert blue_factor > 10.0 and quiet_factor == 1.0
+
+
 def test_without_errors_in_motion_nothing_is_stated():
     assert _bands(np.random.default_rng(0).normal(size=(4000, 1)), standing=True) is None

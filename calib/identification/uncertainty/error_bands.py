@@ -7,7 +7,8 @@ larger at higher frequencies; model errors at lower ones. The density in a band 
     D(r) = V(r) τ(r) / r,
 
 where V is the variance of the errors, filtered and decimated to r rows per second, and τ their integrated
-autocorrelation, as in the weights of an identification (`calib.identification.prior.weighing`).
+autocorrelation, as in the weights of an identification (`calib.identification.prior.weighing`), and at most
+`MAX_INFLATION` as there: beyond it the density of slow errors is stated too low in wide bands.
 """
 
 from collections.abc import Mapping, Sequence
@@ -58,7 +59,8 @@ def error_bands(
 ) -> ErrorBands | None:
     """Return how the density of an identification's errors depends on the band.
 
-    None if the rows of the identification are not those of the model, or a row has no error in motion.
+    None if the rows of the identification are not those of the model, or none has errors in motion. The density of a
+    row without errors in motion is taken to stay.
 
     Args:
         cases: training recordings.
@@ -78,9 +80,12 @@ def error_bands(
         wider = design_decimator(cases[0].motion.rate, factor)
         densities.append(_power(cases, predictions, all_rows, decimator, wider) / rate)
     density = np.array(densities)
-    if not (density > 0.0).all():
+    # a row without errors in motion, as of a locked joint, keeps its density
+    has_errors = (density > 0.0).all(axis=0)
+    if not has_errors.any():
         return None
-    return ErrorBands(rates, density / density[0])
+    relative = np.where(has_errors, density / np.where(has_errors, density[0], 1.0), 1.0)
+    return ErrorBands(rates, relative)
 
 
 def _power(
@@ -108,8 +113,10 @@ def _power(
         errors = decimate(np.asarray(case.target) - predictions[case.name], wider, segment)
         samples = kept(segment, wider)
         row_samples = kept(segment, decimator)
-        nearest = np.searchsorted(row_samples, samples).clip(max=len(row_samples) - 1)
-        in_motion = (rows.standing[nearest] == 0.0) & np.asarray(case.present)[samples]
+        if not len(row_samples):
+            continue
+        next_row = np.searchsorted(row_samples, samples).clip(max=len(row_samples) - 1)
+        in_motion = (rows.standing[next_row] == 0.0) & np.asarray(case.present)[samples]
         for row in range(row_count):
             row_errors = errors[in_motion[:, row], row]
             count = len(row_errors)

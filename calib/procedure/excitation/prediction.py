@@ -59,6 +59,8 @@ TASK_STATES = 400
 NAMED_GAINS = 3
 # σ reached over σ predicted after an identification: 10 and 90 % quantiles over pairs of recordings (measured)
 REACHED = (0.75, 1.5)
+# share of an eigenvalue's size that is rounding
+ROUNDING = 1e-6
 WRITTEN_BY_EXCITE = "give the folder that calib excite wrote"
 
 
@@ -243,6 +245,9 @@ def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray
 def _information_root(inputs: ExcitationInputs, factor: np.ndarray | float = 1.0) -> np.ndarray:
     """Return a square root W (c, c) of the earlier motions' information matrix Wᵀ W.
 
+    The priors' share is what the information exceeds that of the recordings' rows by. Where it does not exceed it, as
+    with a geometry's part in the covariance, all of it is scaled.
+
     Args:
         inputs: model and earlier motions; c is the number of columns of the design.
         factor: factor (c,) of the recordings' rows; that of priors is 1.
@@ -250,13 +255,21 @@ def _information_root(inputs: ExcitationInputs, factor: np.ndarray | float = 1.0
     assert inputs.prior is not None
     columns = inputs.columns.kept
     information = inputs.prior.information[columns][:, columns]
-    data = information
+    squared_factors = np.outer(factor, factor) * np.ones_like(information)
+    scaled = information * squared_factors
     if inputs.prior.data is not None:
         data = inputs.prior.data[columns][:, columns]
-    factors = factor * np.ones(len(information))
-    scaled = information + data * (np.outer(factors, factors) - 1.0)
+        priors = information - data
+        if _is_semidefinite(priors, information):
+            scaled = priors + data * squared_factors
     values, V = np.linalg.eigh(scaled)
     return np.sqrt(np.maximum(values, 0.0))[:, None] * V.T
+
+
+def _is_semidefinite(difference: np.ndarray, information: np.ndarray) -> bool:
+    """Return whether a part (c, c) of an information matrix has no negative eigenvalue but for rounding."""
+    size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    return bool(np.linalg.eigvalsh(difference / np.outer(size, size))[0] > -ROUNDING)
 
 
 def _root(W: np.ndarray) -> np.ndarray:
@@ -431,8 +444,11 @@ def _reweighted(whitened: np.ndarray, growth: np.ndarray) -> np.ndarray:
         growth: (rows,) factor of σ.
     """
     squares = np.sum(whitened**2, axis=0)
-    total = np.maximum(squares.sum(axis=0), 1e-300)
-    return np.sqrt(growth**-2.0 @ squares / total)
+    total = squares.sum(axis=0)
+    responds = total > 0.0
+    shares = growth**-2.0 @ squares / np.where(responds, total, 1.0)
+    # what the new motion does not move was seen by rows that are not known: by those that lose most
+    return np.sqrt(np.where(responds, shares, np.min(growth**-2.0)))
 
 
 def _band(motion: SampledMotion, period: float) -> float:

@@ -207,7 +207,7 @@ def _bands(folder: Path, model: ExcitedModel) -> ErrorBands | None:
 
 
 def _data_information(folder: Path, model: ExcitedModel) -> np.ndarray | None:
-    """Return the information (b, b) of an identification's recordings, without priors; None if there were no priors.
+    """Return the information (b, b) of an identification's recordings, without priors; None if it is not stored.
 
     Columns that are not designed are marginalised.
     """

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from calib.procedure.dynamic_stage import identify, inputs
 from calib.procedure.excitation import design, prediction
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.geometry_spread import geometry_spread
+from calib.procedure.excitation.inputs import ExcitationInputs
+from calib.procedure.excitation.prediction import _information_root, _reweighted
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
 
@@ -106,3 +109,37 @@ def test_missing_prediction_is_refused(motion, outcome, tmp_path):
     other = replace(outcome, found=SimpleNamespace(names=["one", "two"], fitted=fitted))
     with pytest.raises(UsageError, match="none of the 2 identified parameters"):
         prediction.compared_with_identification(motion, other)
+
+
+def test_earlier_rows_are_weighed_by_the_rows_that_see_a_parameter():
+    """Of three parameters each row sees one; the third is moved by neither, as by the friction of a locked joint."""
+    whitened = np.zeros((2, 2, 3))
+    whitened[:, 0, 0] = 3.0
+    whitened[:, 1, 1] = 5.0
+    factor = _reweighted(whitened, np.array([2.0, 4.0]))
+    assert factor == pytest.approx([1 / 2, 1 / 4, 1 / 4])
+
+
+def _stored(information: np.ndarray, data: np.ndarray | None) -> ExcitationInputs:
+    """Return inputs that have an identification's information alone."""
+    kept = np.arange(len(information))
+    stored = SimpleNamespace(
+        columns=SimpleNamespace(kept=kept), prior=SimpleNamespace(information=information, data=data)
+    )
+    return cast(ExcitationInputs, stored)
+
+
+def test_priors_are_not_weighed_with_the_rows():
+    data = np.array([[4.0, 1.0], [1.0, 2.0]])
+    priors = np.diag([0.5, 3.0])
+    factor = np.array([0.5, 0.25])
+    root = _information_root(_stored(data + priors, data), factor)
+    np.testing.assert_allclose(root.T @ root, data * np.outer(factor, factor) + priors)
+
+
+@pytest.mark.parametrize("data", [None, np.diag([8.0, 1.0])], ids=["no rows stored", "covariance of more than torques"])
+def test_all_information_is_weighed_where_the_priors_share_is_not_known(data):
+    information = np.array([[4.0, 1.0], [1.0, 2.0]])
+    factor = np.array([0.5, 0.25])
+    root = _information_root(_stored(information, data), factor)
+    np.testing.assert_allclose(root.T @ root, information * np.outer(factor, factor))
