@@ -18,7 +18,7 @@ from calib.dynamics.load_cases import LoadCases
 from calib.dynamics.regressor_model import Loads
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
-from calib.errors import UsageError, one_of, refused_as, require
+from calib.errors import UsageError, listing, one_of, refused_as, require
 from calib.folders import COVARIANCE, read_covariance
 from calib.identification.model_file import from_table, read_table, refuse_currents, refuse_other_arm
 from calib.identification.settings import IdentificationSettings, make_model
@@ -233,7 +233,7 @@ def _differentiable(model: IdentificationModel) -> tuple[IdentificationModel, li
     omitted = [term.name for term in model.columns if not term.form.slopes]
     notes = []
     if omitted:
-        notes.append(f"the design does not include friction terms without derivatives: {', '.join(omitted)}")
+        notes.append(f"the design does not include friction terms without derivatives: {listing(omitted)}")
     return replace(model, terms=differentiable), notes
 
 
