@@ -12,7 +12,14 @@ from calib.data.poses.pose_files import read_measurements
 from calib.errors import UsageError
 from calib.geometry.static_torques.agreement import agreeing_torques, without_contradicting_torques
 from calib.geometry.static_torques.column_faults import column_fault
-from calib.geometry.static_torques.gravity_fit import gravity_fit, gravity_regressor, payload_load
+from calib.geometry.static_torques.gravity_fit import (
+    FACTOR_SIGMAS,
+    MILLIMETRES,
+    gravity_factor,
+    gravity_fit,
+    gravity_regressor,
+    payload_load,
+)
 from calib.geometry.static_torques.load_errors import load_masses
 from calib.geometry.static_torques.sources import MODELLED, driven, load_changes, load_findings
 from calib.robot.formats import urdf as urdf_format
@@ -300,6 +307,18 @@ def test_files_of_a_few_rows_each_or_of_a_single_pose_do_not_contradict_each_oth
         assert len(fit.loads) == len(files)
 
 
+def test_torques_of_a_single_pose_are_not_called_too_large_by_their_noise(arm, gravity, tmp_path):
+    """Over steps of 0.1 µrad gravity hardly varies: the noise is thousands of times its variation."""
+    poses = np.tile(arm.table(1, 5)[:, :7], (12, 1)) + 1e-7 * np.arange(12)[:, None]
+    still = block(arm.write(tmp_path / "still.csv", arm.table(12, 7, poses=poses)))
+    expected = gravity.sign * driven(still, gravity, MODELLED).torque
+    wrong = changed(still, lambda torque: np.multiply(torque, 0.2, out=torque))
+    factor, sigma = gravity_factor(expected, np.asarray(wrong.measured_torque))
+    assert abs(factor) > MILLIMETRES > abs(factor) - FACTOR_SIGMAS * sigma
+    measured, (unused,) = without_contradicting_torques(wrong, gravity, [])
+    assert measured.measured_torque is None and "times the gravity" not in unused.values["reason"]
+
+
 @pytest.mark.parametrize(
     "heads, says",
     [
@@ -311,6 +330,18 @@ def test_torques_that_are_not_read_are_explained(arm, chain, tmp_path, heads, sa
     measured = block(arm.write(tmp_path / "some.csv", arm.table(10, 1)[:, : len(heads)], heads))
     fit, _, (unused,) = agreeing_torques(chain, [measured])
     assert fit is None and says in unused.values["reason"]
+
+
+@pytest.mark.parametrize("unit", ["", " [A]"])
+def test_torques_by_joint_are_read_beside_numbered_ones_of_some_joints_or_in_amperes(arm, tmp_path, unit):
+    table = arm.table(10, 1)
+    numbered = [f"tau{number}{unit}" for number in range(1, 8)]
+    if not unit:
+        numbered = numbered[:1]
+    heads = [*HEAD[:10], *(f"tau_{name}" for name in JOINTS), *numbered]
+    measured = block(arm.write(tmp_path / "both.csv", np.hstack([table, -table[:, 10 : 10 + len(numbered)]]), heads))
+    assert measured.torque_fault is None
+    assert np.allclose(measured.measured_torque, table[:, 10:])
 
 
 def test_joints_without_a_sensor_have_empty_columns(chain, folder):

@@ -16,9 +16,7 @@ from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, finding, listing
 from calib.geometry.static_torques.gravity_fit import (
     GAIN,
-    IN_MILLIMETRES,
     MAX_RESIDUAL,
-    MILLIMETRES,
     ROUNDS,
     Fault,
     GravityFit,
@@ -28,6 +26,7 @@ from calib.geometry.static_torques.gravity_fit import (
     gravity_fit,
     gravity_regressor,
     load_deviations,
+    millimetre_fault,
     most_probable,
     nothing_read,
     spreads,
@@ -133,9 +132,10 @@ def contradiction(block: PoseMeasurements, gravity: GravityFit, reference: Seque
         return fault
     names = listing(sorted({Path(peer.file).name for peer in reference if peer.measured_torque is not None}))
     expected = gravity.sign * gravity_torques(gravity.chain, block.q)
-    factor, _ = gravity_factor(expected, torque)
-    if abs(factor) > MILLIMETRES:
-        return f"they are {abs(factor):.0f} times the gravity of {names}", IN_MILLIMETRES
+    factor, sigma = gravity_factor(expected, torque)
+    fault = millimetre_fault(factor, sigma, names)
+    if fault is not None:
+        return fault
     loaded = _LoadedGravity.at(block, gravity)
     smallest = np.inf
     cure = "were they read at rest, by the same sensors, in the same unit and joint order as those of the fit?"
