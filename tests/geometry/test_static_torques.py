@@ -294,6 +294,46 @@ def test_of_three_files_the_one_that_contradicts_two_is_named(arm, chain, folder
     assert len(fit.loads) == 2
 
 
+def rub(torque):
+    random = np.random.default_rng(1)
+    torque[:] = 20.0 * np.sign(random.normal(size=torque.shape)) + random.normal(size=torque.shape)
+
+
+def turn_ten(torque):
+    np.negative(torque, out=torque)
+    torque[10:] = np.nan
+
+
+def turn_few(torque):
+    np.negative(torque, out=torque)
+    torque[5:] = np.nan
+
+
+@pytest.mark.parametrize("change, count", [(rub, 40), (rub, 80), (turn_ten, 80), (turn_few, 80)])
+@pytest.mark.parametrize("files", [("odd", "good"), ("good", "odd")])
+def test_of_two_files_the_one_that_shows_gravity_stays(arm, chain, tmp_path, change, count, files):
+    """The odd file has as many rows as the good one or more; it is motor friction, or turned where it has torques."""
+    good = block(arm.write(tmp_path / "good.csv", arm.table(40, 5)))
+    blocks = {"good": good, "odd": changed(block(arm.write(tmp_path / "odd.csv", arm.table(count, 6))), change)}
+    fit, agreeing, (unused,) = agreeing_torques(chain, [blocks[name] for name in files])
+    assert list(unused.values["files"]) == ["changed.csv"]
+    assert agreeing[files.index("good")] is good and agreeing[files.index("odd")].measured_torque is None
+    assert len(fit.loads) == 1
+
+
+def test_of_three_files_two_without_gravity_are_named(arm, chain, tmp_path):
+    tables = [block(arm.write(tmp_path / f"{seed}.csv", arm.table(40, seed))) for seed in (5, 6, 7)]
+    fit, agreeing, findings = agreeing_torques(chain, [changed(tables[0], rub), changed(tables[1], shuffle), tables[2]])
+    assert fit is not None and len(findings) == 2
+    assert [measured.measured_torque is None for measured in agreeing] == [True, True, False]
+
+
+def test_empty_torques_of_an_unseen_file_are_called_empty(folder, gravity):
+    empty = faulty(folder, lambda torque: torque.fill(np.nan))
+    measured, (unused,) = without_contradicting_torques(empty, gravity, [])
+    assert measured.measured_torque is None and unused.values["reason"] == "their columns are empty"
+
+
 def test_files_of_a_few_rows_each_or_of_a_single_pose_do_not_contradict_each_other(arm, chain, folder, tmp_path):
     rows = arm.table(24, 5)
     poses = np.tile(rows[:1, :7], (12, 1)) + 1e-4 * np.arange(12)[:, None]

@@ -29,6 +29,7 @@ from calib.geometry.static_torques.gravity_fit import (
     millimetre_fault,
     most_probable,
     nothing_read,
+    rows_with_torques,
     spreads,
 )
 from calib.robot.chain import Chain
@@ -42,7 +43,7 @@ class Agreement(NamedTuple):
     """How far torques of a file agree with a gravity.
 
     Attributes:
-        at_rest: share of the rows whose torques are explained.
+        at_rest: share of the rows with torques in which all of these are explained; 0 where none were measured.
         distance: mean of the squared residuals over the largest ones of an arm at rest, each 1 at most.
     """
 
@@ -60,7 +61,8 @@ def agreeing_torques(
 ) -> tuple[GravityFit | None, tuple[PoseMeasurements, ...], list[Finding]]:
     """Return the gravity of files whose torques agree, the blocks without torques that do not, and findings on these.
 
-    The odd file is the one without which the others agree best; of two it is the one with fewer rows, or the later.
+    The odd file is the one without which the others agree best; of two it is the one with fewer rows
+    of torques, or the later. Files that show no gravity are judged first, by single files that do.
 
     Args:
         chain: the arm, with its described masses if they are known.
@@ -79,6 +81,7 @@ def agreeing_torques(
             if fault is not None:
                 result[number], remark = _without_torques(block, fault)
                 findings.append(remark)
+        findings += _drop_files_without_gravity(chain, result)
         findings += _drop_odd_files(chain, result)
     gravity, faults = gravity_fit(chain, result)
     return gravity, tuple(result), findings + faults
@@ -205,9 +208,11 @@ class _LoadedGravity:
         at_rest, distance = [], []
         for rows in self.groups:
             ratio = self._residual_ratio(balancing[rows], rows)
-            at_rest += np.all(~(ratio >= 1.0), axis=1).tolist()
-            distance += np.minimum(ratio[np.isfinite(ratio)], 1.0).tolist()
-        return Agreement(float(np.mean(at_rest)), float(np.mean(np.square(distance or [0.0]))))
+            measured = np.isfinite(ratio)
+            resting = np.all(~(ratio >= 1.0), axis=1)
+            at_rest += resting[measured.any(axis=1)].tolist()
+            distance += np.minimum(ratio[measured], 1.0).tolist()
+        return Agreement(float(np.mean(at_rest or [0.0])), float(np.mean(np.square(distance or [0.0]))))
 
     def _residual_ratio(self, balancing: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return the residuals (r, n) over the largest ones of an arm at rest; NaN where no torque was read.
@@ -229,6 +234,37 @@ class _LoadedGravity:
         return np.abs(residual) / (MAX_RESIDUAL * sigma)
 
 
+def _drop_files_without_gravity(chain: Chain, blocks: list[PoseMeasurements]) -> list[Finding]:
+    """Take the torques from blocks, in place, that neither show a gravity nor agree with that of a file that does.
+
+    Torques of a single pose show none, but agree.
+
+    Args:
+        chain: the arm.
+        blocks: the blocks of measurements.
+    """
+    gravities: list[GravityFit] = []
+    reference: list[PoseMeasurements] = []
+    doubtful = []
+    for number, block in enumerate(blocks):
+        gravity, faults = gravity_fit(chain, [block])
+        if gravity is not None:
+            gravities.append(gravity)
+            reference.append(block)
+        elif faults:
+            doubtful.append(number)
+    findings: list[Finding] = []
+    if not gravities:
+        return findings
+    for number in doubtful:
+        block = blocks[number]
+        if not any(agreement(block, gravity).agrees for gravity in gravities):
+            fault = contradiction(block, gravities[0], reference[:1])
+            blocks[number], remark = _without_torques(block, fault)
+            findings.append(remark)
+    return findings
+
+
 def _drop_odd_files(chain: Chain, blocks: list[PoseMeasurements]) -> list[Finding]:
     """Take the torques from blocks, in place, until those of all agree with the others'; return the findings.
 
@@ -239,16 +275,20 @@ def _drop_odd_files(chain: Chain, blocks: list[PoseMeasurements]) -> list[Findin
     findings = []
     numbers = [number for number, block in enumerate(blocks) if block.measured_torque is not None]
     while _disagreement(chain, [blocks[number] for number in numbers]) > 0.0:
-        distances = []
+        # a file that disagrees does so with a gravity of the others: at least this remainder has one
+        ranks = []
+        gravities: dict[int, GravityFit] = {}
         for number in numbers:
             reference = [blocks[peer] for peer in numbers if peer != number]
-            distances.append((_disagreement(chain, reference), len(blocks[number]), -number))
-        odd = -min(distances)[-1]
+            gravity, _ = gravity_fit(chain, reference)
+            if gravity is not None:
+                gravities[number] = gravity
+                rows = rows_with_torques(np.asarray(blocks[number].measured_torque))
+                ranks.append((_disagreement(chain, reference), rows, -number))
+        odd = -min(ranks)[-1]
         numbers.remove(odd)
         reference = [blocks[number] for number in numbers]
-        gravity, _ = gravity_fit(chain, reference)
-        assert gravity is not None
-        fault = contradiction(blocks[odd], gravity, reference)
+        fault = contradiction(blocks[odd], gravities[odd], reference)
         blocks[odd], remark = _without_torques(blocks[odd], fault)
         findings.append(remark)
     return findings

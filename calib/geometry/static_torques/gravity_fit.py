@@ -227,11 +227,10 @@ def gravity_fit(chain: Chain, blocks: Sequence[PoseMeasurements]) -> tuple[Gravi
         return None, []
     torques = [np.asarray(block.measured_torque) for block in measured]
     torque = np.concatenate(torques)
-    finite = np.isfinite(torque)
     fit = None
     fault = nothing_read(torque)
     if fault is None:
-        if finite.any(axis=1).sum() < chain.n:
+        if rows_with_torques(torque) < chain.n:
             return None, []
         described = reference_masses(chain)
         regressor = np.concatenate([gravity_regressor(chain, block.q) for block in measured])
@@ -256,7 +255,7 @@ def fault_of_file(chain: Chain, block: PoseMeasurements) -> Fault | None:
     """
     torque = np.asarray(block.measured_torque)
     fault = nothing_read(torque)
-    if fault is not None or len(block) < chain.n:
+    if fault is not None or rows_with_torques(torque) < chain.n:
         return fault
     described = reference_masses(chain)
     regressor = gravity_regressor(chain, block.q)
@@ -281,6 +280,11 @@ def _factor_and_fault(
     if fault is None:
         fault = column_fault(regressor, np.where(finite, torque, 0.0), finite)
     return factor, fault
+
+
+def rows_with_torques(torque: np.ndarray) -> int:
+    """Return in how many rows of torques (m, n) any was read."""
+    return int(np.isfinite(torque).any(axis=1).sum())
 
 
 def nothing_read(torque: np.ndarray) -> Fault | None:
