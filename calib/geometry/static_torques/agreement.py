@@ -6,7 +6,6 @@ rows. Where it does not, changes that would cure it are tried: another sign, col
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +13,7 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, finding, listing
+from calib.geometry.static_torques.column_faults import ColumnChange, column_changes
 from calib.geometry.static_torques.gravity_fit import (
     GAIN,
     MAX_RESIDUAL,
@@ -118,7 +118,7 @@ def agreement(block: PoseMeasurements, gravity: GravityFit) -> Agreement:
         block: measurements with torques.
         gravity: the gravity of other files.
     """
-    return _LoadedGravity.at(block, gravity).agreement(np.asarray(block.measured_torque))
+    return _LoadedGravity.at(block, gravity).agreement(block)
 
 
 def contradiction(block: PoseMeasurements, gravity: GravityFit, reference: Sequence[PoseMeasurements]) -> Fault:
@@ -143,34 +143,23 @@ def contradiction(block: PoseMeasurements, gravity: GravityFit, reference: Seque
     smallest = np.inf
     cure = "were they read at rest, by the same sensors, in the same unit and joint order as those of the fit?"
     fault = f"with the gravity of {names}, no load explains them", cure
-    for changed, explanation in _changes(torque, names):
-        changed_agreement = loaded.agreement(changed)
-        if changed_agreement.agrees and changed_agreement.distance < smallest:
-            smallest, fault = changed_agreement.distance, explanation
+    for change in _changes(torque.shape[1], names):
+        changed = loaded.agreement(replace(block, measured_torque=change.of(torque)))
+        if changed.agrees and changed.distance < smallest:
+            smallest, fault = changed.distance, change.fault
     return fault
 
 
-def _changes(torque: np.ndarray, names: str) -> Iterator[tuple[np.ndarray, Fault]]:
-    """Yield torques (m, n) with another sign or with columns exchanged, and what each change would mean.
+def _changes(n: int, names: str) -> Iterator[ColumnChange]:
+    """Yield changes of torques: another sign of all, or of one column, or two columns exchanged.
 
     Args:
-        torque: the recorded torques [N m].
-        names: names of the files that they are compared with.
+        n: number of joints.
+        names: names of the files that the torques are compared with.
     """
-    yield -torque, (f"their sign is the other one than in {names}", "reverse the sign of all of them")
-    joints = range(torque.shape[1])
-    for joint in joints:
-        changed = torque.copy()
-        changed[:, joint] *= -1.0
-        name = f"tau{joint + 1}"
-        reason = f"with {name} reversed gravity explains them, as recorded it does not"
-        yield changed, (reason, f"reverse the sign of {name}")
-    for first, second in combinations(joints, 2):
-        changed = torque.copy()
-        changed[:, [first, second]] = torque[:, [second, first]]
-        pair = f"tau{first + 1} and tau{second + 1}"
-        reason = f"with {pair} exchanged gravity explains them, as recorded it does not"
-        yield changed, (reason, f"exchange the names of {pair} in the header")
+    turned = f"their sign is the other one than in {names}", "reverse the sign of all of them"
+    yield ColumnChange(np.arange(n), -np.ones(n), turned)
+    yield from column_changes(np.ones(n, dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,9 +191,9 @@ class _LoadedGravity:
         torque = gravity_torques(gravity.chain, block.q)
         return cls(gravity, by_stated_load(block), torque, np.concatenate([of_gravity, of_load], axis=2))
 
-    def agreement(self, torque: np.ndarray) -> Agreement:
-        """Return how far torques (m, n) of these rows agree with the gravity, with any load."""
-        balancing = self.gravity.sign * torque - self.gravity.offset
+    def agreement(self, block: PoseMeasurements) -> Agreement:
+        """Return how far the torques of a block with these rows agree with the gravity, with any load."""
+        balancing = self.gravity.balancing(block)
         at_rest, distance = [], []
         for rows in self.groups:
             ratio = self._residual_ratio(balancing[rows], rows)
