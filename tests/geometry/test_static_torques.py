@@ -12,7 +12,14 @@ from calib.data.poses.pose_files import read_measurements
 from calib.errors import UsageError
 from calib.geometry.static_torques.agreement import agreeing_torques, without_contradicting_torques
 from calib.geometry.static_torques.column_faults import column_fault
-from calib.geometry.static_torques.gravity_fit import gravity_fit, gravity_regressor, payload_load
+from calib.geometry.static_torques.gravity_fit import (
+    FACTOR_SIGMAS,
+    MILLIMETRES,
+    gravity_factor,
+    gravity_fit,
+    gravity_regressor,
+    payload_load,
+)
 from calib.geometry.static_torques.load_errors import load_masses
 from calib.geometry.static_torques.sources import MODELLED, driven, load_changes, load_findings
 from calib.robot.formats import urdf as urdf_format
@@ -287,6 +294,46 @@ def test_of_three_files_the_one_that_contradicts_two_is_named(arm, chain, folder
     assert len(fit.loads) == 2
 
 
+def rub(torque):
+    random = np.random.default_rng(1)
+    torque[:] = 20.0 * np.sign(random.normal(size=torque.shape)) + random.normal(size=torque.shape)
+
+
+def turn_ten(torque):
+    np.negative(torque, out=torque)
+    torque[10:] = np.nan
+
+
+def turn_few(torque):
+    np.negative(torque, out=torque)
+    torque[5:] = np.nan
+
+
+@pytest.mark.parametrize("change, count", [(rub, 40), (rub, 80), (turn_ten, 80), (turn_few, 80)])
+@pytest.mark.parametrize("files", [("odd", "good"), ("good", "odd")])
+def test_of_two_files_the_one_that_shows_gravity_stays(arm, chain, tmp_path, change, count, files):
+    """The odd file has as many rows as the good one or more; it is motor friction, or turned where it has torques."""
+    good = block(arm.write(tmp_path / "good.csv", arm.table(40, 5)))
+    blocks = {"good": good, "odd": changed(block(arm.write(tmp_path / "odd.csv", arm.table(count, 6))), change)}
+    fit, agreeing, (unused,) = agreeing_torques(chain, [blocks[name] for name in files])
+    assert list(unused.values["files"]) == ["changed.csv"]
+    assert agreeing[files.index("good")] is good and agreeing[files.index("odd")].measured_torque is None
+    assert len(fit.loads) == 1
+
+
+def test_of_three_files_two_without_gravity_are_named(arm, chain, tmp_path):
+    tables = [block(arm.write(tmp_path / f"{seed}.csv", arm.table(40, seed))) for seed in (5, 6, 7)]
+    fit, agreeing, findings = agreeing_torques(chain, [changed(tables[0], rub), changed(tables[1], shuffle), tables[2]])
+    assert fit is not None and len(findings) == 2
+    assert [measured.measured_torque is None for measured in agreeing] == [True, True, False]
+
+
+def test_empty_torques_of_an_unseen_file_are_called_empty(folder, gravity):
+    empty = faulty(folder, lambda torque: torque.fill(np.nan))
+    measured, (unused,) = without_contradicting_torques(empty, gravity, [])
+    assert measured.measured_torque is None and unused.values["reason"] == "their columns are empty"
+
+
 def test_files_of_a_few_rows_each_or_of_a_single_pose_do_not_contradict_each_other(arm, chain, folder, tmp_path):
     rows = arm.table(24, 5)
     poses = np.tile(rows[:1, :7], (12, 1)) + 1e-4 * np.arange(12)[:, None]
@@ -300,6 +347,18 @@ def test_files_of_a_few_rows_each_or_of_a_single_pose_do_not_contradict_each_oth
         assert len(fit.loads) == len(files)
 
 
+def test_torques_of_a_single_pose_are_not_called_too_large_by_their_noise(arm, gravity, tmp_path):
+    """Over steps of 0.1 µrad gravity hardly varies: the noise is thousands of times its variation."""
+    poses = np.tile(arm.table(1, 5)[:, :7], (12, 1)) + 1e-7 * np.arange(12)[:, None]
+    still = block(arm.write(tmp_path / "still.csv", arm.table(12, 7, poses=poses)))
+    expected = gravity.sign * driven(still, gravity, MODELLED).torque
+    wrong = changed(still, lambda torque: np.multiply(torque, 0.2, out=torque))
+    factor, sigma = gravity_factor(expected, np.asarray(wrong.measured_torque))
+    assert abs(factor) > MILLIMETRES > abs(factor) - FACTOR_SIGMAS * sigma
+    measured, (unused,) = without_contradicting_torques(wrong, gravity, [])
+    assert measured.measured_torque is None and "times the gravity" not in unused.values["reason"]
+
+
 @pytest.mark.parametrize(
     "heads, says",
     [
@@ -311,6 +370,18 @@ def test_torques_that_are_not_read_are_explained(arm, chain, tmp_path, heads, sa
     measured = block(arm.write(tmp_path / "some.csv", arm.table(10, 1)[:, : len(heads)], heads))
     fit, _, (unused,) = agreeing_torques(chain, [measured])
     assert fit is None and says in unused.values["reason"]
+
+
+@pytest.mark.parametrize("unit", ["", " [A]"])
+def test_torques_by_joint_are_read_beside_numbered_ones_of_some_joints_or_in_amperes(arm, tmp_path, unit):
+    table = arm.table(10, 1)
+    numbered = [f"tau{number}{unit}" for number in range(1, 8)]
+    if not unit:
+        numbered = numbered[:1]
+    heads = [*HEAD[:10], *(f"tau_{name}" for name in JOINTS), *numbered]
+    measured = block(arm.write(tmp_path / "both.csv", np.hstack([table, -table[:, 10 : 10 + len(numbered)]]), heads))
+    assert measured.torque_fault is None
+    assert np.allclose(measured.measured_torque, table[:, 10:])
 
 
 def test_joints_without_a_sensor_have_empty_columns(chain, folder):

@@ -437,27 +437,44 @@ def find_layout(sheet: Sheet, joints: Joints | Sequence[str]) -> Layout:
 def _find_torques(sheet: Sheet, robot: Joints) -> tuple[tuple[str, ...], tuple[str, str] | None]:
     """Return the names of the joints' torques, ``tau1`` … or ``tau_<joint name>``, or why they are not read.
 
-    Columns in a unit of currents are none: gravity at rest is compared with torques.
-
     Args:
         sheet: the table with its options.
         robot: the robot's joints.
     """
     numbered = [f"tau{number}" for number in range(1, len(robot.names) + 1)]
+    first_fault = None
     for form in (numbered, [f"tau_{name}" for name in robot.names]):
-        columns = [sheet.find(name) for name in form]
-        present = tuple(filter(None, columns))
-        if not present:
-            continue
-        missing = [name for name, column in zip(robot.names, columns) if not column]
-        if missing:
-            reason = f"those of {listing(missing)} are missing, and gravity is found by the torques of all joints"
-            return (), (reason, "record them, or add empty columns for joints without a sensor")
-        units = {sheet.unit(column, "torque") for column in present}
-        if not {unit.lower() for unit in units} <= {"", *EFFORTS}:
-            return (), (f"their columns are in {listing(sorted(units))}", "torques at rest are read in N m or N mm")
-        return present, None
-    return (), None
+        columns, fault = _torques_by_names(sheet, robot, form)
+        if columns:
+            return columns, None
+        first_fault = first_fault or fault
+    return (), first_fault
+
+
+def _torques_by_names(
+    sheet: Sheet, robot: Joints, names: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, str] | None]:
+    """Return the columns of the joints' torques by their names, or why they are not read; neither without any.
+
+    Columns in a unit of currents are none: gravity at rest is compared with torques.
+
+    Args:
+        sheet: the table with its options.
+        robot: the robot's joints.
+        names: name of the torque of each joint.
+    """
+    columns = [sheet.find(name) for name in names]
+    present = tuple(filter(None, columns))
+    if not present:
+        return (), None
+    missing = [name for name, column in zip(robot.names, columns) if not column]
+    if missing:
+        reason = f"those of {listing(missing)} are missing, and gravity is found by the torques of all joints"
+        return (), (reason, "record them, or add empty columns for joints without a sensor")
+    units = {sheet.unit(column, "torque") for column in present}
+    if not {unit.lower() for unit in units} <= {"", *EFFORTS}:
+        return (), (f"their columns are in {listing(sorted(units))}", "torques at rest are read in N m or N mm")
+    return present, None
 
 
 def _layout(sheet: Sheet, robot: Joints) -> Layout:

@@ -6,7 +6,6 @@ rows. Where it does not, changes that would cure it are tried: another sign, col
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,11 +13,10 @@ import numpy as np
 
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import Finding, finding, listing
+from calib.geometry.static_torques.column_faults import ColumnChange, column_changes
 from calib.geometry.static_torques.gravity_fit import (
     GAIN,
-    IN_MILLIMETRES,
     MAX_RESIDUAL,
-    MILLIMETRES,
     ROUNDS,
     Fault,
     GravityFit,
@@ -28,8 +26,10 @@ from calib.geometry.static_torques.gravity_fit import (
     gravity_fit,
     gravity_regressor,
     load_deviations,
+    millimetre_fault,
     most_probable,
     nothing_read,
+    rows_with_torques,
     spreads,
 )
 from calib.robot.chain import Chain
@@ -43,7 +43,7 @@ class Agreement(NamedTuple):
     """How far torques of a file agree with a gravity.
 
     Attributes:
-        at_rest: share of the rows whose torques are explained.
+        at_rest: share of the rows with torques in which all of these are explained; 0 where none were measured.
         distance: mean of the squared residuals over the largest ones of an arm at rest, each 1 at most.
     """
 
@@ -61,7 +61,8 @@ def agreeing_torques(
 ) -> tuple[GravityFit | None, tuple[PoseMeasurements, ...], list[Finding]]:
     """Return the gravity of files whose torques agree, the blocks without torques that do not, and findings on these.
 
-    The odd file is the one without which the others agree best; of two it is the one with fewer rows, or the later.
+    The odd file is the one without which the others agree best; of two it is the one with fewer rows
+    of torques, or the later. Files that show no gravity are judged first, by single files that do.
 
     Args:
         chain: the arm, with its described masses if they are known.
@@ -80,6 +81,7 @@ def agreeing_torques(
             if fault is not None:
                 result[number], remark = _without_torques(block, fault)
                 findings.append(remark)
+        findings += _drop_files_without_gravity(chain, result)
         findings += _drop_odd_files(chain, result)
     gravity, faults = gravity_fit(chain, result)
     return gravity, tuple(result), findings + faults
@@ -116,7 +118,7 @@ def agreement(block: PoseMeasurements, gravity: GravityFit) -> Agreement:
         block: measurements with torques.
         gravity: the gravity of other files.
     """
-    return _LoadedGravity.at(block, gravity).agreement(np.asarray(block.measured_torque))
+    return _LoadedGravity.at(block, gravity).agreement(block)
 
 
 def contradiction(block: PoseMeasurements, gravity: GravityFit, reference: Sequence[PoseMeasurements]) -> Fault:
@@ -133,41 +135,31 @@ def contradiction(block: PoseMeasurements, gravity: GravityFit, reference: Seque
         return fault
     names = listing(sorted({Path(peer.file).name for peer in reference if peer.measured_torque is not None}))
     expected = gravity.sign * gravity_torques(gravity.chain, block.q)
-    factor, _ = gravity_factor(expected, torque)
-    if abs(factor) > MILLIMETRES:
-        return f"they are {abs(factor):.0f} times the gravity of {names}", IN_MILLIMETRES
+    factor, sigma = gravity_factor(expected, torque)
+    fault = millimetre_fault(factor, sigma, names)
+    if fault is not None:
+        return fault
     loaded = _LoadedGravity.at(block, gravity)
     smallest = np.inf
     cure = "were they read at rest, by the same sensors, in the same unit and joint order as those of the fit?"
     fault = f"with the gravity of {names}, no load explains them", cure
-    for changed, explanation in _changes(torque, names):
-        changed_agreement = loaded.agreement(changed)
-        if changed_agreement.agrees and changed_agreement.distance < smallest:
-            smallest, fault = changed_agreement.distance, explanation
+    for change in _changes(torque.shape[1], names):
+        changed = loaded.agreement(replace(block, measured_torque=change.of(torque)))
+        if changed.agrees and changed.distance < smallest:
+            smallest, fault = changed.distance, change.fault
     return fault
 
 
-def _changes(torque: np.ndarray, names: str) -> Iterator[tuple[np.ndarray, Fault]]:
-    """Yield torques (m, n) with another sign or with columns exchanged, and what each change would mean.
+def _changes(n: int, names: str) -> Iterator[ColumnChange]:
+    """Yield changes of torques: another sign of all, or of one column, or two columns exchanged.
 
     Args:
-        torque: the recorded torques [N m].
-        names: names of the files that they are compared with.
+        n: number of joints.
+        names: names of the files that the torques are compared with.
     """
-    yield -torque, (f"their sign is the other one than in {names}", "reverse the sign of all of them")
-    joints = range(torque.shape[1])
-    for joint in joints:
-        changed = torque.copy()
-        changed[:, joint] *= -1.0
-        name = f"tau{joint + 1}"
-        reason = f"with {name} reversed gravity explains them, as recorded it does not"
-        yield changed, (reason, f"reverse the sign of {name}")
-    for first, second in combinations(joints, 2):
-        changed = torque.copy()
-        changed[:, [first, second]] = torque[:, [second, first]]
-        pair = f"tau{first + 1} and tau{second + 1}"
-        reason = f"with {pair} exchanged gravity explains them, as recorded it does not"
-        yield changed, (reason, f"exchange the names of {pair} in the header")
+    turned = f"their sign is the other one than in {names}", "reverse the sign of all of them"
+    yield ColumnChange(np.arange(n), -np.ones(n), turned)
+    yield from column_changes(np.ones(n, dtype=bool))
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,15 +191,17 @@ class _LoadedGravity:
         torque = gravity_torques(gravity.chain, block.q)
         return cls(gravity, by_stated_load(block), torque, np.concatenate([of_gravity, of_load], axis=2))
 
-    def agreement(self, torque: np.ndarray) -> Agreement:
-        """Return how far torques (m, n) of these rows agree with the gravity, with any load."""
-        balancing = self.gravity.sign * torque - self.gravity.offset
+    def agreement(self, block: PoseMeasurements) -> Agreement:
+        """Return how far the torques of a block with these rows agree with the gravity, with any load."""
+        balancing = self.gravity.balancing(block)
         at_rest, distance = [], []
         for rows in self.groups:
             ratio = self._residual_ratio(balancing[rows], rows)
-            at_rest += np.all(~(ratio >= 1.0), axis=1).tolist()
-            distance += np.minimum(ratio[np.isfinite(ratio)], 1.0).tolist()
-        return Agreement(float(np.mean(at_rest)), float(np.mean(np.square(distance or [0.0]))))
+            measured = np.isfinite(ratio)
+            resting = np.all(~(ratio >= 1.0), axis=1)
+            at_rest += resting[measured.any(axis=1)].tolist()
+            distance += np.minimum(ratio[measured], 1.0).tolist()
+        return Agreement(float(np.mean(at_rest or [0.0])), float(np.mean(np.square(distance or [0.0]))))
 
     def _residual_ratio(self, balancing: np.ndarray, rows: np.ndarray) -> np.ndarray:
         """Return the residuals (r, n) over the largest ones of an arm at rest; NaN where no torque was read.
@@ -229,6 +223,37 @@ class _LoadedGravity:
         return np.abs(residual) / (MAX_RESIDUAL * sigma)
 
 
+def _drop_files_without_gravity(chain: Chain, blocks: list[PoseMeasurements]) -> list[Finding]:
+    """Take the torques from blocks, in place, that neither show a gravity nor agree with that of a file that does.
+
+    Torques of a single pose show none, but agree.
+
+    Args:
+        chain: the arm.
+        blocks: the blocks of measurements.
+    """
+    gravities: list[GravityFit] = []
+    reference: list[PoseMeasurements] = []
+    doubtful = []
+    for number, block in enumerate(blocks):
+        gravity, faults = gravity_fit(chain, [block])
+        if gravity is not None:
+            gravities.append(gravity)
+            reference.append(block)
+        elif faults:
+            doubtful.append(number)
+    findings: list[Finding] = []
+    if not gravities:
+        return findings
+    for number in doubtful:
+        block = blocks[number]
+        if not any(agreement(block, gravity).agrees for gravity in gravities):
+            fault = contradiction(block, gravities[0], reference[:1])
+            blocks[number], remark = _without_torques(block, fault)
+            findings.append(remark)
+    return findings
+
+
 def _drop_odd_files(chain: Chain, blocks: list[PoseMeasurements]) -> list[Finding]:
     """Take the torques from blocks, in place, until those of all agree with the others'; return the findings.
 
@@ -239,16 +264,20 @@ def _drop_odd_files(chain: Chain, blocks: list[PoseMeasurements]) -> list[Findin
     findings = []
     numbers = [number for number, block in enumerate(blocks) if block.measured_torque is not None]
     while _disagreement(chain, [blocks[number] for number in numbers]) > 0.0:
-        distances = []
+        # a file that disagrees does so with a gravity of the others: at least this remainder has one
+        ranks = []
+        gravities: dict[int, GravityFit] = {}
         for number in numbers:
             reference = [blocks[peer] for peer in numbers if peer != number]
-            distances.append((_disagreement(chain, reference), len(blocks[number]), -number))
-        odd = -min(distances)[-1]
+            gravity, _ = gravity_fit(chain, reference)
+            if gravity is not None:
+                gravities[number] = gravity
+                rows = rows_with_torques(np.asarray(blocks[number].measured_torque))
+                ranks.append((_disagreement(chain, reference), rows, -number))
+        odd = -min(ranks)[-1]
         numbers.remove(odd)
         reference = [blocks[number] for number in numbers]
-        gravity, _ = gravity_fit(chain, reference)
-        assert gravity is not None
-        fault = contradiction(blocks[odd], gravity, reference)
+        fault = contradiction(blocks[odd], gravities[odd], reference)
         blocks[odd], remark = _without_torques(blocks[odd], fault)
         findings.append(remark)
     return findings

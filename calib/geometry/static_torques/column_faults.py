@@ -3,8 +3,10 @@
 All joints feel the same masses. A reversed column therefore contradicts the others, whatever the masses are.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +19,24 @@ RIDGE = 1e-9
 MIN_SPREAD_SHARE = 0.02
 # effect of gravity on a joint, relative to its torque's spread, below which its axis is vertical
 NO_GRAVITY = 1e-9
+
+
+class ColumnChange(NamedTuple):
+    """Another order and other signs of torque columns.
+
+    Attributes:
+        order: (n,) column that is the torque of each joint.
+        signs: (n,) 1.0, or -1.0 for a reversed column.
+        fault: what is wrong if gravity explains the changed torques, and what to do.
+    """
+
+    order: np.ndarray
+    signs: np.ndarray
+    fault: tuple[str, str]
+
+    def of(self, torque: np.ndarray) -> np.ndarray:
+        """Return the changed torques of recorded ones (m, n)."""
+        return self.signs * torque[:, self.order]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,22 +98,30 @@ def column_fault(regressor: np.ndarray, torque: np.ndarray, finite: np.ndarray) 
     if recorded < (1.0 - EXPLAINED) ** 2:
         return None
     smallest, fault = BETTER * recorded, None
-    for joint in np.flatnonzero(feels_gravity):
-        reversed_signs = signs.copy()
-        reversed_signs[joint] = -1.0
-        share = sums.unexplained(order, reversed_signs)
+    for change in column_changes(feels_gravity):
+        share = sums.unexplained(change.order, change.signs)
         if share < smallest:
-            smallest = share
-            name = f"tau{joint + 1}"
-            reason = f"with {name} reversed gravity explains them, as recorded it does not"
-            fault = reason, f"reverse the sign of {name}"
-    for first, second in combinations(np.flatnonzero(feels_gravity), 2):
+            smallest, fault = share, change.fault
+    return fault
+
+
+def column_changes(changeable: np.ndarray) -> Iterator[ColumnChange]:
+    """Yield the changes of columns of which one is reversed, or two are exchanged.
+
+    Args:
+        changeable: (n,) whether a column is one of these.
+    """
+    order, signs = np.arange(len(changeable)), np.ones(len(changeable))
+    columns = np.flatnonzero(changeable)
+    for column in columns:
+        changed_signs = signs.copy()
+        changed_signs[column] = -1.0
+        name = f"tau{column + 1}"
+        reason = f"with {name} reversed gravity explains them, as recorded it does not"
+        yield ColumnChange(order, changed_signs, (reason, f"reverse the sign of {name}"))
+    for first, second in combinations(columns, 2):
         exchanged = order.copy()
         exchanged[[first, second]] = second, first
-        share = sums.unexplained(exchanged, signs)
-        if share < smallest:
-            smallest = share
-            names = f"tau{first + 1} and tau{second + 1}"
-            reason = f"with {names} exchanged gravity explains them, as recorded it does not"
-            fault = reason, f"exchange the names of {names} in the header"
-    return fault
+        names = f"tau{first + 1} and tau{second + 1}"
+        reason = f"with {names} exchanged gravity explains them, as recorded it does not"
+        yield ColumnChange(exchanged, signs, (reason, f"exchange the names of {names} in the header"))

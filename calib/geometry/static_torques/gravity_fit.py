@@ -48,7 +48,7 @@ MAX_PAYLOAD_SHARE = 3.0
 MILLIMETRES = 200.0
 # what is said of torques that are zero, and what to do
 ZERO = "they are zero in every row", "is the sensors' signal in other columns?"
-# sigmas by which a factor of torques has to exceed what an arm may have
+# sigmas by which a factor of torques has to exceed what an arm may have (our choice)
 FACTOR_SIGMAS = 4.0
 # [N² m²] sum of squares below which gravity does not vary
 TINY = 1e-12
@@ -227,11 +227,10 @@ def gravity_fit(chain: Chain, blocks: Sequence[PoseMeasurements]) -> tuple[Gravi
         return None, []
     torques = [np.asarray(block.measured_torque) for block in measured]
     torque = np.concatenate(torques)
-    finite = np.isfinite(torque)
     fit = None
     fault = nothing_read(torque)
     if fault is None:
-        if finite.any(axis=1).sum() < chain.n:
+        if rows_with_torques(torque) < chain.n:
             return None, []
         described = reference_masses(chain)
         regressor = np.concatenate([gravity_regressor(chain, block.q) for block in measured])
@@ -256,7 +255,7 @@ def fault_of_file(chain: Chain, block: PoseMeasurements) -> Fault | None:
     """
     torque = np.asarray(block.measured_torque)
     fault = nothing_read(torque)
-    if fault is not None or len(block) < chain.n:
+    if fault is not None or rows_with_torques(torque) < chain.n:
         return fault
     described = reference_masses(chain)
     regressor = gravity_regressor(chain, block.q)
@@ -283,6 +282,11 @@ def _factor_and_fault(
     return factor, fault
 
 
+def rows_with_torques(torque: np.ndarray) -> int:
+    """Return in how many rows of torques (m, n) any was read."""
+    return int(np.isfinite(torque).any(axis=1).sum())
+
+
 def nothing_read(torque: np.ndarray) -> Fault | None:
     """Return that torques (m, n) are zero or empty, and what to do; None where a sensor read something."""
     finite = np.isfinite(torque)
@@ -301,14 +305,33 @@ def _too_large(chain: Chain, described: np.ndarray, factor: float, sigma: float)
         described: (n, 10) described standard parameters, as of `reference_masses`.
         factor, sigma: torques over the gravity of these, and its standard deviation.
     """
-    least = abs(factor) - FACTOR_SIGMAS * sigma
-    if chain.inertias is not None and least > MILLIMETRES:
-        return f"they are {abs(factor):.0f} times the gravity of the described masses", IN_MILLIMETRES
-    mass = abs(factor) * float(described[:, 9].sum())
-    if mass * least / abs(factor or 1.0) > MAX_MASS * chain.stretched_length() ** 2:
+    if chain.inertias is not None:
+        fault = millimetre_fault(factor, sigma, "the described masses")
+        if fault is not None:
+            return fault
+    described_mass = float(described[:, 9].sum())
+    if _least_factor(factor, sigma) * described_mass > MAX_MASS * chain.stretched_length() ** 2:
+        mass = abs(factor) * described_mass
         reason = f"they are the gravity of an arm of {mass:.0f} kg, which is too heavy for its length"
         return reason, IN_MILLIMETRES
     return None
+
+
+def millimetre_fault(factor: float, sigma: float, reference: str) -> Fault | None:
+    """Return that torques are in N mm, and what to do; None where they may be in N m.
+
+    Args:
+        factor, sigma: torques over the gravity of a reference, and its standard deviation.
+        reference: what this gravity is of.
+    """
+    if _least_factor(factor, sigma) <= MILLIMETRES:
+        return None
+    return f"they are {abs(factor):.0f} times the gravity of {reference}", IN_MILLIMETRES
+
+
+def _least_factor(factor: float, sigma: float) -> float:
+    """Return the smallest size that a factor of torques may have by its standard deviation."""
+    return abs(factor) - FACTOR_SIGMAS * sigma
 
 
 def _unlike_gravity(fit: GravityFit, measured: Sequence[PoseMeasurements]) -> Fault | None:

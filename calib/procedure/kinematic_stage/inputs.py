@@ -194,6 +194,7 @@ def gather(
     notes = remarks(chain)
     unseen: dict[str, Unseen] = {}
     fitted_blocks = []
+    held_out_names = []
     noticed: list[Finding] = []
     for block in _with_station_and_tool_names(read_blocks, options, settings.stations, settings.tools):
         block, copy_notes = without_copies(block)
@@ -202,11 +203,17 @@ def gather(
         noticed += unseen_readings
         fitted, held_out = hold_out(block, settings.holdout, settings.seed)
         fitted_blocks.append(fitted)
+        name = _free_name(unseen, block.file)
+        held_out_names.append(name)
         if held_out is not None:
-            unseen[_free_name(unseen, block.file)] = Unseen(held_out, held_out=True)
+            unseen[name] = Unseen(held_out, held_out=True)
 
     gravity, fit_blocks, torque_findings = agreeing_torques(weighed, fitted_blocks)
     noticed += torque_findings
+    for name, block in zip(held_out_names, fit_blocks):
+        if name in unseen and block.measured_torque is None:
+            silent = replace(unseen[name].block, measured_torque=None)
+            unseen[name] = replace(unseen[name], block=silent)
     if gravity is not None:
         for block in fit_blocks:
             noticed += load_findings(block, gravity)

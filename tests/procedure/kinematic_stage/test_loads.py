@@ -12,6 +12,7 @@ from calib.errors import UsageError
 from calib.geometry.static_torques.load_check import suspected_load
 from calib.geometry.static_torques.sources import MODELLED, gravity_of
 from calib.procedure.kinematic_stage.folder import FitFolder
+from calib.procedure.kinematic_stage.inputs import gather
 from calib.robot.kinematics import forward
 
 CENTRE = (0.02, -0.03, 0.12)
@@ -145,6 +146,19 @@ def test_poses_under_several_loads_are_fitted_together(several, fitted, unseen):
     codes = {finding.code: finding.values for finding in result.assessment.noticed}
     assert codes["load-changed"]["fitted"] == pytest.approx(2.5, abs=0.1)
     assert not {"payload-differs", "payload-found"} & set(codes)
+
+
+def test_held_out_rows_of_a_file_whose_torques_contradict_have_none_either(several, tmp_path):
+    table = np.loadtxt(several / "a.csv", delimiter=",", skiprows=1)
+    table[:, 10:] *= -1.0
+    odd = GivingArm(seed=3).write(tmp_path / "odd.csv", table[:30])
+    inputs = gather(several / "arm.urdf", [several / "b.csv", odd], settings=calib.FitSettings(holdout=0.3))
+    (unused,) = [finding for finding in inputs.noticed if finding.code == "torques-unused"]
+    assert unused.values["files"] == (str(odd),)
+    assert inputs.unseen["b.csv"].block.measured_torque is not None
+    silent = inputs.unseen["odd.csv"].block
+    assert silent.measured_torque is None and silent.load is None
+    assert np.allclose(silent.torque, gravity_of(inputs.gravity.chain, silent.q))
 
 
 def test_the_certificate_states_the_loads(several, tmp_path):
