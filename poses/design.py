@@ -41,6 +41,11 @@ class Pool:
         """`columns` in single precision."""
         return self.columns.astype(np.float32)
 
+    @cached_property
+    def sizes(self) -> np.ndarray:
+        """Norms (N,) of the Jacobians of all candidates."""
+        return np.linalg.norm(self.z, axis=(1, 2))
+
     def squares(self, factor: np.ndarray) -> np.ndarray:
         """Return the sums of squares (N,) of z Fᵀ of all candidates, for a matrix F (k, p)."""
         product = factor @ self.columns

@@ -7,7 +7,7 @@ import pytest
 from planted import cell, perturb
 
 from calib.data.poses.measurements import Positions, take
-from calib.geometry.checks.wrong_rows import MIN_SHIFTED, SHIFTS, _best_first, _shifted, least_error
+from calib.geometry.checks.wrong_rows import MIN_SHIFTED, SHIFTS, _best_first, _CutErrors, _shifted, least_error
 from calib.geometry.first_guess import install
 from calib.geometry.installation import see
 from calib.robot.calibrated import evaluate
@@ -43,3 +43,11 @@ def test_best_first_row_as_by_a_fit_for_each(variant):
         first = np.unique(block.rows)[: -MIN_SHIFTED - abs(shift)]
         errors = [least_error(nominal, [_shifted(block, int(row), shift)])[0] for row in first]
         assert _best_first(nominal, block, shift) == first[np.argmin(errors)]
+
+
+def test_no_rows_have_no_error():
+    """Without a row there is no error to divide by."""
+    arm, block = measured(40)
+    nominal = install(arm, [block])
+    np.testing.assert_array_equal(least_error(nominal, [take(block, np.arange(0))]), [0.0])
+    assert _CutErrors.of(nominal, block, -1).at(np.array([0])) >= 0.0

@@ -35,8 +35,12 @@ MAX_CUTS = 120
 MIN_MIXED = 24
 # largest number of iterations of the assignment of rows to targets; a few are needed
 MAX_ROUNDS = 50
-# size of a combination of columns, relative to the largest, below which it is rounding
-ROUNDING = 1e-10
+# size of a combination of columns, relative to the largest, below which it is rounding: some 1e6 roundings of double
+# precision, for products of many rows (our choice)
+COLUMN_ROUNDING = 1e-10
+# the same of sums of products of orthonormal columns, as their eigenvalues: a combination of 1e-5 of the largest size,
+# whose square is that far above rounding (our choice)
+PRODUCT_ROUNDING = 1e-10
 Blocks = Sequence[PoseMeasurements]
 
 
@@ -58,7 +62,7 @@ def least_error(nominal: Installation, blocks: Blocks) -> np.ndarray:
             residual = _unexplained(columns[rows], block.position[rows])
             squares += float((residual**2).sum())
         count += len(block)
-    return np.array([squares / count])
+    return np.array([squares / max(count, 1)])
 
 
 def _columns(nominal: Installation, block: Positions) -> np.ndarray:
@@ -195,6 +199,8 @@ class _CutErrors:
     def at(self, first: np.ndarray) -> np.ndarray:
         """Return the mean squared error [m²] with the joint values shifted from each row number `first` (k,) on.
 
+        Without any row, the error is 0.
+
         Args:
             first: rising row numbers.
         """
@@ -208,7 +214,7 @@ class _CutErrors:
             squares += _unexplained_squares(sums)
             paired_before = np.concatenate([[0], np.cumsum(target.is_paired)])
             count += cut + paired_before[-1] - paired_before[start]
-        return squares / count
+        return squares / np.maximum(count, 1)
 
 
 class _TargetRows(NamedTuple):
@@ -226,7 +232,7 @@ class _TargetRows(NamedTuple):
 def _independent(columns: np.ndarray) -> np.ndarray:
     """Return orthonormal columns (m, r) that span the given columns (m, w)."""
     basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    return basis[:, sizes > ROUNDING * sizes[0]]
+    return basis[:, sizes > COLUMN_ROUNDING * sizes[0]]
 
 
 def _sums_before(columns: np.ndarray, ends: np.ndarray) -> np.ndarray:
@@ -246,7 +252,7 @@ def _unexplained_squares(sums: np.ndarray) -> np.ndarray:
         sums: (k, w, w) sums of products of the columns.
     """
     cross = sums[:, :-3, -3:]
-    inverse = np.linalg.pinv(sums[:, :-3, :-3], ROUNDING, hermitian=True)
+    inverse = np.linalg.pinv(sums[:, :-3, :-3], PRODUCT_ROUNDING, hermitian=True)
     explained = np.einsum("kij,kij->k", cross, inverse @ cross)
     total = np.trace(sums[:, -3:, -3:], axis1=1, axis2=2)
     return np.maximum(total - explained, 0.0)

@@ -1,10 +1,16 @@
 """Errors of a fit's held-out poses with another geometry, by the residuals in the fit's folder.
 
 The residual of a row changes by the shift of its predicted position, r - (p_after - p_before), to first order. Base and
-tool placement are fitted anew to the fitted rows before and after, as the fit would place them.
+tool placement are fitted anew to the fitted rows before and after. This approximates the fit: by plain least squares,
+its rows not weighted, and with the same correction of the base for all stations.
+
+The squared errors of each pose before and after are compared by their differences: their mean, beside its standard
+error. Gross rows are moved to the edge of the others (winsorised). The scatter of the placement itself, common to all
+poses, is not in the standard error.
 """
 
 import csv
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -13,11 +19,23 @@ import numpy as np
 
 from calib.geometry import installation
 from calib.geometry.installation import Installation
+from calib.procedure.kinematic_stage.fit_tables import COMPONENTS, TO_CALIBRATED
 from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.records import shielded
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.transforms import invert
+
+MIN_POSES = 8
+"""Poses from which on errors are compared: 2 standard errors of so few are passed in 4 % by chance (Student's t)."""
+MAX_STANDARD_ERRORS = 2.0
+"""Standard errors by which squared errors may rise; more is no chance, with a probability of some 2 % (our choice)."""
+MAX_SCATTER = 3.0
+"""Robust standard deviations from the median at which differences are winsorised (our choice)."""
+NORMAL = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+METRES = 1e-3
+"""Unit of the tables' position residuals [m]."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +45,18 @@ class HeldOutErrors:
     Attributes:
         poses: number of poses.
         before, after: rms position error [m].
+        rise: mean rise of the squared errors in its standard errors, gross poses winsorised.
     """
 
     poses: int
     before: float
     after: float
+    rise: float
+
+    @property
+    def is_worse(self) -> bool:
+        """Whether the errors rise by more than chance explains, on enough poses."""
+        return self.poses >= MIN_POSES and self.rise > MAX_STANDARD_ERRORS
 
 
 class _Rows(NamedTuple):
@@ -63,11 +88,23 @@ def held_out_errors(source: Path, before: Chain, after: Chain) -> HeldOutErrors 
     unseen = _Rows(*(column[~copies] for column in unseen))
     if not len(unseen.q) or not len(fitted.q):
         return None
-    unmoved = _rms_after_placement(fitted, unseen, before, cell)
-    moved = _rms_after_placement(
-        _shifted(fitted, before, after, cell), _shifted(unseen, before, after, cell), before, cell
-    )
-    return HeldOutErrors(len(unseen.q), unmoved, moved)
+    unmoved = _squares_after_placement(fitted, unseen, before, cell)
+    moved_fitted = _shifted(fitted, before, after, cell)
+    moved_unseen = _shifted(unseen, before, after, cell)
+    moved = _squares_after_placement(moved_fitted, moved_unseen, before, cell)
+    rise = standard_errors(moved - unmoved)
+    return HeldOutErrors(len(unseen.q), float(np.sqrt(unmoved.mean())), float(np.sqrt(moved.mean())), rise)
+
+
+def standard_errors(differences: np.ndarray) -> float:
+    """Return the mean of differences (m,) over its standard error, both winsorised; 0 where they do not scatter."""
+    median = np.median(differences)
+    scatter = NORMAL * np.median(np.abs(differences - median))
+    limit = MAX_SCATTER * scatter
+    bounded = np.clip(differences, median - limit, median + limit)
+    if len(bounded) < 2 or not np.ptp(bounded):
+        return 0.0
+    return float(bounded.mean() / (bounded.std(ddof=1) / np.sqrt(len(bounded))))
 
 
 def _shifted(rows: _Rows, before: Chain, after: Chain, cell: Installation) -> _Rows:
@@ -76,13 +113,13 @@ def _shifted(rows: _Rows, before: Chain, after: Chain, cell: Installation) -> _R
     return rows._replace(residual=rows.residual - shift)
 
 
-def _rms_after_placement(fitted: _Rows, unseen: _Rows, chain: Chain, cell: Installation) -> float:
-    """Return the rms error [m] of unseen rows with base and targets placed by the fitted rows."""
+def _squares_after_placement(fitted: _Rows, unseen: _Rows, chain: Chain, cell: Installation) -> np.ndarray:
+    """Return the squared errors (m,) [m²] of unseen rows with base and targets placed by the fitted rows."""
     slopes = _placement_slopes(chain, cell, fitted)
     parameters = slopes.shape[2]
     change, *_ = np.linalg.lstsq(slopes.reshape(-1, parameters), fitted.residual.ravel(), rcond=None)
     errors = unseen.residual - _placement_slopes(chain, cell, unseen) @ change
-    return float(np.sqrt(np.sum(errors**2) / len(errors)))
+    return np.sum(errors**2, axis=1)
 
 
 def _residual_rows(folder: FitFolder, cell: Installation, sets: tuple[str, ...]) -> _Rows:
@@ -96,11 +133,11 @@ def _residual_rows(folder: FitFolder, cell: Installation, sets: tuple[str, ...])
     q, residual, tool = [], [], []
     with folder.residuals.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
-            usable = row["set"] in sets and row["outlier"] != "1" and row["dz [mm]"] not in ("", "nan")
+            error = _vector(row, COMPONENTS["position"])
+            usable = row["set"] in sets and row["outlier"] != "1" and np.isfinite(error).all()
             if not usable or row["station"] not in cell.station_names or row["tool"] not in cell.tool_names:
                 continue
             rotation = invert(cell.stations[cell.station_names.index(row["station"])])[:3, :3]
-            error = [1e-3 * float(row[f"d{axis} [mm]"]) for axis in "xyz"]
             q.append(_joint_values(cell.chain, row))
             residual.append(rotation @ error)
             tool.append(cell.tool_names.index(row["tool"]))
@@ -108,16 +145,25 @@ def _residual_rows(folder: FitFolder, cell: Installation, sets: tuple[str, ...])
 
 
 def _session_rows(folder: ValidationFolder, cell: Installation) -> _Rows:
-    """Return the rows of a session's validation; none where several tools were measured."""
+    """Return the rows of a session's validation; none where several tools were measured.
+
+    The table has predicted minus measured positions, in the base frame.
+    """
     q, residual = [], []
     if folder.errors.is_file() and len(cell.tools) == 1:
         with folder.errors.open(encoding="utf-8", newline="") as file:
             for row in csv.DictReader(file):
-                if row["to_calibrated_z [mm]"] in ("", "nan"):
+                error = _vector(row, TO_CALIBRATED)
+                if not np.isfinite(error).all():
                     continue
                 q.append(_joint_values(cell.chain, row))
-                residual.append([-1e-3 * float(row[f"to_calibrated_{axis} [mm]"]) for axis in "xyz"])
+                residual.append(-error)
     return _Rows(np.reshape(q, (-1, cell.chain.n)), np.reshape(residual, (-1, 3)), np.zeros(len(q), dtype=int))
+
+
+def _vector(row: dict[str, str], columns: Sequence[str]) -> np.ndarray:
+    """Return the vector (3,) [m] in three columns of a row [mm]; NaN for empty cells."""
+    return METRES * np.array([float(row[column] or "nan") for column in columns])
 
 
 def _joint_values(chain: Chain, row: dict[str, str]) -> list[float]:

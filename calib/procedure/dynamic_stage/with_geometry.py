@@ -42,7 +42,7 @@ from calib.units import TORQUE
 if TYPE_CHECKING:
     from calib.identification.uncertainty.joint_estimate import JointEstimate
 
-# ratio of squared errors on held-out torques, and on held-out poses, up to which the joint estimate is not worse
+# ratio of squared errors on held-out torques up to which the joint estimate is not worse (our choice)
 MAX_HELD_OUT = 1.001
 # probability below which torques and geometry contradict each other, by the largest of all distances (our choice)
 CONTRADICTION = 1e-4
@@ -160,8 +160,9 @@ def _worse_on_held_out(result: GeometryFromTorques) -> Finding | None:
     if result.held_out > MAX_HELD_OUT:
         return finding("geometry-not-better", ratio=result.held_out)
     poses = result.poses
-    if poses is not None and poses.after**2 > MAX_HELD_OUT * poses.before**2:
-        return finding("geometry-worse-on-poses", poses=poses.poses, before=poses.before, after=poses.after)
+    if poses is not None and poses.is_worse:
+        rms = {"before": poses.before, "after": poses.after}
+        return finding("geometry-worse-on-poses", poses=poses.poses, rise=poses.rise, **rms)
     return None
 
 

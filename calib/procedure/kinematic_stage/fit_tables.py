@@ -26,17 +26,8 @@ from calib.robot.chain import Chain
 from calib.transforms import invert, rotation_vector
 from calib.units import ERRORS
 
-PLACES = (
-    "x [m]",
-    "y [m]",
-    "z [m]",
-    "to_nominal_x [mm]",
-    "to_nominal_y [mm]",
-    "to_nominal_z [mm]",
-    "to_calibrated_x [mm]",
-    "to_calibrated_y [mm]",
-    "to_calibrated_z [mm]",
-)
+TO_CALIBRATED = ("to_calibrated_x [mm]", "to_calibrated_y [mm]", "to_calibrated_z [mm]")
+PLACES = ("x [m]", "y [m]", "z [m]", "to_nominal_x [mm]", "to_nominal_y [mm]", "to_nominal_z [mm]", *TO_CALIBRATED)
 HEADER = ("name", "unit", "nominal", "value", "sigma", "rsd [%]")
 # nature of a residual -> its columns of residuals.csv
 COMPONENTS = {

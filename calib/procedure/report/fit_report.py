@@ -318,9 +318,9 @@ def _errors_by_row(name: str, comparison: Comparison, unseen: bool, selection: s
     q = np.concatenate([block.q for block in comparison.blocks])
     numbers = np.concatenate([block.rows for block in comparison.blocks])
     points = _points(comparison)
-    names = [Path(block.file).name for block in comparison.blocks]
-    files = list(dict.fromkeys(names))
-    file_numbers = np.repeat([files.index(name) for name in names], [len(block) for block in comparison.blocks])
+    paths = [block.file for block in comparison.blocks]
+    files = list(dict.fromkeys(paths))
+    file_numbers = np.repeat([files.index(path) for path in paths], [len(block) for block in comparison.blocks])
     expected: tuple[float, ...] = ()
     if comparison.intervals is not None:
         expected = _plain(comparison.intervals.radius[selection])
@@ -330,9 +330,22 @@ def _errors_by_row(name: str, comparison: Comparison, unseen: bool, selection: s
         points=_plain(points[selection]),
         expected=expected,
         rows=tuple(map(int, numbers[selection])),
-        files=tuple(files),
+        files=distinct_names(files),
         file=tuple(map(int, file_numbers[selection])),
     )
+
+
+def distinct_names(paths: Sequence[str]) -> tuple[str, ...]:
+    """Return a name for each of different files: that of the file, with as many folders as tell it from the others."""
+    parts = [Path(path).parts for path in paths]
+    names = []
+    for number, path in enumerate(parts):
+        others = parts[:number] + parts[number + 1 :]
+        length = 1
+        while length < len(path) and any(other[-length:] == path[-length:] for other in others):
+            length += 1
+        names.append("/".join(path[-length:]))
+    return tuple(names)
 
 
 def _points(comparison: Comparison) -> np.ndarray:

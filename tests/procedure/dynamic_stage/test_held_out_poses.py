@@ -1,5 +1,7 @@
 """Held-out poses of a fit judge another geometry by the residuals in its folder."""
 
+import csv
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,9 +12,12 @@ import pytest
 from calib.files import write_table
 from calib.geometry import installation
 from calib.geometry.installation import Installation
-from calib.procedure.dynamic_stage.held_out_poses import held_out_errors
+from calib.procedure.dynamic_stage.held_out_poses import held_out_errors, standard_errors
+from calib.procedure.kinematic_stage.fit_tables import TO_CALIBRATED
+from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, ValidationFolder
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain
+from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.transforms import pose
 
@@ -68,6 +73,7 @@ def test_another_arm_is_worse(fit: Path):
     errors = held_out_errors(fit, chain, chain.with_values(values))
     assert errors is not None
     assert errors.after == pytest.approx(2.0 * errors.before, rel=0.05)
+    assert errors.is_worse
 
 
 def test_a_change_that_only_moves_the_base_changes_nothing(fit: Path):
@@ -75,6 +81,37 @@ def test_a_change_that_only_moves_the_base_changes_nothing(fit: Path):
     values = dict(zip(chain.names, chain.values)) | {"turn": 1e-3}
     errors = held_out_errors(fit, chain, chain.with_values(values))
     assert errors is not None and errors.after == pytest.approx(errors.before, rel=1e-2)
+
+
+@pytest.mark.parametrize("after", [true_arm(), planted.arm()])
+def test_the_validation_of_a_session_judges_as_held_out_rows(fit: Path, tmp_path: Path, after: Chain):
+    """Errors in the base frame, predicted minus measured; a row without all of x, y, z does not count."""
+    folder = shutil.copytree(fit, tmp_path / IN_SESSION)
+    with (folder / "residuals.csv").open(newline="") as file:
+        header, *rows = list(csv.reader(file))
+    write_table(folder / "residuals.csv", header, [row for row in rows if row[0] == "fit"])
+    to_station = STATION[:3, :3]
+    session = []
+    for row in [row for row in rows if row[0] != "fit"]:
+        in_base = -to_station.T @ np.array(row[6:9], dtype=float)
+        session.append([*row[3:6], *in_base])
+    session.append([*rows[0][3:6], np.nan, 1.0, 1.0])
+    validated = tmp_path / VALIDATED
+    validated.mkdir()
+    write_table(ValidationFolder(validated).errors, (*header[3:6], *TO_CALIBRATED), session)
+    errors, direct = (held_out_errors(place, planted.arm(), after) for place in (folder, fit))
+    assert errors is not None and direct is not None
+    assert errors.poses == direct.poses
+    assert (errors.before, errors.after) == pytest.approx((direct.before, direct.after), rel=1e-4)
+
+
+def test_a_rise_counts_by_its_scatter():
+    noise = np.random.default_rng(0).normal(0.0, 1.0, (2000, 20))
+    noise[:, 0] += 50.0  # a gross pose
+    passed = np.mean([standard_errors(differences) > 2.0 for differences in noise])
+    assert passed < 0.12
+    assert standard_errors(noise[0] + 3.0) > 5.0
+    assert standard_errors(np.array([1.0])) == standard_errors(np.zeros(9)) == 0.0
 
 
 def test_a_robot_without_held_out_poses_is_not_judged(fit: Path, tmp_path: Path):

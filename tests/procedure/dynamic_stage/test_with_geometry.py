@@ -133,8 +133,10 @@ def test_methods_without_rows_are_refused(robot, tmp_path, capsys):
 @pytest.mark.parametrize(
     "poses, code, delivered",
     [
-        (HeldOutErrors(20, 1e-4, 1.1e-4), "geometry-worse-on-poses", False),
-        (HeldOutErrors(20, 1e-4, 0.9e-4), None, True),
+        (HeldOutErrors(20, 1e-4, 1.1e-4, 2.5), "geometry-worse-on-poses", False),
+        (HeldOutErrors(20, 1e-4, 1.1e-4, 1.5), None, True),
+        (HeldOutErrors(1, 1e-4, 1.1e-4, 2.5), None, True),
+        (HeldOutErrors(20, 1e-4, 0.9e-4, -1.0), None, True),
         (None, "geometry-without-poses", True),
     ],
 )

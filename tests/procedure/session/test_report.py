@@ -258,3 +258,8 @@ def test_unchecked_and_predicted_stay_told(finished: Session) -> None:
     notes = json.loads((finished.folder / "state.json").read_text())["steps"]["fit"]["notes"]
     assert any(note.startswith("estimated σ / predicted σ") for note in notes)
     assert (finished.folder / "2-poses/poses_run.csv").read_text().startswith("t [s],pose,")
+
+
+def test_files_of_the_same_name_are_told_apart_by_their_folders():
+    assert fit_report.distinct_names(["a/m.csv", "b/m.csv", "a/n.csv"]) == ("a/m.csv", "b/m.csv", "n.csv")
+    assert fit_report.distinct_names(["m.csv", "b/m.csv", ""]) == ("m.csv", "b/m.csv", "")
