@@ -129,6 +129,8 @@ class MotionOutlook:
             a quick search.
         before: `torque_sigma_share` of the identification that the motion complements; None: no such identification.
         torque_sigma_before: (n,) `torque_sigma` of that identification [N m or N]; None: no such identification.
+        reached: 10 and 90 % quantiles of σ reached over σ predicted for the parameters; None: not known, since no
+            identification states its errors in wider bands.
     """
 
     noise_share: float
@@ -137,6 +139,18 @@ class MotionOutlook:
     by_period: tuple[MotionPrediction, ...]
     before: float | None = None
     torque_sigma_before: Array | None = None
+    reached: tuple[float, float] | None = None
+
+    @property
+    def reliability(self) -> str:
+        """A clause on how far the parameters' σ of the next identification may be from those predicted."""
+        if self.reached is None:
+            return (
+                "how far σ reached may be from σ predicted is not known, since the identification, of an earlier "
+                "version, does not state its errors in wider bands: identify again"
+            )
+        low, high = self.reached
+        return f"in 80 % of cases σ reached of a parameter was {low:g} to {high:g} times σ predicted"
 
 
 def foretell(
@@ -193,6 +207,8 @@ def foretell(
     if inputs.errors_known:
         (torque_sigma, share_before), sigmas_before = known_sigmas(inputs, task)
         outlook = replace(outlook, before=share_before, torque_sigma_before=torque_sigma)
+        if inputs.prior is not None and inputs.prior.bands is not None:
+            outlook = replace(outlook, reached=REACHED)
     return outlook, _parameter_rows(inputs, root, shifts, sigmas_before)
 
 
@@ -534,17 +550,11 @@ def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> l
     rows.sort(key=lambda row: row.sigma / (row.sigma_before or np.inf))
     gains = [f"{row.name} from ± {row.sigma_before:.3g} to ± {row.sigma:.3g} {row.unit}" for row in rows[:NAMED_GAINS]]
     assumed = f"; torque errors assumed up to {outlook.own.error_growth:.2g} times those so far"
-    assumed += f"; {reached_range()}"
+    assumed += f"; {outlook.reliability}"
     return [
         f"{head}{100 * outlook.before:.2g} % so far, with this motion {designed}{by_period}{assumed}",
         "most improved: " + "; ".join(gains),
     ]
-
-
-def reached_range() -> str:
-    """Return a clause on how far the σ that an identification reaches may be from the predicted one."""
-    low, high = REACHED
-    return f"in 80 % of cases σ reached was {low:g} to {high:g} times σ predicted"
 
 
 def check_folder(folder: Path) -> None:

@@ -219,7 +219,7 @@ def _gains(designed: design.Designed, joints: list[_ShortParameter], parameters:
             before = 100.0 * row.sigma_before / abs(row.value)
             parts.append(f"σ of {row.name} from {before:.2g} to {row.rsd:.2g} %")
     changes = f"a further motion of {seconds:.0f} s, designed for this, is expected to change {listing(parts, 6)}"
-    return [f"{changes} ({prediction.reached_range()})"]
+    return [f"{changes} ({outlook.reliability})"]
 
 
 def promised(session: Session) -> tuple[str, ...]:
