@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recordings import DATA
+from scripts import require_same_package
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "examples/real_recordings.md").read_text().partition("## Away from the training motion")[2]
@@ -69,6 +70,7 @@ def test_plain_references_find_simple_arm(tmp_path) -> None:
 @pytest.mark.slow
 def test_document_states_fresh_results(data, tmp_path) -> None:
     """The document states what a fresh run gives."""
+    require_same_package()
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "CALIB_DATA": str(DATA)}
     command = [sys.executable, str(PARTS / "extrapolation.py"), "--out", str(tmp_path), "--only", *CHOSEN]
     said = subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from recordings import DATA
+from scripts import require_same_package
 
 ROOT = Path(__file__).parents[2]
 TABLE = (ROOT / "examples/real_recordings.md").read_text()
@@ -25,6 +26,7 @@ def rows(said: str) -> dict[tuple[str, str], tuple[float, float]]:
 
 
 def run(*parts: str) -> str:
+    require_same_package()
     environment = os.environ | {"CALIB_DATA": str(DATA)}
     command = [sys.executable, str(ROOT / "examples/interval_coverage.py"), *parts]
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout

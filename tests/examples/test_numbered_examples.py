@@ -6,13 +6,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from scripts import run_here
+from scripts import require_same_package, run_here
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NUMBERED = sorted(EXAMPLES.glob("0*.py"))
 
 
 def run(name: str, *arguments: object) -> str:
+    require_same_package()
     command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,8 @@
-"""Fingerprint of a recording: samples by which it is recognised under another name or in another format."""
+"""Fingerprint of a recording: samples by which it is recognised under another name, thinned or cut.
+
+The samples must have the same values in single precision. A copy with fewer digits, or resampled between its samples,
+is not recognised. Samples at rest do not count: an arm that waits at home gives equal ones in different logs.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +14,15 @@ import numpy as np
 SKETCH = 64
 """Samples by which a log is recognised: those with the smallest hashes (Broder 1997)."""
 FINE_SKETCH = 512
-"""Samples of a recording that a model was identified from: a piece of a hundredth has five of them (our choice)."""
-MIN_COMMON = 3
-"""Common samples from which on two logs share a part (our choice); samples of different logs differ."""
+"""Samples of a recording that a model was identified from: a piece of a fiftieth has ten of them (our choice)."""
+MIN_COMMON = 5
+"""Common samples from which on two logs share a part (our choice): coarse encoders may agree in some by chance."""
+MIN_SHARE = 0.01
+"""Smallest share of common samples: a hundredth counted twice changes less than a log left out (our choice)."""
+STEP = 0.1
+"""Time before and after a sample in which the arm has to move [s] (our choice)."""
+MIN_MOTION = 1e-3
+"""Change of some joint in this time from which on the arm moves [rad or m]: above steps of encoders (our choice)."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +57,25 @@ class Fingerprints:
     recordings: tuple[Fingerprint, ...] = ()
 
 
+def in_motion(t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return whether the arm moves before and after each sample (N,); samples at both ends of a log do not count.
+
+    Args:
+        t: rising times (N,) [s].
+        q: positions (N, n) [rad or m].
+    """
+    before = np.zeros(len(t))
+    after = np.zeros(len(t))
+    for joint in q.T:
+        earlier = np.interp(t - STEP, t, joint)
+        later = np.interp(t + STEP, t, joint)
+        before = np.fmax(before, np.abs(joint - earlier))
+        after = np.fmax(after, np.abs(later - joint))
+    return np.minimum(before, after) > MIN_MOTION
+
+
 def sample_hashes(series: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the sorted distinct hashes (N,) of a log's samples of positions and torques, before any filter.
+    """Return the sorted distinct hashes (N,) of samples of positions and torques, before any filter.
 
     The hash of a sample is a product-sum of its bits, mixed as in SplitMix64 (Steele et al. 2014).
 
@@ -65,14 +92,15 @@ def sample_hashes(series: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def sketch(hashes: np.ndarray) -> np.ndarray:
-    """Return the `SKETCH` smallest hashes (64,) of a log; of a shorter one, the last hash is repeated."""
+    """Return the `SKETCH` smallest hashes (64,) of a log; of a shorter one, the last hash, or 0, is repeated."""
     smallest = hashes[:SKETCH]
-    padding = np.repeat(smallest[-1:], SKETCH - len(smallest))
+    last = smallest[-1] if len(smallest) else 0
+    padding = np.full(SKETCH - len(smallest), last, dtype=np.uint64)
     return np.concatenate([smallest, padding])
 
 
 def common_share(hashes: np.ndarray, earlier: np.ndarray) -> float:
-    """Return the share of an earlier log's samples that a log contains; 0 where fewer than `MIN_COMMON` are equal.
+    """Return the share of an earlier log's samples that a log contains; 0 below `MIN_COMMON` samples or `MIN_SHARE`.
 
     Args:
         hashes: hashes (N,) of the log.
@@ -80,6 +108,6 @@ def common_share(hashes: np.ndarray, earlier: np.ndarray) -> float:
     """
     distinct = np.unique(earlier)
     count = int(np.isin(distinct, hashes).sum())
-    if count < MIN_COMMON:
+    if count < max(MIN_COMMON, MIN_SHARE * len(distinct)):
         return 0.0
     return count / len(distinct)

@@ -14,7 +14,7 @@ from calib.data.recordings.recording import Recording, earlier, in_pieces, parse
 from calib.data.recordings.recording_files import read_recording
 from calib.data.schema import Joints
 from calib.data.signals.filtering import SHARE
-from calib.data.signals.fingerprint import sample_hashes
+from calib.data.signals.fingerprint import in_motion, sample_hashes
 from calib.data.signals.motion import FilterOptions, Motion, make_motion, with_reference
 from calib.data.signals.resampling import Resampled, resample
 from calib.errors import MeasurementError, NoPosture, UsageError, refuse_data, refused_as, suggestion
@@ -340,7 +340,8 @@ def read_motion(
         recording = read_recording(given, joints, own.recording, companions)
     sampled = resample(recording, own.filter.clock, own.filter.gap)
 
-    hashes = sample_hashes([recording.q, recording.effort])
+    moving = in_motion(recording.t, recording.q)
+    hashes = sample_hashes([recording.q[moving], recording.effort[moving]])
 
     options = own.filter
     same_band = like is not None and own.filter.band is None

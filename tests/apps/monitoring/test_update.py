@@ -14,7 +14,7 @@ from calib.apps.monitoring.learning.dynamics_update import DRIFT, LOG_TABLE, Dyn
 from calib.apps.monitoring.learning.logs import dated
 from calib.apps.monitoring.learning.update import update_dynamics
 from calib.data.csv_table import read_table
-from calib.data.signals.fingerprint import common_share, sketch
+from calib.data.signals.fingerprint import common_share, in_motion, sample_hashes, sketch
 from calib.errors import MeasurementError, UsageError
 from calib.procedure.report.figures import figure_data
 from calib.result_kinds import kind_of
@@ -218,6 +218,44 @@ def test_the_log_of_the_identification_is_not_counted_twice(identified: Path, tm
         update.save(tmp_path / "today", plots=False), [str(table.rename(tmp_path / "2026-03-04.csv"))]
     )
     assert codes(again) == ["log-repeated"]
+
+
+def from_home(folder: Path, date: str, seed: int) -> str:
+    """Write a log that rests at home for 2 s, with encoders of two steps, and moves off within 2 s; return its path."""
+    t, q, v, a = planted.motion(seed, duration=14.0)
+    x = np.clip((t - 2.0) / 2.0, 0.0, 1.0)[:, None]
+    w, dw, ddw = x**3 * (10 - 15 * x + 6 * x**2), 15 * x**2 * (1 - x) ** 2, 15 * x * (1 - x) * (1 - 2 * x)
+    torque = planted.torques(w * q, dw * q + w * v, ddw * q + 2 * dw * v + w * a)
+    position = w * q + 1e-5 * np.random.default_rng(seed).integers(0, 2, q.shape) * (x == 0)
+    path = folder / f"log_{date}.npz"
+    np.savez(path, t=t, q=np.round(position, 5), tau=np.round(torque, 2))
+    return str(path)
+
+
+def test_two_logs_from_the_same_rest_are_two_logs(identified: Path, tmp_path: Path):
+    first, second = from_home(tmp_path, "2026-03-05", 13), from_home(tmp_path, "2026-03-06", 14)
+    series = [np.load(path) for path in (first, second)]
+    hashes = [sample_hashes([log["q"], log["tau"]]) for log in series]
+    assert len(np.intersect1d(*hashes)) >= 8  # at home
+    again = shutil.copy(first, tmp_path / "log_2026-03-07.npz")
+    update = update_dynamics(identified, [first, second, f"{again}@6:11"])
+    assert codes(update) == ["log-repeated"]
+    assert [record.learnt for record in update.logs] == [True, True, False]
+
+
+def test_few_common_samples_in_a_large_sketch_are_chance():
+    hashes = np.arange(512, dtype=np.uint64)
+    assert common_share(hashes[:5], hashes) == 0.0  # below 1 %
+    assert common_share(hashes[:6], hashes) == pytest.approx(6 / 512)
+    assert common_share(hashes[:4], sketch(hashes)) == 0.0
+
+
+def test_an_arm_that_never_moves_has_no_samples_to_be_recognised_by():
+    t = np.arange(500) / 100.0
+    assert not in_motion(t, np.full((500, 2), 0.3)).any()
+    assert in_motion(t, np.column_stack([t, 0.0 * t]))[20:-20].all()
+    empty = sample_hashes([np.empty((0, 2)), np.empty((0, 2))])
+    assert common_share(sketch(empty), sketch(empty)) == 0.0
 
 
 def test_a_log_older_than_the_identification_is_not_learnt_from(identified: Path, tmp_path: Path):

@@ -114,6 +114,11 @@ READ = [
 ]
 
 
+def test_every_form_is_read_with_some_separator():
+    assert set(DECIDED_BY_ARM) <= set(FORMS)
+    assert {name for name, _, _ in READ} == set(FORMS)
+
+
 @pytest.mark.parametrize(("name", "separator", "mark"), READ)
 def test_one_reading_is_taken_and_said(arm, tmp_path, name, separator, mark):
     chain, q, position, rotation = arm
