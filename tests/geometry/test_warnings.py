@@ -17,6 +17,7 @@ from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation, see
 from calib.geometry.observability import PLACES, unidentified
 from calib.procedure.findings import lines_of
+from calib.procedure.kinematic_stage import plausibility
 from calib.robot.calibrated import Deflection, Term
 from calib.simulation.cell import measure as measured_by
 from calib.simulation.virtual_cells import perturbed_cell
@@ -189,3 +190,15 @@ def test_real_poses_are_sound(data, folder, way):
     changed = replace(block, q=block.q @ coupling(arm.n, 2, 1, -way).T)
     found = diagnosis.wrong_columns(install(arm, [changed]), [changed], mirrored=True)
     assert (found and (found.code, found.joints)) == (("joint-coupled", (2, 1)) if way else None)
+
+
+def test_joint_without_effect_reaches_the_user():
+    """The explanation of a search is a finding of the fit, with the joint's name."""
+    cell = perturbed_cell(load("ur5"), seed=2)
+    q = random_joints(cell.nominal, 60, 0)
+    still = q.copy()
+    still[:, 0] = 0.3
+    nominal = install(cell.nominal, [replace(measured_by(cell, still, 1), q=q)])
+    explanation = diagnosis.wrong_columns(nominal, [replace(measured_by(cell, still, 1), q=q)])
+    (remark,) = plausibility._explanation(explanation, nominal)
+    assert remark.code == "joint-without-effect"
