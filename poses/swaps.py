@@ -1,7 +1,7 @@
 """Swaps of one member of a design for one candidate, compared for many members at once.
 
 Without a member with the Jacobian z (rows, p), the inverse C of a design's information becomes C + hᵀh with
-h = S^(-1/2) z C and S = I − z C zᵀ (Woodbury; `calib.poses.design`). The scores of all candidates without each of many
+h = S^(-1/2) z C and S = I − z C zᵀ (Woodbury; `poses.design`). The scores of all candidates without each of many
 members are then one product. It is taken in single precision, since it only tells which candidates may gain; their
 gains are computed in double precision.
 """

@@ -32,6 +32,7 @@ LIBRARY = Path(__file__).parent / "mechanism" / "library"
 
 def find(robot: object) -> ParallelMechanism | None:
     """Return the parallel robot of a TOML file, a folder with one, or a library name; None for any other robot."""
+    # what cannot be one is told before the slow import
     if not isinstance(robot, (str, Path)):
         return None
     path = Path(robot)

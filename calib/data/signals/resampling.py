@@ -342,7 +342,7 @@ class Resampled:
     segment: np.ndarray
     rate: float
     report: SamplingReport
-    filtered: dict[tuple[float, ...], np.ndarray] = field(default_factory=dict)
+    filtered: dict[tuple[float, ...], np.ndarray] = field(default_factory=dict, init=False)
 
 
 def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: float | None = None) -> Resampled:

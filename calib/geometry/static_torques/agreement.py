@@ -91,8 +91,7 @@ def unread_torques(block: PoseMeasurements) -> list[Finding]:
     """Return a finding on torques that are in a block's file, but not read."""
     if block.torque_fault is None:
         return []
-    _, remark = _without_torques(block, block.torque_fault)
-    return [remark]
+    return [_unused(block, block.torque_fault)]
 
 
 def without_contradicting_torques(
@@ -304,6 +303,10 @@ def _disagreement(chain: Chain, blocks: Sequence[PoseMeasurements]) -> float:
 
 def _without_torques(block: PoseMeasurements, fault: Fault) -> tuple[PoseMeasurements, Finding]:
     """Return a block without its measured torques, and the finding on their fault."""
+    return replace(block, measured_torque=None), _unused(block, fault)
+
+
+def _unused(block: PoseMeasurements, fault: Fault) -> Finding:
+    """Return the finding on torques in a block's file that are not used."""
     reason, cure = fault
-    remark = finding("torques-unused", files=[block.file], reason=reason, cure=cure)
-    return replace(block, measured_torque=None), remark
+    return finding("torques-unused", files=[block.file], reason=reason, cure=cure)
