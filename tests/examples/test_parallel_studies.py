@@ -13,6 +13,8 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 # by table, by which a trial may leave the README's range: on a processor whose rounding ends the
 # searches at other motions it was 0.03, 0.44, 0.14 and 0.41 away from the README's median
 BOUNDS = {"| value": 0.03, "| stated": 0.45, "| relative": 0.15, "| |": 0.45}
+# an error that noise alone makes: a trial where it is small contradicts nothing
+BY_NOISE_ALONE = "| of the nine, all base parameters fitted [σ]"
 
 
 @pytest.mark.slow
@@ -49,6 +51,8 @@ def _check_readme(study: ModuleType, metrics: dict) -> None:
             if " to " in one:
                 found = float(two.split()[0])
                 least, most = (float(word.strip(" ()")) for word in one.split("(")[1].split(" to "))
+                if old.startswith(BY_NOISE_ALONE):
+                    least = 0.0
                 assert least - bound * abs(least) <= found <= most + bound * abs(most), (old, new)
             else:
                 assert one == two
