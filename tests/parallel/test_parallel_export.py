@@ -1,8 +1,6 @@
 """Exported parallel robots: other programs close the loops of the files and find our accelerations."""
 
 import json
-import os
-import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -77,42 +75,35 @@ def test_pinocchio_accelerates_urdf_alike(name):
         )
 
 
-PLAYED = """
-import json, sys, mujoco, numpy as np
-for step, text, names, tau in json.load(sys.stdin):
+def played(mujoco, robot: OpenedRobot, step: float) -> tuple[float, float, float]:
+    """Return how far MuJoCo's loops are open before and after 0.3 s of our torques, and the last position's error.
+
+    `step` is that of integration, s; the error is the largest of the joints, rad or m.
+    """
+    motion, tau = moved(robot, step * np.arange(round(0.3 / step) + 1))
+    text = robot.mjcf().replace('"0.002 1"', f'"{2 * step} 1"').replace('"0.001"', f'"{step}"')
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     mujoco.mj_forward(model, data)
     start = np.abs(data.efc_pos).max()
-    for forces in tau:
-        data.ctrl[:] = forces
+    for torques in tau[:-1]:
+        data.ctrl[:] = torques
         mujoco.mj_step(model, data)
-    print(json.dumps([start, np.abs(data.efc_pos).max(), [data.joint(name).qpos[0] for name in names]]))
-"""
+    positions = np.array([data.joint(joint.name).qpos[0] for joint in robot.joints])
+    return start, np.abs(data.efc_pos).max(), np.abs(positions - motion.posture.q[-1]).max()
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_mujoco_moves_as_planned(name):
-    """Played from home without control, the torques of a motion lead to it with an error in proportion to the step.
-
-    In an interpreter that has MuJoCo: CALIB_MUJOCO=/path/to/python.
-    """
-    interpreter = os.environ.get("CALIB_MUJOCO")
-    if not interpreter:
-        pytest.skip("MuJoCo is not part of the environment: set CALIB_MUJOCO to a python that has it")
-    robot, given, wanted = opened(name), [], []
+    """Played from home without control, the torques of a motion lead to it with an error in proportion to the step."""
+    mujoco = pytest.importorskip("mujoco")
+    errors = []
     for step in (1e-3, 1e-4):
-        text = robot.mjcf().replace('"0.002 1"', f'"{2 * step} 1"').replace('"0.001"', f'"{step}"')
-        motion, tau = moved(robot, step * np.arange(round(0.3 / step) + 1))
-        given.append([step, text, [joint.name for joint in robot.joints], tau[:-1].tolist()])
-        wanted.append(motion.posture.q[-1])
-    ran = subprocess.run(
-        [interpreter, "-c", PLAYED], input=json.dumps(given), capture_output=True, text=True, check=True
-    )
-    found = [json.loads(line) for line in ran.stdout.splitlines()]
-    assert all(start < 1e-9 and end < 1e-4 for start, end, _ in found)  # the loops are closed and stay so
-    errors = [np.abs(np.array(q) - own).max() for (_, _, q), own in zip(found, wanted)]
+        start, end, error = played(mujoco, opened(name), step)
+        # the loops are closed and stay so
+        assert start < 1e-9 and end < 1e-4
+        errors.append(error)
     assert errors[1] < 0.15 * errors[0] and errors[1] < 1e-3
 
 

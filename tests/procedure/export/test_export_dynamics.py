@@ -2,9 +2,7 @@
 
 import csv
 import json
-import os
 import re
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +10,7 @@ import pytest
 
 from calib import files
 from calib.dynamics import base as bases
-from calib.dynamics import pseudo_inertia
+from calib.dynamics import pseudo_inertia, rigid_body
 from calib.dynamics.idim import from_chain
 from calib.errors import RobotError
 from calib.identification.model_file import to_table
@@ -209,33 +207,23 @@ def check_torques_with_pinocchio_by_joint_names(path: Path) -> None:
 
 
 def test_mujoco_reads_the_mjcf(tmp_path):
-    """In an interpreter that has MuJoCo: CALIB_MUJOCO=/path/to/python."""
-    interpreter = os.environ.get("CALIB_MUJOCO")
-    if not interpreter:
-        pytest.skip("MuJoCo is not part of the environment: set CALIB_MUJOCO to a python that has it")
+    """MuJoCo computes from the exported MJCF the torques of our inverse dynamics."""
+    mujoco = pytest.importorskip("mujoco")
     folder = write_identification(tmp_path / "found", SOURCE.replace("AXIS", "revolute"))
     deliver(Export(None, identified=folder), tmp_path / "out")
-    given = identified.read(folder)
-    from calib.dynamics import rigid_body
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "robot.xml"))
+    data = mujoco.MjData(model)
+    model.dof_damping[:] = 0.0
+    model.dof_frictionloss[:] = 0.0
 
     rng = np.random.default_rng(3)
     q, v, a = rng.uniform(-0.4, 0.4, (3, 5, 2))
-    code = (
-        "import json, sys, mujoco, numpy as np\n"
-        "m = mujoco.MjModel.from_xml_path(sys.argv[1]); d = mujoco.MjData(m); out = []\n"
-        "m.dof_damping[:] = 0; m.dof_frictionloss[:] = 0\n"
-        "for q, v, a in zip(*json.loads(sys.argv[2])):\n"
-        "    d.qpos[:], d.qvel[:], d.qacc[:] = q, v, a\n"
-        "    mujoco.mj_inverse(m, d); out.append(d.qfrc_inverse.tolist())\n"
-        "print(json.dumps(out))\n"
-    )
-    arguments = [
-        interpreter,
-        "-c",
-        code,
-        tmp_path / "out" / "robot.xml",
-        json.dumps([q.tolist(), v.tolist(), a.tolist()]),
-    ]
-    answer = subprocess.run(arguments, capture_output=True, text=True, check=True).stdout
-    wanted = rigid_body.inverse_dynamics(given.arm, given.bodies.ravel(), q, v, a) + given.drives.values[:, 0] * a
-    assert np.abs(np.array(json.loads(answer)) - wanted).max() < 1e-9 * np.abs(wanted).max()
+    torques = []
+    for position, velocity, acceleration in zip(q, v, a):
+        data.qpos[:], data.qvel[:], data.qacc[:] = position, velocity, acceleration
+        mujoco.mj_inverse(model, data)
+        torques.append(data.qfrc_inverse.copy())
+
+    result = identified.read(folder)
+    wanted = rigid_body.inverse_dynamics(result.arm, result.bodies.ravel(), q, v, a) + result.drives.values[:, 0] * a
+    assert np.abs(np.array(torques) - wanted).max() < 1e-9 * np.abs(wanted).max()
