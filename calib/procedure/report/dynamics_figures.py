@@ -15,7 +15,9 @@ from calib.procedure.dynamic_stage.geometry_tables import GEOMETRIES, MIN_SHIFT,
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import TorqueCurves, UnseenReport
-from calib.procedure.report.dynamics_section import SIGNIFICANT, DynamicReport, IdentifiedParameter, percent, proof_of
+from calib.procedure.report.dynamics_errors import percent
+from calib.procedure.report.dynamics_geometry import SIGNIFICANT
+from calib.procedure.report.dynamics_section import DynamicReport, IdentifiedParameter, proof_of
 from calib.procedure.report.figures.charts import Bars, Captioned, Chart, Label, Level, Line, Panel
 from calib.procedure.report.figures.style import AFTER, BEFORE, CURVES, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET
 from calib.procedure.robot_kinds import Mechanism

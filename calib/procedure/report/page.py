@@ -3,6 +3,7 @@
 Report and certificate show the same values as HTML and PDF; this module does not depend on robots.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -297,6 +298,11 @@ class Section:
     verdict: str = ""
     reason: str = ""
     figures: Sequence[KeyFigure] = ()
+
+
+def number(value: float, unit: str = "") -> str:
+    """Return a value with three significant digits and its unit as text; a dash if it is not finite."""
+    return f"{value:.3g}{unit}" if math.isfinite(value) else "–"
 
 
 def relative_sigma(percent: float | None) -> str:

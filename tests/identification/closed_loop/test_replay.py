@@ -101,7 +101,7 @@ def test_the_command_reports_it(robot, tmp_path, capsys):
 
 def test_no_ratio_for_an_impossible_robot():
     """No ratio is told of a model that is no possible robot."""
-    from calib.procedure.report.dynamics_section import tracking_blocks
+    from calib.procedure.report.dynamics_loop import tracking_blocks
 
     def said(*added: float) -> str:
         rms = {"feedback": np.full(2, 13.4e-3), "model": np.full(2, 1e-3)}

@@ -23,7 +23,7 @@ from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import TorqueCurves
 from calib.procedure.dynamic_stage.recorded_gains import FoundGains
 from calib.procedure.dynamic_stage.replay import Replay
-from calib.procedure.report import dynamics_figures, dynamics_section, page
+from calib.procedure.report import dynamics_figures, dynamics_loop, page
 from calib.procedure.report.figures import drawing
 from calib.robot.calibrated import CalibratedChain
 from calib.units import motion_units
@@ -69,7 +69,7 @@ def test_second_ctrl_c_ends_as_the_first(monkeypatch):
 def test_names_in_brackets_reach_the_console():
     rms = {key: np.full(3, 1e-3) for key in ("feedback", "cad", "model", "floor")}
     one = Replay("log.npz", 30.0, None, True, (), np.zeros(3), rms, unseen=True)
-    *_, last = page.rendered(dynamics_section.tracking_blocks({"log.npz": one}))
+    *_, last = page.rendered(dynamics_loop.tracking_blocks({"log.npz": one}))
     assert isinstance(last, Text) and "the controller of [loop];" in last.plain
 
 

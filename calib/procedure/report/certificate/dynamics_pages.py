@@ -13,7 +13,8 @@ from calib.config_types import Plots
 from calib.folders import METRICS
 from calib.procedure.findings import sentence
 from calib.procedure.report.certificate.record import StageRecord
-from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of, rms_words, warnings_of
+from calib.procedure.report.dynamics_errors import percent, rms_words
+from calib.procedure.report.dynamics_section import DynamicReport, proof_of, warnings_of
 from calib.procedure.report.page import ChartPicture, Picture, Pictures, ReportTable, Section, Text
 from calib.records import read_json
 from calib.robot.chain import Joint
