@@ -59,13 +59,13 @@ class DriftFound(ChartedResult, ReportedResult):
     @property
     def verdict(self) -> Verdict:
         """Verdict on whether the drift is acceptable."""
-        totals = [f"{trend.what}: {1e3 * trend.total:.2g} mm in all" for trend in self.trends]
+        totals = [f"{trend.column}: {1e3 * trend.total:.2g} mm in all" for trend in self.trends]
         return Verdict.of("; ".join(totals) or "no column of time or temperature", self.noticed)
 
     def section(self) -> Section:
         """Return the report section with the trends, and the distances between readings of repeated poses."""
         columns = [
-            RecordColumn("with", "{0.what}", number=False),
+            RecordColumn("with", "{0.column}", number=False),
             RecordColumn("poses", "{0.poses}"),
             RecordColumn("visits", "{0.x.size}"),
             RecordColumn("slope", _rate),
@@ -89,9 +89,9 @@ class DriftFound(ChartedResult, ReportedResult):
         for trend in self.trends:
             ends = np.array([trend.x.min(), trend.x.max()])
             for k, axis in enumerate("xyz"):
-                motion = Line(trend.x, 1e3 * trend.moved[:, k], "o", AFTER)
+                motion = Line(trend.x, 1e3 * trend.displacement[:, k], "o", AFTER)
                 slope = Line(ends, 1e3 * trend.slope[k] * (ends - trend.x.mean()), "-", QUIET)
-                panels.append(Panel([motion, slope], f"{axis} [mm]", f"{trend.what} [{trend.unit}]"))
+                panels.append(Panel([motion, slope], f"{axis} [mm]", f"{trend.column} [{trend.unit}]"))
         if not panels:
             return {}
         return {"drift": Chart(panels, 2.2 * len(self.trends), 3)}
@@ -108,8 +108,8 @@ class DriftFound(ChartedResult, ReportedResult):
         """
         rows: list[tuple[object, ...]] = []
         for trend in self.trends:
-            for x, displacement in zip(trend.x, trend.moved):
-                rows.append((trend.what, trend.unit, x, *(1e3 * displacement)))
+            for x, displacement in zip(trend.x, trend.displacement):
+                rows.append((trend.column, trend.unit, x, *(1e3 * displacement)))
         charts: dict[str, Chart] = {}
         if plots:
             charts = self.charts()
@@ -122,7 +122,7 @@ class DriftFound(ChartedResult, ReportedResult):
             "noticed": self.noticed,
         }
         for trend in self.trends:
-            numbers[trend.what] = {
+            numbers[trend.column] = {
                 "slope": trend.slope,
                 "sigma": trend.sigma,
                 "sigmas": trend.sigmas,

@@ -34,10 +34,20 @@ from calib.procedure.session.folder import Session
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 
-SAME = 1e-3  # joints of a pose that is visited again differ by less [rad or m]; our choice
-MIN_DRIFT_SIGMAS = 3.0  # standard errors that repeated poses have to be off to be called drift
-TIMES = {"": 1.0, "s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
-COVARIATES = {"time": re.compile(r"t|time|date|timestamp|date.?time", re.I), "temperature": re.compile(r"temp.*", re.I)}
+SAME_POSE = 1e-3
+"""Joint values of a pose that is visited again differ by less [rad or m] (our choice)."""
+MIN_DRIFT_SIGMAS = 3.0
+"""Standard errors by which repeated poses have to be off to be called drift (our choice)."""
+MIN_NOISE = 1e-12
+"""Lower bound of the noise [m], for measurements that repeat exactly."""
+MIN_SPREAD = 1e-12
+"""Smallest sum of squares of the visits' times, relative to the square of the file's range, that shows a trend."""
+SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+"""Unit of a column of time -> seconds."""
+HOURS = "h"
+CELSIUS = "°C"
+TIME_COLUMN = re.compile(r"t|time|date|timestamp|date.?time", re.I)
+TEMPERATURE_COLUMN = re.compile(r"temp.*", re.I)
 
 
 @dataclass(frozen=True)
@@ -66,10 +76,10 @@ class Trend:
     """Motion of the target with time or temperature.
 
     Attributes:
-        what: name of the column.
+        column: name of the column.
         unit: unit of the column's values: h or °C.
         x: (m,) time from the start, or temperature, at the measurements of repeated poses [unit].
-        moved: (m, 3) measured points minus the arm's prediction and minus the mean of each pose [m], in the
+        displacement: (m, 3) measured points minus the arm's prediction and minus the mean of each pose [m], in the
             instrument's frame.
         poses: number of repeated poses.
         span: range of the column over all rows [unit].
@@ -78,10 +88,10 @@ class Trend:
         sigmas: significance of the slope, as the deviation of a normal variable with the same probability.
     """
 
-    what: str
+    column: str
     unit: str
     x: np.ndarray
-    moved: np.ndarray
+    displacement: np.ndarray
     poses: int
     span: float
     slope: np.ndarray
@@ -106,7 +116,9 @@ class Trend:
         """
         rate = f"{1e3 * self.size:.2g} ± {1e3 * self.sigma:.1g} mm/{self.unit}"
         times = self.total / need if need else 0.0
-        return finding("target-drifts", sigmas=self.sigmas, times=times, rate=rate, total=self.total, column=self.what)
+        return finding(
+            "target-drifts", sigmas=self.sigmas, times=times, rate=rate, total=self.total, column=self.column
+        )
 
 
 def noise_of_difference(sigma: float) -> float:
@@ -125,12 +137,15 @@ def of_session(
         blocks: measurements for the fit.
         again: measurements repeated at the end.
     """
-    instrument, tolerance = session.settings.instrument, 1e-3 * session.settings.fit.tolerance_mm
+    instrument = session.settings.instrument
+    tolerance = 1e-3 * session.settings.fit.tolerance_mm
     sigma = instrument.sigma_position
     if instrument.reference and sigma:
         sigma = _stated_sigma(blocks) or sigma
-    trended = [one.finding(tolerance or noise_of_difference(sigma)) for one in trends(chain, blocks, again, sigma)]
-    return [*repeats(chain, blocks, again, sigma), *trended]
+    findings = repeats(chain, blocks, again, sigma)
+    for trend in trends(chain, blocks, again, sigma):
+        findings.append(trend.finding(tolerance or noise_of_difference(sigma)))
+    return findings
 
 
 def _stated_sigma(blocks: Sequence[PoseMeasurements]) -> float:
@@ -138,10 +153,11 @@ def _stated_sigma(blocks: Sequence[PoseMeasurements]) -> float:
 
     0 without stated σ.
     """
-    squares = [block.sigma.ravel() ** 2 for block in blocks if isinstance(block, Positions) and block.sigma is not None]
-    if not squares:
+    measured = [block for block in blocks if isinstance(block, Positions)]
+    sigmas = [block.sigma.ravel() for block in measured if block.sigma is not None]
+    if not sigmas:
         return 0.0
-    return float(np.sqrt(np.mean(np.concatenate(squares))))
+    return float(np.sqrt(np.mean(np.concatenate(sigmas) ** 2)))
 
 
 def repeats(
@@ -188,21 +204,34 @@ def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurem
         later: measured poses or positions; for other kinds of measurement, the result is None.
         first: the earlier measurements; None: each row of `later` is compared with the earlier rows of `later`.
     """
-    before = [later] if first is None else first
-    earlier = [(block, k) for block in before if isinstance(block, Positions) for k in range(len(block))]
-    if not earlier or not isinstance(later, Positions):
+    if not isinstance(later, Positions):
         return None
-    q, squares = np.array([block.q[k] for block, k in earlier]), []
-    tool = np.array([block.tool[k] for block, k in earlier])
+    blocks = [later]
+    if first is not None:
+        blocks = [block for block in first if isinstance(block, Positions)]
+    if not any(len(block) for block in blocks):
+        return None
+    q = np.concatenate([block.q for block in blocks])
+    position = np.concatenate([block.position for block in blocks])
+    tool = np.concatenate([block.tool for block in blocks])
+
+    squares = []
     for k in range(len(later)):
-        same = (np.abs(q - later.q[k]).max(axis=1) < SAME) & (tool == later.tool[k])
-        near = np.flatnonzero(same if first is not None else same[:k])
-        if len(near):
-            other, row = earlier[near[0]]
-            was, now = forward(chain, np.array([other.q[row], later.q[k]]))[:, :3, 3]
-            shift, joints = later.position[k] - other.position[row], now - was
-            squares.append(max(float(shift @ shift) - float(joints @ joints), 0.0))
-    return Drift(len(squares), float(np.sqrt(np.mean(squares)))) if squares else None
+        same_pose = np.abs(q - later.q[k]).max(axis=1) < SAME_POSE
+        visits = np.flatnonzero(same_pose & (tool == later.tool[k]))
+        if first is None:
+            # of the rows of one file, the earlier ones
+            visits = visits[visits < k]
+        if not len(visits):
+            continue
+        visit = visits[0]
+        tip = forward(chain, np.array([q[visit], later.q[k]]))[:, :3, 3]
+        by_joints = tip[1] - tip[0]
+        shift = later.position[k] - position[visit]
+        squares.append(max(float(shift @ shift - by_joints @ by_joints), 0.0))
+    if not squares:
+        return None
+    return Drift(len(squares), float(np.sqrt(np.mean(squares))))
 
 
 def trends(
@@ -217,39 +246,47 @@ def trends(
         again: measurements at the end, from the station of the first block.
         sigma: σ of one position, per axis [m], a lower bound for the noise; 0: unknown.
     """
-    seen = [block for block in blocks if isinstance(block, Positions)]
-    seen += [replace(block, station=seen[0].station) for block in again if seen and isinstance(block, Positions)]
-    try:
-        cell = install(chain, seen) if seen else None
-    except CalibError:  # too few rows to place the instrument
-        cell = None
-    if cell is None:
+    measured = [block for block in blocks if isinstance(block, Positions)]
+    if not measured:
         return []
-    ready = prepare(cell, seen)
-    off = [block.position - positions(cell, one).T for block, one in zip(seen, ready)]
-    key = [
-        np.column_stack([block.q, 1e3 * block.tool, np.full(len(block), 1e3 * k.station)])
-        for block, k in zip(seen, ready)
-    ]
-    pose = _poses(np.concatenate(key))
-    tables = [_columns(Path(block.file), block.rows) for block in seen]
-    shared = [name for name in tables[0] if all(name in each for each in tables)]
-    columns = [(name, tables[0][name][0], [each[name][1] for each in tables]) for name in shared]
-    found = (
-        _trend(name, unit, np.concatenate(values), np.concatenate(off), pose, sigma)
-        for name, unit, values in columns
-        if unit != "h" or _one_clock(values)
-    )
-    return [one for one in found if one is not None]
+    for block in again:
+        if isinstance(block, Positions):
+            measured.append(replace(block, station=measured[0].station))
+    try:
+        cell = install(chain, measured)
+    except CalibError:  # too few rows to place the instrument
+        return []
+    displacements, keys = [], []
+    for block, prepared in zip(measured, prepare(cell, measured)):
+        displacements.append(block.position - positions(cell, prepared).T)
+        # rows of another target or station are never the same pose
+        station = np.full(len(block), 1e3 * prepared.station)
+        keys.append(np.column_stack([block.q, 1e3 * block.tool, station]))
+    displacement = np.concatenate(displacements)
+    pose = _first_visits(np.concatenate(keys))
+
+    tables = [_columns(Path(block.file), block.rows) for block in measured]
+    result = []
+    for column, (unit, _) in tables[0].items():
+        if not all(column in table for table in tables):
+            continue
+        values = [table[column][1] for table in tables]
+        if unit == HOURS and not _one_clock(values):
+            continue
+        trend = _trend(column, unit, np.concatenate(values), displacement, pose, sigma)
+        if trend is not None:
+            result.append(trend)
+    return result
 
 
-def _poses(key: np.ndarray) -> np.ndarray:
-    """Return for each row the index (m,) of the first row with the same pose, up to a difference of `SAME`.
+def _first_visits(keys: np.ndarray) -> np.ndarray:
+    """Return for each row the index (m,) of the first row with the same pose, up to a difference of `SAME_POSE`.
 
     Args:
-        key: (m, k) joint values, and scaled indices of target and station.
+        keys: (m, k) joint values, and scaled indices of target and station.
     """
-    return np.array([min(near) for near in KDTree(key).query_ball_point(key, SAME, p=np.inf)])
+    neighbours = KDTree(keys).query_ball_point(keys, SAME_POSE, p=np.inf)
+    return np.array([min(rows) for rows in neighbours])
 
 
 def _one_clock(times: Sequence[np.ndarray]) -> bool:
@@ -258,27 +295,59 @@ def _one_clock(times: Sequence[np.ndarray]) -> bool:
     They overlap if each file counts from its own start.
 
     Args:
-        times: times of the rows of each file [s].
+        times: times of the rows of each file [h].
     """
-    spans = sorted((each.min(), each.max()) for each in times)
-    return all(one[1] <= two[0] for one, two in pairwise(spans))
+    spans = sorted((values.min(), values.max()) for values in times)
+    return all(earlier[1] <= later[0] for earlier, later in pairwise(spans))
 
 
-def _trend(what: str, unit: str, x: np.ndarray, off: np.ndarray, pose: np.ndarray, sigma: float) -> Trend | None:
-    _, place, count = np.unique(pose, return_inverse=True, return_counts=True)
-    again = count[place] > 1
-    poses, visits = int((count > 1).sum()), int(again.sum())
+def _trend(
+    column: str, unit: str, x: np.ndarray, displacement: np.ndarray, pose: np.ndarray, sigma: float
+) -> Trend | None:
+    """Return the trend of repeated poses with a column; None if too few are repeated, or the column does not vary.
+
+    Args:
+        column: name of the column.
+        unit: its unit.
+        x: (m,) its values [unit].
+        displacement: (m, 3) measured points minus the arm's prediction [m].
+        pose: (m,) index of the pose of each row.
+        sigma: lower bound of the noise, per axis [m].
+    """
+    _, index, counts = np.unique(pose, return_inverse=True, return_counts=True)
+    repeated = counts[index] > 1
+    poses = int(np.sum(counts > 1))
+    visits = int(repeated.sum())
     dof = 3 * (visits - poses - 1)
-    means = [np.bincount(place, one) / count for one in (x, *off.T)]
-    centred, moved = (x - means[0][place])[again], (off - np.transpose(means[1:])[place])[again]
-    spread = float(centred @ centred)
-    if dof < 1 or spread <= 1e-12 * max(float(np.ptp(x)) ** 2, 1e-300) or not np.ptp(x):
+    x_centred = _minus_pose_means(x[:, None], index, counts)[repeated, 0]
+    displacement = _minus_pose_means(displacement, index, counts)[repeated]
+    span = float(np.ptp(x))
+    squares = float(x_centred @ x_centred)
+    if dof < 1 or span == 0.0 or squares <= MIN_SPREAD * span**2:
         return None
-    slope = centred @ moved / spread
-    left = max(float(np.sqrt(np.sum((moved - np.outer(centred, slope)) ** 2) / dof)), sigma, 1e-12)
-    chance = fdtrc(3, dof, spread * float(slope @ slope) / (3.0 * left**2))
-    sigmas = -float(ndtri(max(float(chance), 1e-300) / 2.0))
-    return Trend(what, unit, x[again], moved, poses, float(np.ptp(x)), slope, left / np.sqrt(spread), sigmas)
+
+    slope = x_centred @ displacement / squares
+    residual = displacement - np.outer(x_centred, slope)
+    noise = max(float(np.sqrt(np.sum(residual**2) / dof)), sigma, MIN_NOISE)
+    statistic = squares * float(slope @ slope) / (3.0 * noise**2)
+    # the probability that noise alone gives such a slope; its logarithm must exist
+    probability = max(float(fdtrc(3, dof, statistic)), 1e-300)
+    sigmas = -float(ndtri(probability / 2.0))
+    return Trend(column, unit, x[repeated], displacement, poses, span, slope, noise / np.sqrt(squares), sigmas)
+
+
+def _minus_pose_means(values: np.ndarray, index: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return values (m, k) minus their means over the visits of each pose.
+
+    Args:
+        values: (m, k).
+        index: (m,) number of the pose of each row.
+        counts: rows of each pose.
+    """
+    sums = np.zeros((len(counts), values.shape[1]))
+    np.add.at(sums, index, values)
+    means = sums / counts[:, None]
+    return values - means[index]
 
 
 def _columns(path: Path, rows: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
@@ -290,27 +359,35 @@ def _columns(path: Path, rows: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
     """
     if not path.is_file():
         return {}
-    table = read_table(path)
-    return {name: (unit, values[rows - 1]) for name, unit, values in _covariates(table) if len(values) >= rows.max()}
+    columns = {}
+    for name, unit, values in _covariates(read_table(path)):
+        if len(values) >= rows.max():
+            columns[name] = unit, values[rows - 1]
+    return columns
 
 
 def _covariates(table: Table) -> Iterator[tuple[str, str, np.ndarray]]:
+    """Yield name, unit and values (m,) of a table's columns of time [h] and temperature [°C]."""
     for name, unit, cells in zip(table.header, table.units, table.cells):
-        if COVARIATES["temperature"].fullmatch(name) and cells.dtype == float and np.isfinite(cells).all():
-            yield name, "°C", cells
-        elif COVARIATES["time"].fullmatch(name) and (seconds := _seconds(cells, unit)) is not None:
-            yield name, "h", seconds / 3600.0
+        if TEMPERATURE_COLUMN.fullmatch(name):
+            if cells.dtype == float and np.isfinite(cells).all():
+                yield name, CELSIUS, cells
+        elif TIME_COLUMN.fullmatch(name):
+            seconds = _seconds(cells, unit)
+            if seconds is not None:
+                yield name, HOURS, seconds / 3600.0
 
 
 def _seconds(cells: np.ndarray, unit: str) -> np.ndarray | None:
-    """Return the times [s] in a column: numbers in a unit of `TIMES`, or dates in ISO 8601; None for other columns.
+    """Return the times [s] in a column: numbers in a unit of `SECONDS`, or dates in ISO 8601; None for other columns.
 
     Args:
         cells: (m,) cells of the column.
         unit: unit in the column's header.
     """
     if cells.dtype == float:
-        return TIMES[unit] * cells if unit in TIMES and np.isfinite(cells).all() else None
+        readable = unit in SECONDS and np.isfinite(cells).all()
+        return SECONDS[unit] * cells if readable else None
     try:
         return np.array([datetime.fromisoformat(str(cell)).timestamp() for cell in cells])
     except ValueError:

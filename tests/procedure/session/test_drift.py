@@ -43,7 +43,7 @@ def test_planted_drift_is_found_with_slope(cell, tmp_path):
     path = measured(cell, tmp_path, MOVES, columns=("time [min]", "temp_air"))
     found = drift_page.drift("ur5", [path], DriftSettings(sigma=6e-5))
     time, warmth = found.trends
-    assert (time.what, time.unit, warmth.what, warmth.unit) == ("time", "h", "temp_air", "°C")
+    assert (time.column, time.unit, warmth.column, warmth.unit) == ("time", "h", "temp_air", "°C")
     assert abs(time.size - MOVES / HOURS) < 4.0 * time.sigma < 0.6 * time.size
     assert warmth.total == pytest.approx(time.total, rel=1e-3) and found.verdict == "marginal"
     assert {each.code for each in found.noticed} == {"target-drifts", "poses-moved"}
