@@ -13,9 +13,10 @@ again; no ROS was at hand to build it. Maintainer and license are left to be fil
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import NamedTuple
 from xml.sax.saxutils import escape, quoteattr
 
 from calib import files
@@ -31,16 +32,32 @@ from calib.robot.descriptions.xacro_arguments import split
 from calib.robot.formats.urdf_tree import edited, set_attributes, text
 from calib.robot.formats.urdf_tree import read as read_tree
 
-HERE = "calib.procedure.export"
-NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")  # REP 149's [a-z](_?[a-z0-9]+)*, without its backtracking
-SHOWS = ("robot_state_publisher", "joint_state_publisher_gui", "rviz2")
-FILES = {
+TEMPLATE_PACKAGE = "calib.procedure.export"
+# REP 149's [a-z](_?[a-z0-9]+)*, without its backtracking
+PACKAGE_NAME = re.compile(r"[a-z][a-z0-9]*(_[a-z0-9]+)*")
+DISPLAY_PACKAGES = ("robot_state_publisher", "joint_state_publisher_gui", "rviz2")
+# template -> its path in the package
+TEMPLATES = {
     "package.xml": "package.xml",
     "CMakeLists.txt": "CMakeLists.txt",
     "display.rviz": "rviz/display.rviz",
     "display.launch.template": "launch/display.launch.py",
 }
-_PACKAGE = re.compile(r"package://([^/]+)/")
+_PACKAGE_URI = re.compile(r"package://([^/]+)/")
+
+
+class _Meshes(NamedTuple):
+    """A URDF's text with its meshes in the package.
+
+    Attributes:
+        content: the text, with the mesh names changed.
+        copies: path in the package -> path of the mesh that is copied there.
+        missing: names of meshes that were not found.
+    """
+
+    content: str
+    copies: dict[str, Path]
+    missing: list[str]
 
 
 def write_package(
@@ -66,75 +83,132 @@ def write_package(
         UsageError: for a name that is not valid for a ROS 2 package, and for MoveIt files of another robot.
         RobotError: if the finished URDF, read back, differs from the robot; nothing is written.
     """
-    likely = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
-    words = f"--ros2 {name}: a package's name has lower-case letters, digits and single _, a letter first (REP 149)"
-    require(NAME.fullmatch(name), f"{words}{f', as {likely}' if NAME.fullmatch(likely) else ''}", UsageError)
-    target, robot, chain = into / name, name.removesuffix("_description"), export.robot.chain
-    configs = {f"config/{file.name}": file for path in moveit for file in moveit_files(path)}
-    for file in configs.values():
-        limit_tables(file, chain, export.urdf)
-    with TemporaryDirectory() as place:
-        path = Path(place) / f"{robot}.urdf"
-        notes = deliver_single(export, {URDF: path})
-        content, encoding = text(path)
-        content, meshes, lost = _with_own_meshes(path, content, name, export.urdf)
+    _check_name(name)
+    target = into / name
+    robot_name = name.removesuffix("_description")
+    chain = export.robot.chain
+    configs: dict[str, Path] = {}
+    for path in moveit:
+        for file in moveit_files(path):
+            limit_tables(file, chain, export.urdf)
+            configs[f"config/{file.name}"] = file
+
+    with TemporaryDirectory() as folder:
+        urdf = Path(folder) / f"{robot_name}.urdf"
+        notes = deliver_single(export, {URDF: urdf})
+        content, encoding = text(urdf)
+        meshes = _with_package_meshes(urdf, content, name, export.urdf)
+    content = meshes.content
     if control and "<ros2_control" not in content:
-        content = _with_control(content, robot, chain)
+        content = _with_control(content, robot_name, chain)
         notes.append("<ros2_control> is for mock hardware: name your robot's plugin in it")
     check_readback(content, str(target), chain)
-    if lost:
-        notes.append(f"{len(lost)} meshes were not found; their file names are unchanged, such as {lost[0]}")
-    needed = dict.fromkeys([*SHOWS, *(match[1] for each in lost if (match := _PACKAGE.match(each)))])
-    made: dict[str, str | bytes] = {f"urdf/{robot}.urdf": content.encode(encoding)}
-    made |= {place: file.read_bytes() for place, file in {**meshes, **configs}.items()}
-    words = {
+    if meshes.missing:
+        example = meshes.missing[0]
+        notes.append(f"{len(meshes.missing)} meshes were not found; their file names are unchanged, such as {example}")
+
+    contents: dict[str, str | bytes] = {f"urdf/{robot_name}.urdf": content.encode(encoding)}
+    for path, file in {**meshes.copies, **configs}.items():
+        contents[path] = file.read_bytes()
+    fields = {
         "NAME": name,
-        "ROBOT": robot,
+        "ROBOT": robot_name,
         "ROOT": read_tree(content, name).roots[0],
         "ABOUT": escape(f"{chain.name}, calibrated by armature-calib. {export.remark}".strip()),
-        "DEPENDS": "\n".join(f"  <exec_depend>{each}</exec_depend>" for each in needed),
-        "FOLDERS": " ".join(sorted({each.split("/")[0] for each in (*made, *FILES.values()) if "/" in each})),
+        "DEPENDS": _dependencies(meshes.missing),
+        "FOLDERS": _folders([*contents, *TEMPLATES.values()]),
     }
-    for template, place in FILES.items():
-        made[place] = re.sub(r"@([A-Z]+)@", lambda found: words[found[1]], shipped_text(HERE, f"templates/{template}"))
-    files.check_results([(target / place, ()) for place in made], [export.urdf, *configs.values()], overwrite)
+    for template, path in TEMPLATES.items():
+        contents[path] = _filled(template, fields)
+
+    results = [(target / path, ()) for path in contents]
+    files.check_results(results, [export.urdf, *configs.values()], overwrite)
     with files.together():
-        for place, written in made.items():
-            files.write(target / place, written)
-    return (*notes, f"{len(meshes)} meshes copied; fill in maintainer and license in {target / 'package.xml'}")
+        for path, written in contents.items():
+            files.write(target / path, written)
+    remark = f"{len(meshes.copies)} meshes copied; fill in maintainer and license in {target / 'package.xml'}"
+    return (*notes, remark)
 
 
-def _with_own_meshes(
-    path: Path, content: str, name: str, source: Path | None
-) -> tuple[str, dict[str, Path], list[str]]:
-    """Return a URDF's text with mesh names changed to paths in the package, the found meshes, and names of lost ones.
+def _check_name(name: str) -> None:
+    """Refuse a name that REP 149 does not allow, with the nearest one that it does.
+
+    Raises:
+        UsageError: for such a name.
+    """
+    allowed = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
+    message = f"--ros2 {name}: a package's name has lower-case letters, digits and single _, a letter first (REP 149)"
+    if PACKAGE_NAME.fullmatch(allowed):
+        message += f", as {allowed}"
+    require(PACKAGE_NAME.fullmatch(name), message, UsageError)
+
+
+def _dependencies(missing: Sequence[str]) -> str:
+    """Return the lines of ``package.xml`` with what the package needs to run.
 
     Args:
-        path: path of the URDF.
+        missing: names of meshes that are not copied: their packages are needed.
+    """
+    packages = dict.fromkeys(DISPLAY_PACKAGES)
+    for mesh in missing:
+        uri = _PACKAGE_URI.match(mesh)
+        if uri:
+            packages[uri[1]] = None
+    return "\n".join(f"  <exec_depend>{package}</exec_depend>" for package in packages)
+
+
+def _folders(paths: Sequence[str]) -> str:
+    """Return the package's folders, sorted, for its ``CMakeLists.txt``."""
+    folders = {path.split("/")[0] for path in paths if "/" in path}
+    return " ".join(sorted(folders))
+
+
+def _filled(template: str, fields: Mapping[str, str]) -> str:
+    """Return the text of a template in which each ``@NAME@`` is replaced by the field of that name."""
+
+    def field(mark: re.Match[str]) -> str:
+        return fields[mark[1]]
+
+    return re.sub(r"@([A-Z]+)@", field, shipped_text(TEMPLATE_PACKAGE, f"templates/{template}"))
+
+
+def _with_package_meshes(urdf: Path, content: str, name: str, source: Path | None) -> _Meshes:
+    """Return a URDF's text with the names of the found meshes changed to paths in the package.
+
+    Args:
+        urdf: path of the URDF.
         content: text of the URDF.
         name: name of the package.
         source: URDF of the nominal robot, whose folder is searched for meshes; None: no search.
-
-    Returns:
-        The text, path in the package -> path of the mesh, and the names of meshes that were not found.
     """
-    folders = [] if source is None else list(Path(split(str(source))[0]).resolve().parents)
-    changes, meshes, lost = list[tuple[int, int, str]](), dict[str, Path](), list[str]()
-    for _, _, node in (*urdf_meshes(path, "visual"), *urdf_meshes(path, "collision")):
-        written = node.attributes.get("filename", "")
-        found = find_mesh(written, folders)
-        if found is None:
-            lost.append(written)
+    folders: list[Path] = []
+    if source is not None:
+        folders = list(Path(split(str(source))[0]).resolve().parents)
+    changes: list[tuple[int, int, str]] = []
+    copies: dict[str, Path] = {}
+    missing: list[str] = []
+    for _, _, node in (*urdf_meshes(urdf, "visual"), *urdf_meshes(urdf, "collision")):
+        uri = node.attributes.get("filename", "")
+        mesh = find_mesh(uri, folders)
+        if mesh is None:
+            missing.append(uri)
             continue
-        inner = [
-            part for part in Path(_PACKAGE.sub("", written).removeprefix("file://")).parts if part not in ("/", "..")
-        ]
-        place = Path("meshes", *(inner[1:] if inner[0] == "meshes" else inner))
-        while meshes.get(str(place), found) != found:
-            place = place.with_stem(f"{place.stem}_")
-        meshes[str(place)] = found
-        changes += set_attributes(content, node, {"filename": f"package://{name}/{place}"})
-    return edited(content, changes), meshes, lost
+        path = _path_in_package(uri)
+        # another mesh of the same name gets another one
+        while copies.get(str(path), mesh) != mesh:
+            path = path.with_stem(f"{path.stem}_")
+        copies[str(path)] = mesh
+        changes += set_attributes(content, node, {"filename": f"package://{name}/{path}"})
+    return _Meshes(edited(content, changes), copies, missing)
+
+
+def _path_in_package(uri: str) -> Path:
+    """Return the path below ``meshes`` at which a mesh is copied: that in its own package, or on the disk."""
+    parts = list(Path(_PACKAGE_URI.sub("", uri).removeprefix("file://")).parts)
+    inner = [part for part in parts if part not in ("/", "..")]
+    if inner[0] == "meshes":
+        inner = inner[1:]
+    return Path("meshes", *inner)
 
 
 def _with_control(content: str, robot: str, chain: Chain) -> str:
@@ -145,11 +219,12 @@ def _with_control(content: str, robot: str, chain: Chain) -> str:
         robot: name of the robot.
         chain: the arm, whose joints are controlled.
     """
-    joints = "".join(
-        f'    <joint name={quoteattr(name)}>\n      <command_interface name="position"/>\n'
-        '      <state_interface name="position"/>\n      <state_interface name="velocity"/>\n    </joint>\n'
-        for name in chain.joint_names
-    )
+    joints = ""
+    for joint in chain.joint_names:
+        joints += (
+            f'    <joint name={quoteattr(joint)}>\n      <command_interface name="position"/>\n'
+            '      <state_interface name="position"/>\n      <state_interface name="velocity"/>\n    </joint>\n'
+        )
     head = f'  <ros2_control name="{robot}" type="system">\n    <hardware>\n'
     plugin = "      <plugin>mock_components/GenericSystem</plugin>\n    </hardware>\n"
     before, end, after = content.rpartition("</robot>")
