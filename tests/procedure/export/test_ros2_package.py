@@ -12,7 +12,7 @@ import yaml
 
 from calib.errors import CalibError, UsageError
 from calib.procedure.export.delivery import Export
-from calib.procedure.export.ros2_package import NAME, write_package
+from calib.procedure.export.ros2_package import PACKAGE_NAME, write_package
 from calib.robot import calibrated
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import random_joints
@@ -112,7 +112,7 @@ def test_impossible_package_name_is_refused(tmp_path, export, name):
 
 def test_names_are_those_of_rep_149():
     words = [a + b + c for a in "a_A1" for b in ("", "_", "b", "_b", "__", "9") for c in ("", "_", "c", "_9")]
-    assert [bool(NAME.fullmatch(each)) for each in words] == [
+    assert [bool(PACKAGE_NAME.fullmatch(each)) for each in words] == [
         bool(re.fullmatch(r"[a-z](_?[a-z0-9]+)*", each)) for each in words
     ]
 
