@@ -58,9 +58,12 @@ class Point(Generic[T]):
         Raises:
             UsageError: a table names an extension point that does not exist, or an offer cannot be loaded.
         """
-        return [_load(package, place) for package, table in _offers().items() for place in table.get(self.name, ())]
+        result = []
+        for package, table in _offers().items():
+            result += [_load(package, address) for address in table.get(self.name, ())]
+        return result
 
-    def one(self) -> T:
+    def first(self) -> T:
         """Return the first offer.
 
         Raises:
@@ -69,8 +72,7 @@ class Point(Generic[T]):
         """
         for offer in self.all():
             return offer
-        words = f"{self.name.replace('_', ' ')}: no package provides it; install the toolkit again"
-        raise UsageError(words)
+        raise UsageError(f"{self.name.replace('_', ' ')}: no package provides it; install the toolkit again")
 
 
 def merged(point: Point[Mapping[str, T]]) -> dict[str, T]:
@@ -91,29 +93,44 @@ def _offers() -> dict[str, dict[str, tuple[str, ...]]]:
         for point in table:
             if point not in POINTS:
                 raise UsageError(f"{name}: OFFERS: there is no extension point '{point}'{suggestion(point, POINTS)}")
-        tables[name] = {point: (places,) if isinstance(places, str) else places for point, places in table.items()}
+        tables[name] = {}
+        for point, addresses in table.items():
+            tables[name][point] = (addresses,) if isinstance(addresses, str) else addresses
     return tables
 
 
 def _packages() -> list[str]:
     """Return the full names of the packages directly below one of `HOSTS`, sorted by the last part of their names."""
-    found = []
+    names = set[str]()
     for host in HOSTS:
         try:
             folders = import_module(host).__path__
         except ModuleNotFoundError:
             continue
-        found += [f"{host}.{module.name}" for module in pkgutil.iter_modules(folders) if module.ispkg]
-    return sorted(set(found) - set(HOSTS), key=lambda name: name.rpartition(".")[2])
+        names.update(f"{host}.{module.name}" for module in pkgutil.iter_modules(folders) if module.ispkg)
+    return sorted(names - set(HOSTS), key=_last_part)
 
 
-def _load(package: str, place: str) -> Any:
-    module, _, name = place.rpartition(":")
+def _last_part(name: str) -> str:
+    return name.rpartition(".")[2]
+
+
+def _load(package: str, address: str) -> Any:
+    """Return an object of a package.
+
+    Args:
+        package: full name of the package.
+        address: ``module:name`` below it, ``:name`` or ``module:``.
+
+    Raises:
+        UsageError: it cannot be loaded.
+    """
+    module, _, name = address.rpartition(":")
     loaded = _import(f"{package}.{module}" if module else package)
     if not name:
         return loaded
     if not hasattr(loaded, name):
-        raise UsageError(f"{package}: OFFERS: {place}: there is no '{name}'{suggestion(name, dir(loaded))}")
+        raise UsageError(f"{package}: OFFERS: {address}: there is no '{name}'{suggestion(name, dir(loaded))}")
     return getattr(loaded, name)
 
 

@@ -169,7 +169,7 @@ def test_applications_can_be_removed(monkeypatch):
     monkeypatch.setattr(extensions, "_offers", dict)
     assert extensions.Point("commands", "").all() == []
     with pytest.raises(UsageError):
-        extensions.Point("optics", "").one()
+        extensions.Point("optics", "").first()
     code = "import sys; sys.modules['calib.apps'] = None; "
     code += "import calib; from calib.cli import run; "
     code += "from calib.data.poses.measurements import PoseMeasurements as Measured; import numpy as np; "

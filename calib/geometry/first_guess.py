@@ -332,7 +332,7 @@ def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflectio
     optics = NoOptics()
     if foreign:
         # registers guesses and residuals, too
-        optics = OPTICS.one()(foreign)
+        optics = OPTICS.first()(foreign)
     stations: dict[str, np.ndarray] = {}
     tools: dict[str, np.ndarray] = {}
     for block in sorted(measured, key=lambda block: (block.placing, -_turning(chain, block), -len(block))):

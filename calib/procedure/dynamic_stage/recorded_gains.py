@@ -192,7 +192,7 @@ def _identify(
     reference: int | None,
 ) -> DriveGains:
     if not isinstance(chain, Chain):
-        return ROBOTS.one().drive_gains(chain, cases, settings, known_values, reference)
+        return ROBOTS.first().drive_gains(chain, cases, settings, known_values, reference)
     model = make_model(chain, settings)
     base = find_base(model, cases, chain_states(chain, model, settings.seed))
     missing = [name for name in known_values if name not in [model.names[k] for k in base.kept]]

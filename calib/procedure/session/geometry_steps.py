@@ -162,7 +162,7 @@ def _write_pose_lists(session: Session, chain: Chain, q: np.ndarray) -> int:
     for name, joints in lists.items():
         path = write_poses(session.path(f"2-poses/{name}"), joints, chain.joint_names, joint_kinds(chain))
         if robot.controller:
-            WRITE_PROGRAM.one()(path, path.with_suffix(""), robot.controller, robot.external)
+            WRITE_PROGRAM.first()(path, path.with_suffix(""), robot.controller, robot.external)
     return len(lists.get(folder.UNSEEN, ()))
 
 
