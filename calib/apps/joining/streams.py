@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 
@@ -83,6 +83,26 @@ class Streamed(Joined):
     left: float
 
 
+class _Thinning(NamedTuple):
+    """Rows of a stream whose residuals are independent.
+
+    Attributes:
+        rows: (r,) rows of the stream.
+        sigma: robust standard deviation of the position residuals, per axis [m].
+        correlation_time: τ of the residuals before thinning [s].
+        factor: √(τ / time between rows).
+        neighbour_correlation: correlation of neighbouring residuals after thinning.
+        finding: what was done, for the user.
+    """
+
+    rows: np.ndarray
+    sigma: float
+    correlation_time: float
+    factor: float
+    neighbour_correlation: float
+    finding: Finding
+
+
 def join_streams(log_file: Path, file: Path, chain: Chain, options: FitOptions) -> Streamed:
     """Return the points of an instrument's stream with the joint values of a controller's log, thinned.
 
@@ -97,6 +117,63 @@ def join_streams(log_file: Path, file: Path, chain: Chain, options: FitOptions) 
     Raises:
         MeasurementError: the files are no streams, the arm moves too little, or the files are not of the same motion.
     """
+    run = _read_run(log_file, file, chain, options)
+    stream = run.stream
+
+    # clock and arm are first fitted to rows whose residuals are correlated
+    nominal, clock, rivals = begin(chain, run)
+    cell, clock, equations = fitted(nominal, run, run.known(clock, FITTED), clock)
+    step, wander = find_step(equations)
+    if step or wander > MAX_WANDER:
+        _refuse(step, wander, run, clock)
+    usable, errors, velocity, findings = _usable(cell, run, clock)
+    thinning = _thin(run, clock, usable, errors)
+    rows = thinning.rows
+    if len(rows) < MIN_ROWS:
+        notes = "; ".join([*run.lines(), *lines_of([thinning.finding])])
+        message = (
+            "too few rows are independent: did a clock jump, or did instrument or target move? Else measure for longer"
+        )
+        refuse_data(file, f"{message}, over more of the workspace ({notes})")
+
+    # then to independent ones
+    clock = _clock_by_rows(nominal, run, clock, thinning)
+    rms_speed = float(np.sqrt(np.mean(np.sum(velocity**2, axis=0))))
+    position_error = clock.sigma * rms_speed
+    if not position_error < thinning.sigma:
+        refuse_data(
+            file,
+            f"the offset of its clock is known to {1e3 * clock.sigma:.2g} ms only, in which the target moves by "
+            f"{1e3 * position_error:.2g} mm (noise {1e3 * thinning.sigma:.2g} mm): measure for longer, each way forth "
+            "and back",
+        )
+
+    if rivals:
+        findings.append(finding("stream-repeats", offsets=rivals))
+    if wander:
+        findings.append(finding("stream-wanders", away=wander))
+    findings.append(_clock_finding(clock, stream))
+    notes = (*run.lines(), *lines_of([*findings, thinning.finding]))
+    row_velocities = velocities(cell, run, rows, clock)[:3]
+    table = _table(chain, run.joints(clock, rows), stream, rows, row_velocities)
+    return Streamed(
+        table,
+        stream.rows[rows] - 1,
+        notes,
+        clock,
+        sigma=thinning.sigma,
+        correlation=thinning.correlation_time,
+        factor=thinning.factor,
+        left=thinning.neighbour_correlation,
+    )
+
+
+def _read_run(log_file: Path, file: Path, chain: Chain, options: FitOptions) -> Run:
+    """Return the recordings of a motion by controller and instrument; arguments as in `join_streams`.
+
+    Raises:
+        MeasurementError: the files are no streams, or the arm moves too little.
+    """
     clocks = clock_names(options.columns)
     log = read_stream(log_file, _joints(chain, options.for_file(log_file)), clocks)
     stream = _fresh(read_stream(file, _target(options.for_file(file)), clocks))
@@ -106,27 +183,29 @@ def join_streams(log_file: Path, file: Path, chain: Chain, options: FitOptions) 
     turns = stream.values[:, 3:] if stream.values.shape[1] > 3 else None
     no_joints = np.zeros((len(stream.t), chain.n))
     points = PoseMeasurements.of(no_joints, positions, turns, joint_names=chain.joint_names, file=str(file))
-    run = Run(log, stream, points)
+    return Run(log, stream, points)
 
-    # clock and arm are first fitted to rows whose residuals are correlated
-    nominal, clock, rivals = begin(chain, run)
-    cell, clock, equations = fitted(nominal, run, run.known(clock, FITTED), clock)
-    step, wander = find_step(equations)
-    if step or wander > MAX_WANDER:
-        _refuse(step, wander, run, clock)
-    usable, errors, velocity, findings = _usable(cell, run, clock)
+
+def _thin(run: Run, clock: Clock, usable: np.ndarray, errors: np.ndarray) -> _Thinning:
+    """Return rows of the stream that are far enough apart for their residuals to be independent.
+
+    Args:
+        run: the recordings of controller and instrument.
+        clock: the fitted clock.
+        usable: (m,) rows of the stream from which they are taken.
+        errors: (3 or 6, m) their residuals.
+    """
+    stream = run.stream
     tau = max(inflation(row) for row in errors)
     sigma = spread(errors[:3])
     min_interval = stream.step * (1.0 + 1.5 * (tau - 1.0))
     chosen, spacing = _thinned(stream.t[usable], run.joints(clock, usable), min_interval)
-    rows = usable[chosen]
-    correlations = [float(autocorrelation(row, 1)[0]) for row in errors[:, chosen]]
-    neighbour_correlation = max(correlations)
+    neighbour_correlation = max(float(autocorrelation(row, 1)[0]) for row in errors[:, chosen])
     correlation_time = tau * stream.step
     factor = float(np.sqrt(tau))
-    thinned = finding(
+    remark = finding(
         "stream-thinned",
-        taken=len(rows),
+        taken=len(chosen),
         of=len(usable),
         step=stream.step,
         **spacing,
@@ -135,59 +214,41 @@ def join_streams(log_file: Path, file: Path, chain: Chain, options: FitOptions) 
         factor=factor if factor > WORTH_SAYING else None,
         left=neighbour_correlation,
     )
-    if len(rows) < MIN_ROWS:
-        notes = "; ".join([*run.lines(), *lines_of([thinned])])
-        message = (
-            "too few rows are independent: did a clock jump, or did instrument or target move? Else measure for longer"
-        )
-        refuse_data(file, f"{message}, over more of the workspace ({notes})")
+    return _Thinning(usable[chosen], sigma, correlation_time, factor, neighbour_correlation, remark)
 
-    # then to independent ones; neighbours are alike in what changes slowly
-    few = rows[evenly(len(rows), FITTED)]
+
+def _clock_by_rows(nominal: Installation, run: Run, clock: Clock, thinning: _Thinning) -> Clock:
+    """Return the clock fitted to thinned rows, its σ widened by the correlation that is left between neighbours.
+
+    Neighbours are alike in what changes slowly.
+
+    Args:
+        nominal: the nominal arm with station and tool.
+        run: the recordings of controller and instrument.
+        clock: where the fit begins.
+        thinning: the rows.
+    """
+    few = thinning.rows[evenly(len(thinning.rows), FITTED)]
     _, clock, _ = fitted(nominal, run, few, clock, backlash=True)
-    correlation = max(neighbour_correlation, 0.0)
-    alike = float(np.sqrt((1.0 + correlation) / (1.0 - correlation)))
-    clock = replace(clock, sigma=alike * clock.sigma, drift_sigma=alike * clock.drift_sigma)
-    rms_speed = float(np.sqrt(np.mean(np.sum(velocity**2, axis=0))))
-    position_error = clock.sigma * rms_speed
-    if not position_error < sigma:
-        refuse_data(
-            file,
-            f"the offset of its clock is known to {1e3 * clock.sigma:.2g} ms only, in which the target moves by "
-            f"{1e3 * position_error:.2g} mm (noise {1e3 * sigma:.2g} mm): measure for longer, each way forth and back",
-        )
+    correlation = max(thinning.neighbour_correlation, 0.0)
+    widening = float(np.sqrt((1.0 + correlation) / (1.0 - correlation)))
+    return replace(clock, sigma=widening * clock.sigma, drift_sigma=widening * clock.drift_sigma)
 
-    if rivals:
-        findings.append(finding("stream-repeats", offsets=rivals))
-    if wander:
-        findings.append(finding("stream-wanders", away=wander))
+
+def _clock_finding(clock: Clock, stream: Stream) -> Finding:
+    """Return the finding that states an instrument's clock beside the controller's."""
     first_time = stream.t[:1]
     first = stream.t[0] - float(clock.controller(first_time)[0])
-    findings.append(
-        finding(
-            "stream-clock",
-            first=first,
-            offset=clock.offset,
-            sigma=clock.sigma,
-            drift=clock.drift,
-            drift_sigma=clock.drift_sigma,
-            middle=clock.middle,
-            ppm=1e6 * clock.drift,
-            ppm_sigma=1e6 * clock.drift_sigma,
-        )
-    )
-    notes = (*run.lines(), *lines_of([*findings, thinned]))
-    row_velocities = velocities(cell, run, rows, clock)[:3]
-    table = _table(chain, run.joints(clock, rows), stream, rows, row_velocities)
-    return Streamed(
-        table,
-        stream.rows[rows] - 1,
-        notes,
-        clock,
-        sigma=sigma,
-        correlation=correlation_time,
-        factor=factor,
-        left=neighbour_correlation,
+    return finding(
+        "stream-clock",
+        first=first,
+        offset=clock.offset,
+        sigma=clock.sigma,
+        drift=clock.drift,
+        drift_sigma=clock.drift_sigma,
+        middle=clock.middle,
+        ppm=1e6 * clock.drift,
+        ppm_sigma=1e6 * clock.drift_sigma,
     )
 
 
