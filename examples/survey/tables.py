@@ -144,10 +144,8 @@ def merit_table(summary: ConditionSummary) -> Iterator[str]:
     yield header_rule(2 + len(MERIT_COLUMNS))
     for method in summary.methods:
         failures = sum(method.failures.values())
-        cells = [method.method, str(method.trials), str(failures)]
-        for figure in MERIT_COLUMNS.values():
-            cells.append(number(method.figures[figure].median))
-        yield table_line(cells)
+        figures = [number(method.figures[figure].median) for figure in MERIT_COLUMNS.values()]
+        yield table_line([method.method, str(method.trials), str(failures), *figures])
 
 
 def coverage_table(summaries: Sequence[ConditionSummary], names: Sequence[str]) -> Iterator[str]:
@@ -171,9 +169,9 @@ def motion_table(random: Sequence[ConditionSummary], designed: Sequence[Conditio
     """Yield median torque and parameter errors [%] on random and on designed motions, for conditions that have both."""
     pairs = []
     for summary in designed:
-        for partner in random:
-            if summary.methods and _differ_by_motion(summary.condition, partner.condition):
-                pairs.append((partner, summary))
+        partners = [partner for partner in random if _differ_by_motion(summary.condition, partner.condition)]
+        if summary.methods and partners:
+            pairs.append((partners[0], summary))
     header = ["random → designed [%]"]
     for partner, _ in pairs:
         name = short_name(partner.condition)
@@ -231,10 +229,7 @@ def cost_table(rows: Iterable[TrialRow]) -> Iterator[str]:
 
 def _mean_time(rows: Iterable[TrialRow], robot: str, factor: int) -> float:
     """Return the mean processor time [s] of the rows of a robot and a decimation factor; NaN without a time."""
-    times = []
-    for row in rows:
-        if row.robot == robot and row.decimation == factor and not math.isnan(row.cpu):
-            times.append(row.cpu)
+    times = [row.cpu for row in rows if row.robot == robot and row.decimation == factor and not math.isnan(row.cpu)]
     if not times:
         return math.nan
     return sum(times) / len(times)
@@ -254,16 +249,15 @@ def recordings_table(folder: Path) -> Iterator[str]:
     yield table_line(["method", *robots])
     yield header_rule(len(robots))
     for method in METHODS:
-        cells = []
-        for by_method in robots.values():
-            cells.append(_recording_cell(by_method[method]) if method in by_method else "")
+        cells = [_recording_cell(by_method.get(method)) for by_method in robots.values()]
         if any(cells):
             yield table_line([method, *cells])
 
 
-def _recording_cell(row: dict[str, str]) -> str:
+def _recording_cell(row: dict[str, str] | None) -> str:
+    """Return the error on unseen motion [%] with its σ and seconds; empty for a method without a row."""
     # methods that simulate the closed loop do not run on these recordings
-    if "[loop]" in row["failure"]:
+    if row is None or "[loop]" in row["failure"]:
         return ""
     if row["failure"]:
         return "no estimate"
