@@ -15,7 +15,8 @@ once: with a wrong controller it grows although the parameters stay right, and o
 that answered the noise, which no prediction can. `torque_error` compares fairly: the torque of another motion,
 noise-free, against the truth. A dash: that estimate could not be simulated along that motion.
 
-    python examples/tx40/identification.py --out tx40-study [--quick] [--seed 0] [--tried NAME …] [--methods NAME …] [--readme]
+    python examples/tx40/identification.py --out tx40-study [--quick] [--seed 0] [--tried NAME …] [--methods NAME …]
+        [--readme]
 """
 
 from __future__ import annotations
