@@ -20,7 +20,7 @@ masses are not in the library, so its torque is not limited).
     python examples/lwr4plus/excitation_peers.py --out lwr4plus-peers [--seconds 30] [--quick] [--seed 0]
 
 Some quarter of an hour of processor time; what rows.json holds already is not run again. --quick: two seconds per
-peer, one seed, no other robots, of the peers exact gradients, differences and chance.
+peer, one seed, no other robots, of the peers exact gradients, differences and chance; two starts of the default search.
 """
 
 from __future__ import annotations
@@ -313,6 +313,7 @@ class Extent:
         peer_seeds: number of seeds of each peer.
         periods: durations of the default search's motions [s].
         default_seeds: number of its seeds.
+        default_starts: number of its starts.
         robots: other robots of the library.
     """
 
@@ -321,10 +322,11 @@ class Extent:
     peer_seeds: int = 2
     periods: tuple[float, ...] = (20.0, 10.0)
     default_seeds: int = 5
+    default_starts: int = DEFAULT_DESIGN.starts
     robots: tuple[str, ...] = ("panda", "tx40")
 
 
-QUICK = Extent(2.0, ("slsqp", "slsqp, differences", "random"), 1, (10.0,), 1, ())
+QUICK = Extent(2.0, ("slsqp", "slsqp, differences", "random"), 1, (10.0,), 1, 2, ())
 
 
 def verified_condition(robot: Robot, problem: ExcitationProblem, result: SearchResult) -> dict[str, float]:
@@ -371,17 +373,20 @@ def run_peer(robot: Robot, name: str, seconds: float, seed: int) -> Metrics:
     return {"curve": curve, "reached": reached}
 
 
-def run_default(robot: Robot, period: float, seed: int) -> Metrics:
-    """Return condition numbers and processor seconds of the default search."""
+def run_default(robot: Robot, period: float, seed: int, starts: int) -> Metrics:
+    """Return condition numbers and processor seconds of the default search.
+
+    Args:
+        robot: the robot.
+        period: duration of the motion [s].
+        seed: seed of the starts.
+        starts: number of starts.
+    """
     problem = excitation_problem(robot, period)
     curve: Curve = []
     start = time.process_time()
     result = design(
-        problem,
-        starts=DEFAULT_DESIGN.starts,
-        evaluations=DEFAULT_DESIGN.evaluations,
-        seed=seed,
-        map=partial(_timed_map, curve, start),
+        problem, starts=starts, evaluations=DEFAULT_DESIGN.evaluations, seed=seed, map=partial(_timed_map, curve, start)
     )
     result, _ = ensured(problem, result)
     elapsed = time.process_time() - start
@@ -424,7 +429,7 @@ def searches_of(extent: Extent, seed: int) -> dict[str, Callable[[], Metrics]]:
     searches: dict[str, Callable[[], Metrics]] = {}
     for k in range(seed, seed + extent.default_seeds):
         for period in extent.periods:
-            searches[f"default, {period:g} s, seed {k}"] = partial(run_default, robot, period, k)
+            searches[f"default, {period:g} s, seed {k}"] = partial(run_default, robot, period, k, extent.default_starts)
     for k in range(seed, seed + extent.peer_seeds):
         for name in extent.peers:
             searches[f"{name}, seed {k}"] = partial(run_peer, robot, name, extent.seconds, k)
@@ -444,7 +449,9 @@ def stored_metrics(path: Path, seconds: float) -> Metrics:
 
 def main() -> None:
     arguments = study_options.read(
-        __doc__, seconds=(30.0, "of processor time per peer"), quick="two seconds for each of three peers, one seed"
+        __doc__,
+        seconds=(30.0, "of processor time per peer"),
+        quick="two seconds for each of three peers, one seed, two starts",
     )
     extent = QUICK if arguments.quick else Extent(arguments.seconds)
     rows = arguments.out / "rows.json"

@@ -47,7 +47,9 @@ def fresh(out: Path, name: str, *options: str) -> dict:
 def test_readme_has_every_table_of_the_study() -> None:
     """Every table of the study stands in the README and holds what was run."""
     assert set(BOUNDS) <= set(README)
-    named = re.findall(r"^def ([a-z]\w*)\(metrics: Metrics", Path(study_tables.__file__).read_text(), flags=re.MULTILINE)
+    named = re.findall(
+        r"^def ([a-z]\w*)\(metrics: Metrics", Path(study_tables.__file__).read_text(), flags=re.MULTILINE
+    )
     assert set(named) == set(study_tables.SHOW)
     for text in README.values():
         assert len(text.splitlines()) >= 3
