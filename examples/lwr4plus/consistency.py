@@ -27,6 +27,7 @@ import numpy as np
 import study_options
 import study_tables
 
+import calib
 from calib import files
 from calib.data.signals.filtering import decimate
 from calib.dynamics.torque_rows import torque_rows
@@ -34,13 +35,13 @@ from calib.errors import TaskLost
 from calib.identification.identify import chain_states, common_decimator, find_base
 from calib.identification.uncertainty import geometry_uncertainty
 from calib.simulation import known_robots
-from calib.toolkit.chains import CalibratedChain, Chain, random_joints
+from calib.toolkit.chains import Chain, random_joints
 from calib.toolkit.installations import calibrated_chain, install
 from calib.toolkit.installations import fit_installation as fit
 from calib.toolkit.model_identification import Identification, identify
 from calib.toolkit.recordings import FilterOptions, Recording, make_motion
 from calib.toolkit.sessions import Payload
-from calib.toolkit.simulations import Cell, Reference, SimulatedInstrument, lwr4plus_cell, measure, random_fourier
+from calib.toolkit.simulations import Cell, Reference, lwr4plus_cell, measure, random_fourier
 from calib.toolkit.torque_models import Case, IdentificationSettings, make_case, make_model, standard_parameters
 from calib.workers import workers
 
@@ -80,8 +81,8 @@ class Setup:
     poses: int
 
     @property
-    def instrument(self) -> SimulatedInstrument:
-        return SimulatedInstrument(self.name, self.position, self.orientation)
+    def instrument(self) -> calib.SimulatedInstrument:
+        return calib.SimulatedInstrument(self.name, self.position, self.orientation)
 
 
 SETUPS = (
@@ -201,7 +202,7 @@ def cases_of(
     return cases
 
 
-def calibrate(world: World, seed: list[int]) -> CalibratedChain:
+def calibrate(world: World, seed: list[int]) -> calib.CalibratedChain:
     """Measure the poses and fit: the calibrated robot, with the covariance of its elements."""
     measured = measure(world.cell, world.poses, np.random.default_rng([*seed, 1]))
     installation = install(world.cell.nominal, [measured])
@@ -316,7 +317,7 @@ def geometries(kind: str, seed: int) -> dict[str, Any]:
         name = "CAD" if factor == 1 else f"CAD, {factor} times as far off"
         chains[name] = true.with_values(true.values + factor * (nominal.values - true.values))
     cases = cases_of(world.motion, world.clean, kind, world.noise, [seed, 3], ENCODER_NOISE)
-    identification = identify(CalibratedChain(true, nominal), cases, world.settings)
+    identification = identify(calib.CalibratedChain(true, nominal), cases, world.settings)
     validation = validation_cases(world, seed)
     metrics = {}
     for name, chain in chains.items():

@@ -22,6 +22,7 @@ import numpy as np
 import study_options
 import study_tables
 
+import calib
 from calib import files
 from calib.geometry.accuracy import errors
 from calib.geometry.fit import GeometricFit, Settings, fit_with_prior, parameter_values, polish_frames
@@ -38,7 +39,7 @@ from calib.toolkit.chains import Chain, random_joints
 from calib.toolkit.installations import Installation, install, prepare, see
 from calib.toolkit.installations import fit_installation as fit
 from calib.toolkit.pose_data import Positions
-from calib.toolkit.simulations import Cell, SimulatedInstrument, lwr4plus_cell, measure, rigid, true_poses
+from calib.toolkit.simulations import Cell, lwr4plus_cell, measure, rigid, true_poses
 from calib.transforms import invert
 
 # joint limits, symmetric [rad]
@@ -487,8 +488,8 @@ def base_leds(poses: np.ndarray, seed: int) -> dict[str, float]:
         poses: (17, 7) poses to fit.
         seed: seed of the noise.
     """
-    tool_only = lwr4plus_cell(SimulatedInstrument(base_frame=None), hidden=0.0)
-    with_base = lwr4plus_cell(SimulatedInstrument(base_frame=np.eye(4)), hidden=0.0)
+    tool_only = lwr4plus_cell(calib.SimulatedInstrument(base_frame=None), hidden=0.0)
+    with_base = lwr4plus_cell(calib.SimulatedInstrument(base_frame=np.eye(4)), hidden=0.0)
     # the frame in which positions are compared: the camera's, or the base's
     T_base_camera = invert(with_base.truth.stations[0])
     return {
