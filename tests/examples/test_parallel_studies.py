@@ -38,7 +38,7 @@ def test_dualv_is_identified_and_weighed(study, tmp_path, capsys):
         sigma = {name: one["sigma_percent"] for name, one in run["methods"].items()}
         assert all(sigma["idim"][name] < sigma["pim"][name] for name in (*study.LEGS, "ZZ4"))
         assert sigma["pim_equal_legs"]["ZZ11"] < min(sigma["pim"][name] for name in study.LEGS)
-        assert all(ours < theirs for ours, theirs in zip(run["cross_validation"]["idim"], study.CROSS))
+        assert all(ours < theirs for ours, theirs in zip(run["cross_validation"]["idim"], study.PAPER_ERRORS))
     _check_readme(study, metrics)
     assert all((tmp_path / name).exists() for name in ("forces.png", "torques.png", "overconstraint.png", "power.png"))
 
@@ -73,7 +73,7 @@ def test_stored_motions_are_those_of_the_search(study):
 
     The searches ended by themselves, and a short one comes near to them.
     """
-    short = study.designed(0, evaluations=study.MOST // 25)
+    short = study.design_motion(0, evaluations=study.MAX_EVALUATIONS // 25)
     problem = short.problem
     reached = []
     for seed in range(study.SEEDS):
@@ -82,7 +82,7 @@ def test_stored_motions_are_those_of_the_search(study):
         assert np.allclose(np.array(problem.family.coefficients(x)), motion.series.coefficients, rtol=0, atol=1e-9)
         assert verify_motion(problem.family, x, problem.constraints).feasible
         assert _worth(problem, x) == pytest.approx(motion.reached["merit"], abs=1e-6)
-        assert motion.reached["evaluations"] < study.MOST
+        assert motion.reached["evaluations"] < study.MAX_EVALUATIONS
         reached.append(motion.reached["merit"])
     assert _worth(problem, short.found.x) < max(reached) + NEAR
 
