@@ -40,10 +40,16 @@ from calib.toolkit.simulations import Plant, Reference, feed_forward, random_fou
 from calib.toolkit.statistics import LinearFit, settled_std, wls
 from calib.toolkit.torque_models import BOTH, MOTOR, Base, IdentificationModel, TorqueRows, observe
 
+# random motion for validation: shares of the joints' ranges [rad] and speeds [rad/s]; duration [s]; harmonics
 REACH = 0.8 * np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
 SPEED = 0.8 * np.deg2rad([110.0, 110.0, 128.0, 128.0, 204.0, 184.0, 184.0])
-PAPER_JOINT_6 = 0.5  # [N m], within which Fig. 8's joint 6 stays "along most of the validation trajectory"
-RATIO, POOR = 30.0, 10.0  # r_σ of the paper's rule; RSD [%] above which a parameter goes
+DURATION, HARMONICS = 25.0, 5
+# gravity of a base that is tilted [m/s²]
+TILTED_GRAVITY = 9.81 * np.array([0.3, 0.2, -np.sqrt(1 - 0.13)])
+# error of joint 6 within which Fig. 8 stays "along most of the validation trajectory" [N m]
+PAPER_JOINT_6 = 0.5
+# level of the F-test; r_σ of the paper's rule; RSD [%] above which a parameter goes
+LEVEL, RATIO, MAX_RSD = 0.01, 30.0, 10.0
 # Jubien, Gautier & Janot (2014), another unit, by way of kukaKDL's kukakdl_const.hpp; ZZ2R there holds Ia2. Its motor
 # inertias and friction are the truth here (by construction), so only the links' parameters are compared.
 PUBLISHED = {"XX2R": 1.31, "ZZ2R + Ia2": 4.46, "MY2R": 3.37, "XX4R": 0.368, "MY4R": -1.37, "MY5R": 0.049, "MY6R": 0.042}
@@ -53,35 +59,42 @@ def counts() -> dict[str, int]:
     """Return the numbers of base parameters of the models and their variants, on the CAD geometry."""
     chain = lwr4plus.nominal_chain()
     both = model(chain, BOTH)
-    tilted = model(chain, BOTH, 9.81 * np.array([0.3, 0.2, -np.sqrt(1 - 0.13)]))
-    whole = nominal_base(BOTH)
-    found = {f"Model {number}": nominal_base(kind).b for number, kind in MODELS.items()}
-    found |= {
+    tilted = model(chain, BOTH, TILTED_GRAVITY)
+    base = nominal_base(BOTH)
+    numbers = {f"Model {number}": nominal_base(kind).b for number, kind in MODELS.items()}
+    return numbers | {
         "one load case": bases.find(both, loads=[None]).b,
         "motor torque only": nominal_base(MOTOR).b,
         "tilted": bases.find(tilted).b,
         "standard": both.p,
-        "without effect": len(whole.without_effect),
-        "regrouped": len(whole.regrouped),
+        "without effect": len(base.without_effect),
+        "regrouped": len(base.regrouped),
     }
-    return found
 
 
 def trajectory_b() -> Reference:
     """Return one period of Trajectory B, 44 columns, as kept of `excitation.py`'s first seed."""
-    found = coefficients.read(Path(__file__).parent)
-    t = np.arange(round(found.period * RATE)) / RATE
-    return Reference(t, *found.orders(t))
+    series = coefficients.read(Path(__file__).parent)
+    t = np.arange(round(series.period * RATE)) / RATE
+    return Reference(t, *series.orders(t))
 
 
 def fourier(seed: list[int]) -> Reference:
     """Return a random motion that no model is fitted to."""
-    return random_fourier(-REACH, REACH, SPEED, 25.0, RATE, 5, seed=np.random.default_rng(seed))
+    return random_fourier(-REACH, REACH, SPEED, DURATION, RATE, HARMONICS, seed=np.random.default_rng(seed))
 
 
 @dataclass(frozen=True)
 class Fit:
-    """One model, identified on one geometry."""
+    """One model, identified on one geometry.
+
+    Attributes:
+        model: the model on that geometry.
+        base: its base parameters.
+        fit: estimate of all base parameters.
+        elimination: the essential parameters with their estimate.
+        rules: name of a rule of elimination to the number of parameters that it keeps.
+    """
 
     model: IdentificationModel
     base: Base
@@ -89,130 +102,164 @@ class Fit:
     elimination: Elimination
     rules: dict[str, int]
 
+    @property
+    def values(self) -> np.ndarray:
+        """All base parameters (b,): the essential estimate, and zero for the others."""
+        values = np.zeros(self.base.b)
+        values[self.elimination.kept] = self.elimination.essential.estimate.values
+        return values
+
 
 def identify(chain: Chain, kind: TorqueRows, data: Data) -> Fit:
-    """Estimate base and essential parameters: columns chosen on the CAD geometry, regrouped on the one given."""
-    own = model(chain, kind)
-    base = bases.regroup(nominal_base(kind), own)
-    rows = collected(own, base, data)
+    """Estimate base and essential parameters.
+
+    Args:
+        chain: the geometry to identify on; the base columns are chosen on the CAD geometry and regrouped on this one.
+        kind: rows of torque: motors, joint torque sensors, or both.
+        data: the recordings.
+    """
+    full = model(chain, kind)
+    base = bases.regroup(nominal_base(kind), full)
+    rows = collected(full, base, data)
     std = settled_std(rows)
-    tested = eliminate(rows, Rule.F, level=0.01, std=std)
-    first = tested.essential.estimate
-    poor = [name for name, rsd in zip(first.names, first.rsd) if rsd > POOR]
-    good = [name for name in first.names if name not in poor]
-    gone = [step.name for step in tested.steps]
-    supervised = eliminate(rows, Rule.F, level=0.01, keep=good, drop=[*gone, *poor], std=std)
+    tested = eliminate(rows, Rule.F, level=LEVEL, std=std)
+    # What the F-test keeps with a large RSD goes too.
+    estimate = tested.essential.estimate
+    poor = [name for name, rsd in zip(estimate.names, estimate.rsd) if rsd > MAX_RSD]
+    good = [name for name in estimate.names if name not in poor]
+    dropped = [step.name for step in tested.steps]
+    supervised = eliminate(rows, Rule.F, level=LEVEL, keep=good, drop=[*dropped, *poor], std=std)
+    by_ratio = eliminate(rows, Rule.RSD, ratio=RATIO, std=std)
     rules = {
-        f"RSD ratio < {RATIO:g}": len(eliminate(rows, Rule.RSD, ratio=RATIO, std=std).kept),
+        f"RSD ratio < {RATIO:g}": len(by_ratio.kept),
         "F": len(tested.kept),
-        f"F, RSD < {POOR:g} %": len(supervised.kept),
+        f"F, RSD < {MAX_RSD:g} %": len(supervised.kept),
     }
-    return Fit(own, base, wls(rows, std), supervised, rules)
+    return Fit(full, base, wls(rows, std), supervised, rules)
 
 
-def values_of(found: Fit) -> np.ndarray:
-    """Return all base parameters: the essential estimate, and zero for the others."""
-    values = np.zeros(found.base.b)
-    values[found.elimination.kept] = found.elimination.essential.estimate.values
-    return values
-
-
-def computed_torque(found: Fit, data: Data) -> dict[str, Any]:
+def computed_torque(fit: Fit, data: Data) -> dict[str, Any]:
     """Return errors of the torque below 2 Hz on other motion, rows of sensors and motors by joint [N m], [%]."""
-    result: dict[str, Any] = {}
-    for case in data.cases(found.model.torque_rows):
-        rows = observe(found.model, found.base.kept, case, case.motion.decimator)
-        error = rows.target - rows.matrix @ values_of(found)
-        n = found.model.bodies.n
-        raw = np.asarray(case.target)
-        above = raw[:: case.motion.decimator.factor][: len(error)]
+    n = fit.model.bodies.n
+    metrics: dict[str, Any] = {}
+    for case in data.cases(fit.model.torque_rows):
+        rows = observe(fit.model, fit.base.kept, case, case.motion.decimator)
+        error = rows.target - rows.matrix @ fit.values
+        # torques before the decimator's filter, at the samples of the rows
+        torque = np.asarray(case.target)[:: case.motion.decimator.factor][: len(error)]
         for name, part in (("sensor", slice(0, n)), ("motor", slice(n, 2 * n))):
-            result[f"{case.name} {name}"] = {
-                "rms": np.sqrt(np.mean(error[:, part] ** 2, axis=0)).tolist(),
+            relative = np.linalg.norm(error[:, part], axis=0) / np.linalg.norm(rows.target[:, part], axis=0)
+            metrics[f"{case.name} {name}"] = {
+                "rms": _rms(error[:, part]).tolist(),
                 "largest": np.abs(error[:, part]).max(axis=0).tolist(),
-                "relative_percent": (
-                    100.0 * np.linalg.norm(error[:, part], axis=0) / np.linalg.norm(rows.target[:, part], axis=0)
-                ).tolist(),
-                "rms_of_torque": np.sqrt(np.mean(above[:, part] ** 2, axis=0)).tolist(),
+                "relative_percent": (100.0 * relative).tolist(),
+                "rms_of_torque": _rms(torque[:, part]).tolist(),
             }
-    return result
+    return metrics
+
+
+def _rms(values: np.ndarray) -> np.ndarray:
+    """Return the root mean square of each column."""
+    return np.sqrt(np.mean(values**2, axis=0))
 
 
 def tracking(chain: Chain, fits: dict[str, Fit], reference: Reference) -> dict[str, list[float]]:
-    """Return rms tracking errors [mrad] of the true loaded arm without and with feed-forward by each estimate."""
-    whole = model(chain, MOTOR)
-    robot = Plant(whole.bodies, whole.terms, true_parameters(chain))
-    bare = replace(controller(robot, reference), ahead=None)
-    result = {"feedback alone": tracking_error(robot, bare, reference)}
-    for name, found in fits.items():
-        believed = Plant(found.model.bodies, whole.terms, found.base.to_standard(values_of(found)))
-        result[name] = tracking_error(robot, bare, reference, feed_forward(believed, reference))
-    return {name: (1e3 * error).tolist() for name, error in result.items()}
+    """Return rms tracking errors [mrad] of the true loaded arm without and with feed-forward by each estimate.
+
+    Args:
+        chain: geometry of the true arm.
+        fits: name of an estimate to the estimate.
+        reference: the motion to follow.
+    """
+    motor_model = model(chain, MOTOR)
+    robot = Plant(motor_model.bodies, motor_model.terms, true_parameters(chain))
+    feedback = replace(controller(robot, reference), ahead=None)
+    errors = {"feedback alone": tracking_error(robot, feedback, reference)}
+    for name, fit in fits.items():
+        believed = Plant(fit.model.bodies, motor_model.terms, fit.base.to_standard(fit.values))
+        errors[name] = tracking_error(robot, feedback, reference, feed_forward(believed, reference))
+    return {name: (1e3 * error).tolist() for name, error in errors.items()}
 
 
-def essential(found: Fit) -> dict[str, Any]:
+def essential(fit: Fit) -> dict[str, Any]:
     """Return the essential parameters with RSDs [%], next to those of Table 4."""
-    estimate = found.elimination.essential.estimate
+    estimate = fit.elimination.essential.estimate
     names = set(estimate.names)
+    paper = set(TABLE_4)
     return {
-        "count": len(names), "table_4": len(TABLE_4),
-        "both": sorted(names & set(TABLE_4)), "only_here": sorted(names - set(TABLE_4)),
-        "only_table_4": sorted(set(TABLE_4) - names),
-        "rsd_percent": {name: float(x) for name, x in zip(estimate.names, estimate.rsd)},
-        "eliminated": [step.name for step in found.elimination.steps],
-    }  # fmt: skip
+        "count": len(names),
+        "table_4": len(TABLE_4),
+        "both": sorted(names & paper),
+        "only_here": sorted(names - paper),
+        "only_table_4": sorted(paper - names),
+        "rsd_percent": dict(zip(estimate.names, estimate.rsd.tolist())),
+        "eliminated": [step.name for step in fit.elimination.steps],
+    }
 
 
-def errors_in_sigma(found: Fit, truth: np.ndarray) -> float:
-    """Return rms((x - truth) / σ) of all base parameters."""
-    estimate = found.fit.estimate
-    return float(np.sqrt(np.mean(((estimate.values - truth) / estimate.sigma) ** 2)))
+def errors_in_sigma(fit: Fit, truth: np.ndarray) -> float:
+    """Return rms((x - truth) / σ) of all base parameters (b,)."""
+    estimate = fit.fit.estimate
+    errors = (estimate.values - truth) / estimate.sigma
+    return float(np.sqrt(np.mean(errors**2)))
 
 
 def side_by_side(cad: Fit, calibrated: Fit) -> dict[str, float]:
     """Return 100 |x_CAD - x_ID| / |x_ID| [%] of the base parameters essential on both geometries (Fig. 7)."""
-    own = {name: k for k, name in enumerate(calibrated.elimination.essential.estimate.names)}
-    first = cad.elimination.essential.estimate
-    second = calibrated.elimination.essential.estimate.values
-    return {
-        name: float(100.0 * abs(x - second[own[name]]) / abs(second[own[name]]))
-        for name, x in zip(first.names, first.values)
-        if name in own
-    }
+    cad_estimate = cad.elimination.essential.estimate
+    estimate = calibrated.elimination.essential.estimate
+    calibrated_values = dict(zip(estimate.names, estimate.values))
+    differences = {}
+    for name, value in zip(cad_estimate.names, cad_estimate.values):
+        if name in calibrated_values:
+            reference = calibrated_values[name]
+            differences[name] = float(100.0 * abs(value - reference) / abs(reference))
+    return differences
 
 
-def published(found: Fit) -> dict[str, dict[str, float]]:
+def published(fit: Fit) -> dict[str, dict[str, float]]:
     """Return the simulated arm's estimates next to those published for another unit."""
-    values = dict(zip(found.base.names, found.fit.estimate.values))
+    values = dict(zip(fit.base.names, fit.fit.estimate.values))
     values["ZZ2R + Ia2"] = values["ZZ2R"] + values["Ia2"]
+    comparison = {}
+    for name, reference in PUBLISHED.items():
+        difference = 100.0 * abs(values[name] / reference - 1.0)
+        comparison[name] = {"here": float(values[name]), "published": reference, "apart_percent": float(difference)}
+    return comparison
+
+
+def model_metrics(fit: Fit) -> dict[str, Any]:
+    """Return the size of a model, its condition number and its true error."""
     return {
-        name: {"here": float(values[name]), "published": x, "apart_percent": float(100.0 * abs(values[name] / x - 1.0))}
-        for name, x in PUBLISHED.items()
+        "base": fit.base.b,
+        "essential": fit.rules,
+        "condition": fit.fit.condition_normalised,
+        "error_in_sigma": errors_in_sigma(fit, _truth(fit)),
     }
 
 
 def run(out: Path, seed: int = 0) -> dict[str, Any]:
     """Run the study; write and return the metrics."""
-    nominal, truth = lwr4plus.nominal_chain(), true_chain()
+    truth = true_chain()
     calibrated = geometry.fitted_arm(seed)
-    training, other = trajectory_b(), fourier([seed, 1001])
-    data, unseen = record(truth, training, [seed, 0]), record(truth, other, [seed, 1])
-    again = record(truth, training, [seed, 2])
-    metrics: dict[str, Any] = {"counts": counts(), "models": {}}
+    training = trajectory_b()
+    validation = fourier([seed, 1001])
+    data = record(truth, training, [seed, 0])
+    unseen = record(truth, validation, [seed, 1])
+    repetition = record(truth, training, [seed, 2])
+    models = {}
     for number, kind in MODELS.items():
-        found = identify(calibrated, kind, data)
-        metrics["models"][f"Model {number}"] = {
-            "base": found.base.b, "essential": found.rules,
-            "condition": found.fit.condition_normalised, "error_in_sigma": errors_in_sigma(found, _truth(found)),
-        }  # fmt: skip
-    fits = {name: identify(chain, BOTH, data)
-            for name, chain in (("cad", nominal), ("calibrated", calibrated))}  # fmt: skip
-    best = fits["calibrated"]
-    metrics |= {
+        models[f"Model {number}"] = model_metrics(identify(calibrated, kind, data))
+    best = identify(calibrated, BOTH, data)
+    fits = {"cad": identify(lwr4plus.nominal_chain(), BOTH, data), "calibrated": best}
+    torque_errors = {name: computed_torque(fit, unseen) for name, fit in fits.items()}
+    torque_errors["calibrated, B again"] = computed_torque(best, repetition)
+    metrics: dict[str, Any] = {
+        "counts": counts(),
+        "models": models,
         "essential": essential(best),
-        "computed_torque": {name: computed_torque(found, unseen) for name, found in fits.items()}
-        | {"calibrated, B again": computed_torque(best, again)},
-        "tracking_mrad": tracking(truth, fits, other),
+        "computed_torque": torque_errors,
+        "tracking_mrad": tracking(truth, fits, validation),
         "cad_against_calibrated_percent": side_by_side(fits["cad"], best),
         "published": published(best),
         "regrouping_left": float(best.base.lost.max(initial=0.0)),
@@ -225,18 +272,20 @@ def run(out: Path, seed: int = 0) -> dict[str, Any]:
     return metrics
 
 
-def _truth(found: Fit) -> np.ndarray:
-    """Return the true base parameters of a model."""
+def _truth(fit: Fit) -> np.ndarray:
+    """Return the true base parameters (b,) of a model."""
     chain = true_chain()
-    known = dict(zip(model(chain, BOTH).names, true_parameters(chain)))
-    return found.base.transform @ np.array([known[name] for name in found.model.names])
+    by_name = dict(zip(model(chain, BOTH).names, true_parameters(chain)))
+    standard = np.array([by_name[name] for name in fit.model.names])
+    return fit.base.transform @ standard
 
 
-def torques(found: Fit, data: Data) -> Figure:
+def torques(fit: Fit, data: Data) -> Figure:
     """Draw the loaded sensors' torques below 2 Hz on other motion, measured and computed (Fig. 8)."""
-    case = data.cases(BOTH)[1]
-    rows = observe(found.model, found.base.kept, case, case.motion.decimator)
-    computed, t = rows.matrix @ values_of(found), np.linspace(case.motion.t[0], case.motion.t[-1], len(rows.target))
+    _, loaded = data.cases(BOTH)
+    rows = observe(fit.model, fit.base.kept, loaded, loaded.motion.decimator)
+    computed = rows.matrix @ fit.values
+    t = np.linspace(loaded.motion.t[0], loaded.motion.t[-1], len(rows.target))
     with styled():
         figure, axes = sheet(4, 2, width=PAGE_WIDTH, height=6.4)
         for joint, axis in enumerate(axes[:7]):
@@ -255,8 +304,9 @@ def torques(found: Fit, data: Data) -> Figure:
 
 
 def main() -> None:
-    options = study_options.read(__doc__)
-    study_tables.show(study_tables.dynamics(run(options.out, options.seed)))
+    arguments = study_options.read(__doc__)
+    metrics = run(arguments.out, arguments.seed)
+    study_tables.show(study_tables.dynamics(metrics))
 
 
 if __name__ == "__main__":

@@ -39,16 +39,15 @@ import study_tables
 from excitation_moves import moves, waypoint_spline
 from simulated_arm import PAYLOAD, TABLE_4, Data, collected, model, nominal_base, record, true_chain, true_parameters
 
+import calib
 from calib import files
-from calib.api.motions import ExcitationDesign
 from calib.dynamics import base as bases
-from calib.estimation.triangles import combine
+from calib.estimation.triangles import Triangles, combine
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.design import Designed, search_motion
 from calib.procedure.excitation.excited_model import excited_model
 from calib.procedure.excitation.inputs import ExcitationInputs, IdentifiableColumns
 from calib.procedure.excitation.limits import read_motion_limits
-from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.report.figures.sheets import save
 from calib.robot.tables import dumps
 from calib.simulation import lwr4plus
@@ -61,23 +60,47 @@ from calib.toolkit.torque_models import BOTH, MOTOR, Base, IdentificationModel, 
 from calib.trajectories.design.objectives import condition_numbers
 from calib.workers.threads import one_blas_thread
 
-PERIODS = (10.0, 15.0, 20.0, 25.0, 30.0)  # the paper's T0, section 4.3 [s]
-PERIOD, SECONDS, RATE = 25.0, 50.0, 1000.0  # of a trajectory and of a log [s]; of the controller [Hz]
-STARTS, EVALUATIONS = 6, 250  # of a design
-FRONT = 6  # motions on the Pareto front of B
-SPEEDS = (0.3, 0.45, 0.6, 0.9)  # of the plain moves, shares of the limits
-NOISE = np.repeat([0.003, 0.015], 7)  # of the limits, on joint and motor torques: D's weights (the truth's)
-RUNS = ((PAYLOAD,), ())  # of the same motion: loaded, then empty
-GOALS = {"A": ("raw=2",), "B": ("raw=35", "joint6=0.1", "joint7=0.1"), "D": ("logdet",)}  # A: as small as can be
+# the paper's T0, section 4.3 [s]
+PERIODS = (10.0, 15.0, 20.0, 25.0, 30.0)
+# duration of a trajectory and of a log [s]; rate of the controller [Hz]
+PERIOD, SECONDS, RATE = 25.0, 50.0, 1000.0
+# speed over which the Coulomb sign is smoothed, where motions are judged [rad/s]
+SHARP_SPEED = 0.01
+# of a design
+STARTS, EVALUATIONS = 6, 250
+# motions on the Pareto front of B
+FRONT = 6
+# of the plain moves, shares of the limits
+SPEEDS = (0.3, 0.45, 0.6, 0.9)
+# shares of the limits, on joint and motor torques: D's weights (the truth's)
+NOISE = np.repeat([0.003, 0.015], 7)
+# load cases of the same motion: loaded, then empty
+RUNS = ((PAYLOAD,), ())
+# A: as small as can be
+GOALS = {"A": ("raw=2",), "B": ("raw=35", "joint6=0.1", "joint7=0.1"), "D": ("logdet",)}
 LIMITS = {
-    "without": ["joint-margin", "self-collision", "floor"], "target": {"axis_distance": 0.3, "height": -0.2},
+    "without": ["joint-margin", "self-collision", "floor"],
+    "target": {"axis_distance": 0.3, "height": -0.2},
     "torque": {"margin": 0.0},
-}  # fmt: skip
+}
+# motion that the others are compared with
+REFERENCE = "B, 44 columns"
+SPLINE = "spline, 20 waypoints"
+# motions whose paths are drawn
+DRAWN = ("A, 102 columns", "B, 102 columns", "A, 44 columns", REFERENCE, "D, 44 columns", SPLINE)
+FITS = ("102 fitted", "44 fitted")
+FIGURES = ("median_rsd", "median_rsd_wrist", "error_in_sigma", "median_error")
+Metrics = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """The arm as it is known: its geometry, and the standard parameters (136,) of `model`."""
+    """The arm as it is known.
+
+    Attributes:
+        chain: its geometry.
+        values: (136,) standard parameters of `model`.
+    """
 
     chain: Chain
     values: np.ndarray
@@ -85,22 +108,33 @@ class Arm:
     @cached_property
     def observed(self) -> tuple[IdentificationModel, Base]:
         """Model 2, sharp, and its base columns: chosen on the CAD geometry, regrouped on this one."""
-        own = model(self.chain, BOTH, v0=0.01)
-        return own, bases.regroup(nominal_base(BOTH), own)
+        full = model(self.chain, BOTH, v0=SHARP_SPEED)
+        return full, bases.regroup(nominal_base(BOTH), full)
+
+    @property
+    def base_values(self) -> np.ndarray:
+        """Base parameters (102,)."""
+        _, base = self.observed
+        return base.transform @ self.values
 
     @cached_property
     def without_payload(self) -> np.ndarray:
-        payload = slice(10 * self.chain.n, 10 * (self.chain.n + 1))
-        return np.concatenate([self.values[: payload.start], np.zeros(10), self.values[payload.stop :]])
+        """Standard parameters (136,) of the empty arm."""
+        values = np.array(self.values)
+        values[10 * self.chain.n : 10 * (self.chain.n + 1)] = 0.0
+        return values
 
     @cached_property
     def effort(self) -> np.ndarray:
+        """Torque limits (n,) [N m]."""
         return np.array([joint.effort for joint in self.chain.joints])
 
     def torque(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the larger of the motor torques' moduli with and without the payload (N, n)."""
-        Y = model(self.chain, MOTOR, v0=0.01).regressor(q, v, a)
-        return np.abs(np.stack([Y @ self.values, Y @ self.without_payload])).max(axis=0)
+        regressor = model(self.chain, MOTOR, v0=SHARP_SPEED).regressor(q, v, a)
+        loaded = np.abs(regressor @ self.values)
+        empty = np.abs(regressor @ self.without_payload)
+        return np.maximum(loaded, empty)
 
 
 @cache
@@ -109,31 +143,42 @@ def truth() -> Arm:
     return Arm(chain, true_parameters(chain))
 
 
-def estimate(seed: int) -> Arm:
+def estimated_arm(seed: int) -> Arm:
     """Return what is known before the design: fitted geometry, Model 2 from a slow log of plain moves.
 
     The moves are planned with the CAD bodies alone.
     """
     nominal = lwr4plus.nominal_chain()
     measured = measure(lwr4plus_cell(), random_joints(nominal, 60, [seed, 1]), [seed, 2])
-    chain = calibrated_chain(fit(install(nominal, [measured]), [measured])).chain
-    bodies = np.arange(17 * (nominal.n + 1)) < 10 * (nominal.n + 1)
-    slow = moves(nominal, Arm(nominal, true_parameters(nominal) * bodies).torque, SPEEDS[0], seed, RATE, SECONDS)
-    own, base = Arm(chain, np.zeros(0)).observed
-    rows = collected(own, base, record(truth().chain, slow, [seed, 3]))
-    return Arm(chain, base.to_standard(wls(rows, settled_std(rows)).estimate.values))
+    result = fit(install(nominal, [measured]), [measured])
+    chain = calibrated_chain(result).chain
+    bodies = 10 * (nominal.n + 1)
+    cad_values = true_parameters(nominal)
+    cad_values[bodies:] = 0.0
+    slow = moves(nominal, Arm(nominal, cad_values).torque, SPEEDS[0], seed, RATE, SECONDS)
+    full, base = Arm(chain, np.zeros(0)).observed
+    rows = collected(full, base, record(truth().chain, slow, [seed, 3]))
+    estimate = wls(rows, settled_std(rows)).estimate
+    return Arm(chain, base.to_standard(estimate.values))
 
 
 def table_4(base: Base) -> np.ndarray:
-    """Return the positions of the 44 essential parameters among the base columns."""
+    """Return the positions (44,) of the essential parameters among the base columns."""
     return np.array([base.names.index(name) for name in TABLE_4])
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A trajectory to design: A, B or D, by the condition of 102 or 44 columns, by which knowledge.
+    """A trajectory to design.
 
-    With `front` motions to choose from, between that condition and joint 6's torque.
+    Attributes:
+        which: A, B or D.
+        columns: number of columns of the condition number, 102 or 44.
+        knowledge: by which arm, ``estimate``, ``truth`` or ``cad``.
+        harmonics: of the Fourier series.
+        seed: seed of the starts.
+        period: duration [s].
+        front: number of motions to choose from, between that condition and joint 6's torque.
     """
 
     which: str
@@ -146,193 +191,336 @@ class Plan:
 
     @property
     def name(self) -> str:
-        base = f"{self.which}, {self.columns} columns"
-        longer = "" if self.period == PERIOD else f", T0 = {self.period:g} s"
-        return base + longer + {"truth": ", known truth", "cad": ", CAD geometry"}.get(self.knowledge, "")
+        name = f"{self.which}, {self.columns} columns"
+        if self.period != PERIOD:
+            name += f", T0 = {self.period:g} s"
+        if self.knowledge == "truth":
+            name += ", known truth"
+        if self.knowledge == "cad":
+            name += ", CAD geometry"
+        return name
 
 
-def designed(plan: Plan, arm: Arm, starts: int, evaluations: int) -> tuple[Reference, list[dict[str, Any]]]:
-    """Return one period of a designed trajectory, verified between its samples, and what its front is worth."""
-    whole, base = arm.observed
-    excited = excited_model(whole, RUNS, arm.values, friction=True, nominal=lwr4plus.nominal_chain())
+def design(plan: Plan, arm: Arm, starts: int, evaluations: int) -> tuple[Reference, list[Metrics]]:
+    """Return one period of a designed trajectory, verified between its samples, and what its front is worth.
+
+    Args:
+        plan: the trajectory.
+        arm: the arm as it is known.
+        starts: number of starts.
+        evaluations: evaluations of each start.
+    """
+    full, base = arm.observed
+    excited = excited_model(full, RUNS, arm.values, friction=True, nominal=lwr4plus.nominal_chain())
     columns = table_4(base) if plan.columns == len(TABLE_4) else np.arange(base.b)
-    sigmas = np.tile(NOISE * np.tile(arm.effort, 2), len(RUNS)) if plan.which == "D" else None
-    given = ExcitationInputs(
-        arm.chain, read_motion_limits(LIMITS, arm.chain), excited, {},
-        IdentifiableColumns(None, sigmas, base.names, chosen=columns), None,
-    )  # fmt: skip
-    settings = ExcitationSettings(
-        goals=GOALS[plan.which], period=plan.period, harmonics=plan.harmonics, rate=RATE, front=plan.front,
-        samples=80 + 8 * plan.harmonics, starts=starts, evaluations=evaluations, seed=plan.seed, outlook=False,
-    )  # fmt: skip
-    found = search_motion(given, settings)
-    return _period(found), [] if found.front is None else [
-        {"cond": motion["cond"]["44"]["raw"], "share": motion["torque_share"][5],
-         "best": bool(found.front.best[k]), "designed": k == found.front.designed}
-        for k, motion in enumerate(exact(_period(replace(found, found=run))) for run in found.front.found)
-    ]  # fmt: skip
+    sigmas = None
+    if plan.which == "D":
+        # joint and motor torques, in each load case
+        sigmas = np.tile(NOISE * np.tile(arm.effort, 2), len(RUNS))
+    identifiable = IdentifiableColumns(None, sigmas, base.names, chosen=columns)
+    limits = read_motion_limits(LIMITS, arm.chain)
+    inputs = ExcitationInputs(arm.chain, limits, excited, {}, identifiable, None)
+    settings = calib.ExcitationSettings(
+        goals=GOALS[plan.which],
+        period=plan.period,
+        harmonics=plan.harmonics,
+        rate=RATE,
+        front=plan.front,
+        samples=80 + 8 * plan.harmonics,
+        starts=starts,
+        evaluations=evaluations,
+        seed=plan.seed,
+        outlook=False,
+    )
+    designed = search_motion(inputs, settings)
+    return _period(designed), front_metrics(designed)
 
 
-def _period(found: Designed) -> Reference:
+def front_metrics(designed: Designed) -> list[Metrics]:
+    """Return condition number and torque of joint 6 of each motion on a Pareto front; empty without a front."""
+    front = designed.front
+    if front is None:
+        return []
+    metrics = []
+    for k, result in enumerate(front.found):
+        merits = merits_of(_period(replace(designed, found=result)))
+        motion = {
+            "cond": merits["cond"]["44"]["raw"],
+            "share": merits["torque_share"][5],
+            "best": bool(front.best[k]),
+            "designed": k == front.designed,
+        }
+        metrics.append(motion)
+    return metrics
+
+
+def _period(designed: Designed) -> Reference:
     """Return one period at the controller's rate without its end: periods follow each other."""
-    return Reference(*(series[:-1] for series in ExcitationDesign(**vars(found)).sampled()))
+    sampled = calib.ExcitationDesign(**vars(designed)).sampled()
+    return Reference(*(series[:-1] for series in sampled))
 
 
-def keep(period: Reference, folder: Path) -> Path:
+def write_trajectory(period: Reference, folder: Path) -> Path:
     """Write one period of a Fourier series as ``trajectory.toml``, which `dynamics.py` plays."""
-    lines = np.fft.rfft(period.q, axis=0)[: Plan("B").harmonics + 1] / len(period.q)
-    own = tuple(np.concatenate([[c[0].real], -2.0 * c[1:].imag, 2.0 * c[1:].real]) for c in lines.T)
-    names, kinds = zip(*((joint.name, joint.kind) for joint in lwr4plus.nominal_chain().joints))
-    motion = coefficients.Periodic(names, kinds, len(period.q) / RATE, RATE, 1, "fourier", own)
+    count = len(period.q)
+    # a column per joint: constant, then sines and cosines of each harmonic
+    spectrum = np.fft.rfft(period.q, axis=0)[: Plan("B").harmonics + 1] / count
+    sines, cosines = -2.0 * spectrum[1:].imag, 2.0 * spectrum[1:].real
+    series = tuple(np.concatenate([spectrum[:1].real, sines, cosines]).T)
+    joints = lwr4plus.nominal_chain().joints
+    names = tuple(joint.name for joint in joints)
+    kinds = tuple(joint.kind for joint in joints)
+    motion = coefficients.Periodic(names, kinds, count / RATE, RATE, 1, "fourier", series)
     return files.write(folder / coefficients.NAME, dumps(coefficients.table(motion, "lwr4plus", ())))
 
 
 def repeated(period: Reference, seconds: float = SECONDS) -> Reference:
-    """Return as many whole periods of a motion as fit into a log."""
-    times = max(1, round(seconds / (len(period.t) / RATE)))
-    q, v, a = (np.tile(x, (times, 1)) for x in (period.q, period.v, period.a))
+    """Return as many whole periods of a motion as fit into a log [s]."""
+    count = max(1, round(seconds / (len(period.t) / RATE)))
+    q, v, a = (np.tile(series, (count, 1)) for series in (period.q, period.v, period.a))
     return Reference(np.arange(len(q)) / RATE, q, v, a)
 
 
-def exact(motion: Reference) -> dict[str, Any]:
+def merits_of(motion: Reference) -> Metrics:
     """Return what a motion is worth by the true arm, without noise: condition numbers, torque shares, peak."""
-    arm, part = truth(), slice(None, None, 50)
-    own, base = arm.observed
-    state = (motion.q[part], motion.v[part], motion.a[part])
-    runs = LoadCases(own, base, RUNS)
-    Y = runs.regressor(*state)
-    tau = np.abs(Y @ (base.transform @ arm.values))[:, runs.limited] / arm.effort
+    arm = truth()
+    full, base = arm.observed
+    part = slice(None, None, 50)
+    cases = LoadCases(full, base, RUNS)
+    regressor = cases.regressor(motion.q[part], motion.v[part], motion.a[part])
+    torque_share = np.abs(regressor @ arm.base_values)[:, cases.limited] / arm.effort
+    peak = (arm.torque(motion.q, motion.v, motion.a) / arm.effort).max()
     return {
-        "cond": {str(len(base.kept)): condition_numbers(Y), "44": condition_numbers(Y, columns=table_4(base))},
-        "torque_share": tau.mean(axis=(0, 1)).tolist(),
-        "peak": float((arm.torque(motion.q, motion.v, motion.a) / arm.effort).max()),
+        "cond": {str(base.b): condition_numbers(regressor), "44": condition_numbers(regressor, columns=table_4(base))},
+        "torque_share": torque_share.mean(axis=(0, 1)).tolist(),
+        "peak": float(peak),
     }
 
 
-def logged(motion: Reference, seed: list[int]) -> Data:
+def log_motion(motion: Reference, seed: list[int]) -> Data:
     """Return the logs of the true arm on a motion of 50 s, without and with payload."""
     return record(truth().chain, motion, seed)
 
 
-def fitted(arm: Arm, data: Data) -> dict[str, Any]:
-    """Filter, decimate and fit; what is said of the 44 with all 102 columns fitted, and fitted alone."""
-    own, base = arm.observed
-    true = (truth().observed[1].transform @ truth().values)[table_4(base)]
-    whole = collected(own, base, data)
-    result: dict[str, Any] = {"truth": true.tolist(), "rows": int(whole.rows[0])}
-    for name, rows in (("102 fitted", whole), ("44 fitted", whole.select(table_4(base)))):
-        std = settled_std(rows)
-        found, size = wls(rows, std).estimate, np.linalg.norm(combine(rows, std)[:, :-1], axis=0)
-        index = [found.names.index(one) for one in TABLE_4]
-        values, sigma, rsd = found.values[index], found.sigma[index], found.rsd[index]
-        wrist = [one.rstrip("R")[-1] in "67" for one in TABLE_4]
-        result[name] = {
-            "estimate": values.tolist(), "rsd": rsd.tolist(), "median_rsd": float(np.median(rsd)),
-            "median_rsd_wrist": float(np.median(rsd[wrist])),
-            "size": size[index].tolist(), "separation": (1.0 / (sigma * size[index])).tolist(),
-            "error_in_sigma": float(np.sqrt(np.mean(((values - true) / sigma) ** 2))),
-            "median_error": float(np.median(100.0 * np.abs(values / true - 1.0))),
-        }  # fmt: skip
-    return result
+def identify(arm: Arm, data: Data) -> Metrics:
+    """Filter, decimate and fit: the 44 essential parameters with all 102 columns fitted, and fitted alone.
+
+    Args:
+        arm: the arm as it is known, for its geometry.
+        data: the logs.
+    """
+    full, base = arm.observed
+    columns = table_4(base)
+    true = truth().base_values[columns]
+    rows = collected(full, base, data)
+    essential_rows = rows.select(columns)
+    return {
+        "truth": true.tolist(),
+        "rows": int(rows.rows[0]),
+        "102 fitted": fit_metrics(rows, true),
+        "44 fitted": fit_metrics(essential_rows, true),
+    }
+
+
+def fit_metrics(rows: Triangles, true: np.ndarray) -> Metrics:
+    """Return estimates of the 44 essential parameters, their RSDs [%] and their errors.
+
+    Args:
+        rows: the rows of all columns to fit.
+        true: (44,) true values.
+    """
+    std = settled_std(rows)
+    estimate = wls(rows, std).estimate
+    index = [estimate.names.index(name) for name in TABLE_4]
+    values, sigma, rsd = estimate.values[index], estimate.sigma[index], estimate.rsd[index]
+    # length of a whitened column; its part that no other column explains is 1 / σ
+    size = np.linalg.norm(combine(rows, std)[:, :-1], axis=0)[index]
+    separation = 1.0 / (sigma * size)
+    errors = (values - true) / sigma
+    wrist = [name.rstrip("R")[-1] in "67" for name in TABLE_4]
+    return {
+        "estimate": values.tolist(),
+        "rsd": rsd.tolist(),
+        "median_rsd": float(np.median(rsd)),
+        "median_rsd_wrist": float(np.median(rsd[wrist])),
+        "size": size.tolist(),
+        "separation": separation.tolist(),
+        "error_in_sigma": float(np.sqrt(np.mean(errors**2))),
+        "median_error": float(np.median(100.0 * np.abs(values / true - 1.0))),
+    }
 
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """One motion to make, log and identify from: a plan, the speed of plain moves, or the waypoints' spline (None)."""
+    """One motion to make, log and identify from.
 
-    what: Plan | float | None
+    Attributes:
+        motion: a plan, the speed of plain moves, or None for the waypoints' spline.
+        seed: seed of motion and noise.
+        arm: the arm as it is known.
+        starts: starts of a design.
+        evaluations: evaluations of each start.
+    """
+
+    motion: Plan | float | None
     seed: int
-    arm: Arm  # as it is known
+    arm: Arm
     starts: int
     evaluations: int
 
     @property
     def name(self) -> str:
-        if isinstance(self.what, Plan):
-            return self.what.name
-        return "spline, 20 waypoints" if self.what is None else f"moves at {self.what:g}"
+        if isinstance(self.motion, Plan):
+            return self.motion.name
+        if self.motion is None:
+            return SPLINE
+        return f"moves at {self.motion:g}"
+
+    def make(self) -> tuple[Reference, list[Metrics]]:
+        """Return the motion, and what its front is worth."""
+        arm = self.arm
+        if isinstance(self.motion, Plan):
+            return self._design(self.motion)
+        if self.motion is None:
+            spline, _ = waypoint_spline(arm.chain, arm.torque, self.seed, RATE, PERIOD)
+            return spline, []
+        return moves(arm.chain, arm.torque, self.motion, self.seed, RATE, SECONDS), []
+
+    def _design(self, plan: Plan) -> tuple[Reference, list[Metrics]]:
+        arm = self.arm
+        if plan.knowledge == "truth":
+            arm = truth()
+        if plan.knowledge == "cad":
+            arm = Arm(lwr4plus.nominal_chain(), arm.values)
+        evaluations = self.evaluations
+        if plan.which == "D":
+            evaluations *= 2
+        return design(plan, arm, self.starts, evaluations)
 
 
 @one_blas_thread()  # as the API does
-def done(task: Task) -> tuple[Reference, dict[str, Any]]:
+def run_task(task: Task) -> tuple[Reference, Metrics]:
     """Return the result of one task: motion, logs, identification and errors."""
-    arm, plan, front = task.arm, task.what, list[dict[str, Any]]()
-    if isinstance(plan, Plan):
-        effort = task.evaluations * (2 if plan.which == "D" else 1)
-        known = {"truth": truth(), "estimate": arm, "cad": Arm(lwr4plus.nominal_chain(), arm.values)}[plan.knowledge]
-        motion, front = designed(plan, known, task.starts, effort)
-    elif plan is None:
-        motion, _ = waypoint_spline(arm.chain, arm.torque, task.seed, RATE, PERIOD)
-    else:
-        motion = moves(arm.chain, arm.torque, plan, task.seed, RATE, SECONDS)
-    return motion, exact(motion) | fitted(arm, logged(repeated(motion), [task.seed, 4])) | {"front": front}
+    motion, front = task.make()
+    data = log_motion(repeated(motion), [task.seed, 4])
+    return motion, merits_of(motion) | identify(task.arm, data) | {"front": front}
+
+
+def quick_motions(seed: int) -> list[tuple[Plan | float | None, int]]:
+    """Return motions and seeds of the quick form: B of 44 columns without its front, two moves and the spline."""
+    return [(Plan("B", 44, seed=seed), seed), (0.45, seed), (0.9, seed), (None, seed)]
+
+
+def all_motions(seed: int, seeds: int) -> list[tuple[Plan | float | None, int]]:
+    """Return motions and seeds of the whole study.
+
+    Args:
+        seed: the first seed, with which D, other periods, the known truth and the CAD geometry are designed too.
+        seeds: number of seeds.
+    """
+    motions: list[tuple[Plan | float | None, int]] = []
+    for k in range(seed, seed + seeds):
+        for knowledge in ("estimate", "truth"):
+            if knowledge == "truth" and k > seed:
+                continue
+            for which, columns in (("A", 102), ("B", 102), ("A", 44), ("B", 44)):
+                plan = Plan(which, columns, knowledge, seed=k)
+                # one front, of the first design of B
+                if plan == Plan("B", 44, seed=seed):
+                    plan = replace(plan, front=FRONT)
+                motions.append((plan, k))
+        motions += [(speed, k) for speed in SPEEDS]
+        motions.append((None, k))
+    motions.append((Plan("D", 44, harmonics=12, seed=seed), seed))
+    motions += [(Plan("B", 44, period=period, seed=seed), seed) for period in PERIODS if period != PERIOD]
+    motions.append((Plan("B", 44, "cad", seed=seed), seed))
+    return motions
 
 
 def study(
     seed: int, seeds: int, starts: int, evaluations: int, workers: int, quick: bool
-) -> tuple[dict[str, Any], dict[str, Reference]]:
-    """Make and judge all motions; the metrics, and one of each kind of motion by the first seed."""
-    arm = estimate(seed)
-    assert arm.observed  # chosen once, and handed to every process
-    wanted: list[tuple[Plan | float | None, int]] = []
-    for k in range(seed, seed + seeds):
-        kinds = [("B", 44)] if quick else [("A", 102), ("B", 102), ("A", 44), ("B", 44)]
-        for knowledge in ("estimate",) if quick or k > seed else ("estimate", "truth"):
-            chosen = ("B", 44, "estimate", seed)
-            wanted += [
-                (Plan(*kind, knowledge, seed=k, front=FRONT * ((*kind, knowledge, k) == chosen)), k) for kind in kinds
-            ]
-        wanted += [(speed, k) for speed in ((0.45, 0.9) if quick else SPEEDS)] + [(None, k)]
-    if not quick:
-        wanted.append((Plan("D", 44, harmonics=12, seed=seed), seed))
-        wanted += [(Plan("B", 44, period=period, seed=seed), seed) for period in PERIODS if period != PERIOD]
-        wanted.append((Plan("B", 44, "cad", seed=seed), seed))
-    tasks = [Task(what, k, arm, starts, evaluations) for what, k in wanted]
-    motions, rows = dict[str, Reference](), dict[str, list[dict[str, Any]]]()
+) -> tuple[Metrics, dict[str, Reference]]:
+    """Make and judge all motions; the metrics, and one of each kind of motion by the first seed.
+
+    Args:
+        seed: the first seed.
+        seeds: number of seeds.
+        starts: starts of each design.
+        evaluations: evaluations of each start.
+        workers: number of processes.
+        quick: whether few motions are made.
+    """
+    arm = estimated_arm(seed)
+    # chosen once, and handed to every process
+    assert arm.observed
+    motions_and_seeds = quick_motions(seed) if quick else all_motions(seed, seeds)
+    tasks = [Task(motion, k, arm, starts, evaluations) for motion, k in motions_and_seeds]
+    motions: dict[str, Reference] = {}
+    rows: dict[str, list[Metrics]] = {}
     with ProcessPoolExecutor(workers) as pool:
-        for task, (motion, row) in zip(tasks, pool.map(done, tasks), strict=True):
+        for task, (motion, row) in zip(tasks, pool.map(run_task, tasks), strict=True):
             motions.setdefault(task.name, motion)
             rows.setdefault(task.name, []).append(row | {"seed": task.seed})
-            print(
-                f"{task.name}, seed {task.seed}: cond of 44 {row['cond']['44']['raw']:.1f}", file=sys.stderr, flush=True
-            )
-    base = arm.observed[1]
-    columns, now, true = table_4(base), base.transform @ arm.values, truth().observed[1].transform @ truth().values
-    off = 100.0 * np.abs(now[columns] / true[columns] - 1.0)
-    return {
-        "seed": seed, "seeds": seeds, "columns": len(base.kept), "period": PERIOD, "seconds": SECONDS,
-        "estimate_off_percent": {"median": float(np.median(off)), "largest": float(off.max())},
+            condition = row["cond"]["44"]["raw"]
+            print(f"{task.name}, seed {task.seed}: cond of 44 {condition:.1f}", file=sys.stderr, flush=True)
+    _, base = arm.observed
+    columns = table_4(base)
+    error = 100.0 * np.abs(arm.base_values[columns] / truth().base_values[columns] - 1.0)
+    metrics = {
+        "seed": seed,
+        "seeds": seeds,
+        "columns": base.b,
+        "period": PERIOD,
+        "seconds": SECONDS,
+        "estimate_off_percent": {"median": float(np.median(error)), "largest": float(error.max())},
         "motions": rows,
-        "compared": compared(rows),
+        "compared": {name: summary_of(runs, rows[REFERENCE]) for name, runs in rows.items()},
         "geometries": geometries(arm, motions, seed),
-    }, motions  # fmt: skip
+    }
+    return metrics, motions
 
 
-def compared(rows: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
-    """Return per motion medians over the seeds, and the RSDs' ratio to those of B, 44 columns."""
-    result = dict[str, Any]()
-    for name, runs in rows.items():
-        one: dict[str, Any] = {
-            "cond": {
-                key: {form: _spread([run["cond"][key][form] for run in runs]) for form in ("raw", "normalised")}
-                for key in runs[0]["cond"]
-            },
-            "share": np.median([run["torque_share"] for run in runs], axis=0).tolist(),
-            "peak": _spread([run["peak"] for run in runs]),
-        }
-        for key in ("102 fitted", "44 fitted"):
-            if key in runs[0]:
-                own, other = [run[key] for run in runs], [run[key] for run in rows["B, 44 columns"]]
-                level = np.median([one["median_rsd"] for one in other])
-                one[key] = {
-                    what: _spread([run[what] for run in own])
-                    for what in ("median_rsd", "median_rsd_wrist", "error_in_sigma", "median_error")
-                } | {"ratio": _spread([run["median_rsd"] / level for run in own])}
-                for what in ("size", "separation"):
-                    logs = [np.mean(np.log([run[what] for run in some])) for some in (own, other)]
-                    one[key][f"{what}_ratio"] = float(np.exp(logs[0] - logs[1]))
-        result[name] = one
-    return result
+def summary_of(runs: list[Metrics], reference: list[Metrics]) -> Metrics:
+    """Return medians of a motion over the seeds, and its RSDs' ratio to those of the reference.
+
+    Args:
+        runs: metrics of the motion by seed.
+        reference: metrics of B, 44 columns, by seed.
+    """
+    condition: dict[str, dict[str, list[float]]] = {}
+    for columns in runs[0]["cond"]:
+        condition[columns] = {}
+        for scaling in ("raw", "normalised"):
+            condition[columns][scaling] = _spread([run["cond"][columns][scaling] for run in runs])
+    summary: Metrics = {
+        "cond": condition,
+        "share": np.median([run["torque_share"] for run in runs], axis=0).tolist(),
+        "peak": _spread([run["peak"] for run in runs]),
+    }
+    for key in FITS:
+        summary[key] = fit_summary([run[key] for run in runs], [run[key] for run in reference])
+    return summary
+
+
+def fit_summary(fits: list[Metrics], reference: list[Metrics]) -> Metrics:
+    """Return medians of `fit_metrics` over the seeds, and ratios to those of the reference.
+
+    Args:
+        fits: metrics of a motion's fits by seed.
+        reference: metrics of the reference's fits by seed.
+    """
+    summary: Metrics = {figure: _spread([fit[figure] for fit in fits]) for figure in FIGURES}
+    reference_rsd = np.median([fit["median_rsd"] for fit in reference])
+    summary["ratio"] = _spread([fit["median_rsd"] / reference_rsd for fit in fits])
+    for figure in ("size", "separation"):
+        ratio = _geometric_mean(fits, figure) / _geometric_mean(reference, figure)
+        summary[f"{figure}_ratio"] = ratio
+    return summary
+
+
+def _geometric_mean(fits: list[Metrics], figure: str) -> float:
+    """Return the geometric mean of a figure over the 44 parameters and the seeds."""
+    return float(np.exp(np.mean(np.log([fit[figure] for fit in fits]))))
 
 
 def _spread(values: list[float]) -> list[float]:
@@ -340,44 +528,45 @@ def _spread(values: list[float]) -> list[float]:
     return [float(np.median(values)), float(min(values)), float(max(values))]
 
 
-def geometries(arm: Arm, motions: dict[str, Reference], seed: int) -> dict[str, Any]:
-    """Identify from random waypoints (RP) and from B (OT) on CAD and on fitted (ID) geometry: Figs 6 and 7."""
-    result = dict[str, Any]()
-    for motion, key in (("RP", "spline, 20 waypoints"), ("OT", "B, 44 columns")):
-        data = logged(repeated(motions[key]), [seed, 5])
-        for name, known in (("CAD", Arm(lwr4plus.nominal_chain(), arm.values)), ("ID", arm)):
-            found = fitted(known, data)
-            result[f"{name}, {motion}"] = found["102 fitted"] | {"truth": found["truth"]}
-    return result
+def geometries(arm: Arm, motions: dict[str, Reference], seed: int) -> Metrics:
+    """Identify from random waypoints (RP) and from B (OT) on CAD and on fitted (ID) geometry: Figs 6 and 7.
+
+    Args:
+        arm: the arm as it is known.
+        motions: name of a motion to the motion.
+        seed: seed of the noise.
+    """
+    cad = Arm(lwr4plus.nominal_chain(), arm.values)
+    metrics: Metrics = {}
+    for label, name in (("RP", SPLINE), ("OT", REFERENCE)):
+        data = log_motion(repeated(motions[name]), [seed, 5])
+        for geometry, known_arm in (("CAD", cad), ("ID", arm)):
+            result = identify(known_arm, data)
+            metrics[f"{geometry}, {label}"] = result["102 fitted"] | {"truth": result["truth"]}
+    return metrics
 
 
 def main() -> None:
-    given = study_options.read(
+    arguments = study_options.read(
         __doc__,
-        quick="B of 44 columns and a few baselines, one seed",
+        quick="B of 44 columns without its front, and a few baselines, one seed",
         seeds=(3, "of designs, waypoints and noise"),
         starts=(STARTS, "of each design"),
         evaluations=(EVALUATIONS, "of each start; twice as many for D"),
         workers=(2, "local processes"),
     )
-    seeds = 1 if given.quick else given.seeds
-    found, motions = study(given.seed, seeds, given.starts, given.evaluations, given.workers, given.quick)
-    files.write_json(given.out / "metrics.json", found)
-    shown = (
-        "A, 102 columns",
-        "B, 102 columns",
-        "A, 44 columns",
-        "B, 44 columns",
-        "D, 44 columns",
-        "spline, 20 waypoints",
-    )
-    drawn = {name: motions[name] for name in shown if name in motions}
-    save(figures.paths(truth().chain, drawn), given.out / "plot_paths.png")
-    save(figures.estimates(found["geometries"]), given.out / "plot_estimates.png")
-    save(figures.speeds(found["motions"], SPEEDS), given.out / "plot_speeds.png")
-    save(figures.front(found["motions"]), given.out / "plot_front.png")
-    keep(motions["B, 44 columns"], given.out)
-    study_tables.show(study_tables.excitation(found))
+    quick, out = arguments.quick, arguments.out
+    seeds = 1 if quick else arguments.seeds
+    metrics, motions = study(arguments.seed, seeds, arguments.starts, arguments.evaluations, arguments.workers, quick)
+    files.write_json(out / "metrics.json", metrics)
+    drawn = {name: motions[name] for name in DRAWN if name in motions}
+    save(figures.paths(truth().chain, drawn), out / "plot_paths.png")
+    save(figures.estimates(metrics["geometries"]), out / "plot_estimates.png")
+    save(figures.speeds(metrics["motions"], SPEEDS), out / "plot_speeds.png")
+    if not quick:
+        save(figures.front(metrics["motions"]), out / "plot_front.png")
+    write_trajectory(motions[REFERENCE], out)
+    study_tables.show(study_tables.excitation(metrics))
 
 
 if __name__ == "__main__":

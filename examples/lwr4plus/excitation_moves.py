@@ -10,17 +10,29 @@ from scipy.interpolate import CubicSpline
 from calib.toolkit.chains import Chain, forward
 from calib.toolkit.simulations import Reference
 
-SHARE = 0.9  # of the limits of position, velocity and torque
-INSIDE = np.linspace(0.0, 1.0, 60)
-ELBOW = np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 0.0, 0.0])  # well inside the workspace
+# of the limits of position, velocity and torque
+SHARE = 0.9
+# instants s of a move at which the workspace and the torque limits are checked
+CHECKED = np.linspace(0.0, 1.0, 60)
+# samples of a spline from one check of the workspace and the torque limits to the next
+CHECK_STEP = 20
+# posture well inside the workspace
+ELBOW = np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 0.0, 0.0])
+# least distance of the tool from axis 1, and least height [m]
+MIN_DISTANCE, MIN_HEIGHT = 0.3, -0.2
+# factor by which a motion is made slower or smaller until it keeps the limits, and the number of trials
+SLOWER, SMALLER, TRIALS = 1.02, 0.98, 200
 Torque = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
 def trapezoidal(s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return position, speed and acceleration over s = 0 … 1 of a trapezoidal profile in three equal parts."""
-    place = np.where(s < 1 / 3, 2.25 * s**2, np.where(s < 2 / 3, 1.5 * s - 0.25, 1 - 2.25 * (1 - s) ** 2))
-    bend = np.where(s < 1 / 3, 4.5, np.where(s < 2 / 3, 0.0, -4.5))
-    return place, np.minimum(1.5, np.minimum(4.5 * s, 4.5 * (1 - s))), bend
+    starting = s < 1 / 3
+    steady = ~starting & (s < 2 / 3)
+    position = np.select([starting, steady], [2.25 * s**2, 1.5 * s - 0.25], 1 - 2.25 * (1 - s) ** 2)
+    speed = np.minimum(1.5, np.minimum(4.5 * s, 4.5 * (1 - s)))
+    acceleration = np.select([starting, steady], [4.5, 0.0], -4.5)
+    return position, speed, acceleration
 
 
 def moves(chain: Chain, torque: Torque, speed: float, seed: int, rate: float, seconds: float) -> Reference:
@@ -31,22 +43,50 @@ def moves(chain: Chain, torque: Torque, speed: float, seed: int, rate: float, se
     holds fewer of them.
 
     Args:
-        torque: (q, v, a), each (N, n), to the torques' moduli (N, n).
-        rate, seconds: of the samples [Hz], and of the whole [s].
+        chain: the arm with its limits.
+        torque: (q, v, a), each (N, n), to the torques' moduli (N, n) [N m or N].
+        speed: share of the limits.
+        seed: seed of the waypoints.
+        rate: sampling rate [Hz].
+        seconds: duration of all moves together [s].
     """
     rng = np.random.default_rng(seed)
-    points, times = [_pose(chain, rng)], list[float]()
-    while sum(times) < seconds:
-        goal = _pose(chain, rng)
-        if _clear(chain, points[-1] + INSIDE[:, None] * (goal - points[-1])):
-            times.append(SHARE / speed * _fastest(chain, torque, points[-1], goal))
-            points.append(goal)
-    ends, q = np.concatenate([[0.0], np.cumsum(times)]), np.array(points)
+    waypoints = [_random_pose(chain, rng)]
+    durations: list[float] = []
+    while sum(durations) < seconds:
+        start = waypoints[-1]
+        goal = _random_pose(chain, rng)
+        if _in_workspace(chain, start + CHECKED[:, None] * (goal - start)):
+            durations.append(SHARE / speed * _shortest_duration(chain, torque, start, goal))
+            waypoints.append(goal)
+    q = np.array(waypoints)
+    ends = np.concatenate([[0.0], np.cumsum(durations)])
     t = np.arange(0.0, seconds, 1.0 / rate)
+    # move of each sample
     k = np.searchsorted(ends, t, side="right") - 1
-    width, step = np.array(times)[k][:, None], np.diff(q, axis=0)[k]
-    place, pace, bend = trapezoidal(((t - ends[k]) / width[:, 0])[:, None])
-    return Reference(t, q[k] + step * place, step * pace / width, step * bend / width**2)
+    duration = np.array(durations)[k][:, None]
+    step = np.diff(q, axis=0)[k]
+    s = (t - ends[k])[:, None] / duration
+    return _straight_move(t, q[k], step, s, duration)
+
+
+def _straight_move(
+    t: np.ndarray, start: np.ndarray, step: np.ndarray, s: np.ndarray, duration: np.ndarray | float
+) -> Reference:
+    """Return samples of straight moves in joint space.
+
+    Args:
+        t: (N,) times [s].
+        start: (N, n) or (n,) joint values at the start of the sample's move.
+        step: (N, n) or (n,) joint values at its end minus those at its start.
+        s: (N, 1) share of the move's duration.
+        duration: (N, 1) or one number [s].
+    """
+    position, speed, acceleration = trapezoidal(s)
+    q = start + step * position
+    v = step * speed / duration
+    a = step * acceleration / duration**2
+    return Reference(t, q, v, a)
 
 
 def waypoint_spline(
@@ -56,45 +96,70 @@ def waypoint_spline(
 
     The waypoints are drawn about an elbow posture and drawn towards it until 0.9 of the limits and the workspace hold.
 
+    Args:
+        chain: the arm with its limits.
+        torque: (q, v, a), each (N, n), to the torques' moduli (N, n) [N m or N].
+        seed: seed of the waypoints.
+        rate: sampling rate [Hz].
+        period: duration [s].
+        count: number of waypoints.
+
     Returns:
         The motion, and the share of the joints' ranges that its waypoints are spread over.
     """
     rng = np.random.default_rng(seed)
-    spread = SHARE * rng.uniform(chain.lower - ELBOW, chain.upper - ELBOW, (count, chain.n))
-    knots, t = np.linspace(0.0, period, count + 1), np.arange(0.0, period, 1.0 / rate)
-    velocity, effort = _limits(chain)
-    for share in 0.98 ** np.arange(200):
-        curve = CubicSpline(knots, ELBOW + share * np.vstack([spread, spread[:1]]), bc_type="clamped")
-        q, v, a = (curve(t, order) for order in range(3))
-        few = slice(None, None, 20)
-        inside = ((q >= SHARE * chain.lower) & (q <= SHARE * chain.upper)).all() and (np.abs(v) <= velocity).all()
-        if inside and _clear(chain, q[few]) and (torque(q[few], v[few], a[few]) <= effort).all():
-            return Reference(t, q, v, a), float(share)
+    deviations = SHARE * rng.uniform(chain.lower - ELBOW, chain.upper - ELBOW, (count, chain.n))
+    closed = np.vstack([deviations, deviations[:1]])
+    knots = np.linspace(0.0, period, count + 1)
+    t = np.arange(0.0, period, 1.0 / rate)
+    for share in SMALLER ** np.arange(TRIALS):
+        curve = CubicSpline(knots, ELBOW + share * closed, bc_type="clamped")
+        motion = Reference(t, curve(t), curve(t, 1), curve(t, 2))
+        if _keeps_limits(chain, torque, motion):
+            return motion, float(share)
     raise RuntimeError("no spline about the elbow posture keeps the limits")
 
 
+def _keeps_limits(chain: Chain, torque: Torque, motion: Reference) -> bool:
+    """Return whether a motion keeps `SHARE` of the limits of position, velocity and torque, and the workspace."""
+    velocity, effort = _limits(chain)
+    if (motion.q < SHARE * chain.lower).any() or (motion.q > SHARE * chain.upper).any():
+        return False
+    if (np.abs(motion.v) > velocity).any():
+        return False
+    part = slice(None, None, CHECK_STEP)
+    if not _in_workspace(chain, motion.q[part]):
+        return False
+    return bool((torque(motion.q[part], motion.v[part], motion.a[part]) <= effort).all())
+
+
 def _limits(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
-    return tuple(SHARE * np.array([getattr(joint, key) for joint in chain.joints]) for key in ("velocity", "effort"))  # type: ignore[return-value]
+    """Return `SHARE` of the velocity limits (n,) and of the torque limits (n,)."""
+    velocity = np.array([joint.velocity for joint in chain.joints])
+    effort = np.array([joint.effort for joint in chain.joints])
+    return SHARE * velocity, SHARE * effort
 
 
-def _pose(chain: Chain, rng: np.random.Generator) -> np.ndarray:
+def _random_pose(chain: Chain, rng: np.random.Generator) -> np.ndarray:
     while True:
         q = rng.uniform(SHARE * chain.lower, SHARE * chain.upper)
-        if _clear(chain, q[None]):
+        if _in_workspace(chain, q[None]):
             return q
 
 
-def _clear(chain: Chain, q: np.ndarray) -> bool:
-    """Return whether the tool stays 0.3 m from axis 1 and above -0.2 m."""
-    place = forward(chain, q)[:, :3, 3]
-    return bool((np.hypot(place[:, 0], place[:, 1]) >= 0.3).all() and (place[:, 2] >= -0.2).all())
+def _in_workspace(chain: Chain, q: np.ndarray) -> bool:
+    """Return whether the tool stays away from axis 1 and above its least height at all poses (m, n)."""
+    x, y, z = forward(chain, q)[:, :3, 3].T
+    return bool((np.hypot(x, y) >= MIN_DISTANCE).all() and (z >= MIN_HEIGHT).all())
 
 
-def _fastest(chain: Chain, torque: Torque, start: np.ndarray, goal: np.ndarray) -> float:
+def _shortest_duration(chain: Chain, torque: Torque, start: np.ndarray, goal: np.ndarray) -> float:
     """Return the shortest duration [s] of a move, to 2 %."""
     velocity, effort = _limits(chain)
-    place, pace, bend = trapezoidal(INSIDE[:, None])
-    step, width = goal - start, float((1.5 * np.abs(goal - start) / velocity).max())
-    while (torque(start + step * place, step * pace / width, step * bend / width**2) > effort).any():
-        width *= 1.02
-    return width
+    step = goal - start
+    duration = float((1.5 * np.abs(step) / velocity).max())
+    while True:
+        move = _straight_move(CHECKED * duration, start, step, CHECKED[:, None], duration)
+        if (torque(move.q, move.v, move.a) <= effort).all():
+            return duration
+        duration *= SLOWER

@@ -25,7 +25,10 @@ from calib import files
 from calib.procedure.excitation import coefficients
 
 HERE = Path(__file__).parent
-PARTS: dict[str, tuple[list[str], list[str]]] = {  # options of the whole part, and of the quick one
+ROOT = HERE.parents[1]
+FIGURES = HERE / "figures"
+# part: options of the whole part, and of the quick one
+PARTS: dict[str, tuple[list[str], list[str]]] = {
     "geometry": ([], ["--quick"]),
     "dynamics": ([], []),
     "consistency": (["--runs", "40"], ["--runs", "0"]),
@@ -33,21 +36,25 @@ PARTS: dict[str, tuple[list[str], list[str]]] = {  # options of the whole part, 
     "planning": ([], ["--paths", "3"]),
     "excitation_peers": ([], ["--quick"]),
 }
-FIGURES = HERE / "figures"
-METRICS, ROWS, MARK = "metrics.json", "rows.json", "code.txt"  # of a part: whole, as it goes on, what made it
+# files of a part: its metrics, its results as it goes on, and the mark of the code that made them
+METRICS, ROWS, MARK = "metrics.json", "rows.json", "code.txt"
+# scripts that do not change a part's metrics
+PRESENTATION = ("study.py", "study_tables.py")
 
 
 def code_of(name: str, quick: bool) -> str:
     """Return a mark of all that a part's metrics come from: the toolkit, the scripts here, and its options."""
-    digest, root = hashlib.sha256(" ".join([name, *PARTS[name][quick]]).encode()), HERE.parents[1]
-    tools = [path for room in ("calib", "poses", "trajectories") for path in (root / room).rglob("*.py")]
-    scripts = [path for path in HERE.glob("*.py") if path.name not in ("study.py", "study_tables.py")]
-    for path in sorted([*tools, *scripts]):
+    sources = [path for path in HERE.glob("*.py") if path.name not in PRESENTATION]
+    for package in ("calib", "poses", "trajectories"):
+        sources += (ROOT / package).rglob("*.py")
+    options = " ".join([name, *PARTS[name][quick]])
+    digest = hashlib.sha256(options.encode())
+    for path in sorted(sources):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
 
-def is_made(name: str, out: Path, quick: bool) -> bool:
+def is_finished(name: str, out: Path, quick: bool) -> bool:
     """Return whether a part was run to its end by this code."""
     mark = out / MARK
     return (out / METRICS).exists() and mark.exists() and mark.read_text() == code_of(name, quick)
@@ -55,20 +62,43 @@ def is_made(name: str, out: Path, quick: bool) -> bool:
 
 def run(name: str, out: Path, quick: bool) -> None:
     """Run one part of the study; results of older code are removed."""
-    started, code, mark = time.perf_counter(), code_of(name, quick), out / MARK
+    start = time.perf_counter()
+    code = code_of(name, quick)
+    mark = out / MARK
     if not mark.exists() or mark.read_text() != code:
-        for left in (METRICS, ROWS):
-            (out / left).unlink(missing_ok=True)
+        (out / METRICS).unlink(missing_ok=True)
+        (out / ROWS).unlink(missing_ok=True)
         files.write(mark, code)
     command = [sys.executable, str(HERE / f"{name}.py"), "--out", str(out), *PARTS[name][quick]]
     print(f"\n== {name}: {' '.join(command[1:])}", file=sys.stderr, flush=True)
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-    print(f"== {name}: {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)
+    print(f"== {name}: {time.perf_counter() - start:.0f} s", file=sys.stderr, flush=True)
 
 
 def tables_of(name: str, out: Path) -> study_tables.Tables:
     """Return the tables of a finished part."""
-    return study_tables.SHOW[name](json.loads((out / METRICS).read_text(encoding="utf-8")))
+    metrics = json.loads((out / METRICS).read_text(encoding="utf-8"))
+    return study_tables.SHOW[name](metrics)
+
+
+def write_tables(tables: study_tables.Tables, out: Path, quick: bool) -> None:
+    """Write ``tables.md``, with the marks between which the README holds the same tables."""
+    text = "quick form: these are not the study's figures\n\n" if quick else ""
+    for name, table in tables.items():
+        text += f"<!-- table {name} -->\n\n{table}\n\n<!-- end -->\n\n"
+    files.write(out / "tables.md", text)
+
+
+def renew_readme(tables: study_tables.Tables, folders: list[Path]) -> None:
+    """Put tables, figures and the designed motion of finished parts into the README and beside it."""
+    readme = HERE / "README.md"
+    files.write(readme, study_tables.renewed(readme.read_text(encoding="utf-8"), tables))
+    FIGURES.mkdir(exist_ok=True)
+    for folder in folders:
+        for picture in folder.glob("*.png"):
+            shutil.copy(picture, FIGURES / picture.name)
+        for motion in folder.glob(coefficients.NAME):
+            shutil.copy(motion, HERE / motion.name)
 
 
 def main() -> None:
@@ -79,27 +109,21 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="each part in its short form: to see that it runs")
     parser.add_argument("--readme", action="store_true", help="put tables and figures into README.md")
     parser.add_argument("--only", nargs="+", choices=list(PARTS), default=list(PARTS))
-    given = parser.parse_args()
-    if given.quick and given.readme:
+    arguments = parser.parse_args()
+    if arguments.quick and arguments.readme:
         parser.error("--readme takes the study's figures, not those of --quick")
     tables: study_tables.Tables = {}
-    for name in given.only:
-        out = given.out / name
-        if given.all or not is_made(name, out, given.quick):
-            run(name, out, given.quick)
+    folders = []
+    for name in arguments.only:
+        out = arguments.out / name
+        folders.append(out)
+        if arguments.all or not is_finished(name, out, arguments.quick):
+            run(name, out, arguments.quick)
         tables |= tables_of(name, out)
     study_tables.show(tables)
-    head = "quick form: these are not the study's figures\n\n" if given.quick else ""
-    text = "".join(f"<!-- table {name} -->\n\n{one}\n\n<!-- end -->\n\n" for name, one in tables.items())
-    files.write(given.out / "tables.md", head + text)
-    if given.readme:
-        readme = HERE / "README.md"
-        files.write(readme, study_tables.renewed(readme.read_text(encoding="utf-8"), tables))
-        for picture in (path for name in given.only for path in (given.out / name).glob("*.png")):
-            FIGURES.mkdir(exist_ok=True)
-            shutil.copy(picture, FIGURES / picture.name)
-        for motion in (path for name in given.only for path in (given.out / name).glob(coefficients.NAME)):
-            shutil.copy(motion, HERE / motion.name)
+    write_tables(tables, arguments.out, arguments.quick)
+    if arguments.readme:
+        renew_readme(tables, folders)
 
 
 if __name__ == "__main__":

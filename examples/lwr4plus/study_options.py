@@ -12,19 +12,23 @@ def read(document: str | None, **options: str | tuple[Any, str]) -> argparse.Nam
 
     Args:
         document: the script's docstring, whose first line is its help.
-        options: beside ``--out`` and ``--seed``: words of a switch, or default and words of a value (a tuple as the
+        options: beside ``--out`` and ``--seed``: the help of a switch, or default and help of a value (a tuple as the
             default: the values there are, the first by default).
     """
     parser = argparse.ArgumentParser(description=(document or "").split("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="folder for metrics.json and figures")
-    for name, given in ({"seed": (0, "of everything random")} | options).items():
-        if isinstance(given, str):
-            parser.add_argument(f"--{name}", action="store_true", help=given)
-        elif isinstance(given[0], tuple):
-            parser.add_argument(f"--{name}", choices=given[0], default=given[0][0], help=given[1])
+    parser.add_argument("--seed", type=int, default=0, help="of everything random")
+    for name, option in options.items():
+        if isinstance(option, str):
+            parser.add_argument(f"--{name}", action="store_true", help=option)
+            continue
+        default, text = option
+        if isinstance(default, tuple):
+            parser.add_argument(f"--{name}", choices=default, default=default[0], help=text)
+        elif default is None:
+            parser.add_argument(f"--{name}", help=text)
         else:
-            kind = str if given[0] is None else type(given[0])
-            parser.add_argument(f"--{name}", type=kind, default=given[0], help=given[1])
-    found = parser.parse_args()
-    found.out.mkdir(parents=True, exist_ok=True)
-    return found
+            parser.add_argument(f"--{name}", type=type(default), default=default, help=text)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    return arguments

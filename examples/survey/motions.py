@@ -13,13 +13,53 @@ error of the mean estimate: what more data would not take away, but for the mean
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from calib.apps.studies.conditions import read_study
-from calib.apps.studies.experiment import make_experiment
+from calib.apps.studies.conditions import Condition, read_study
+from calib.apps.studies.experiment import Experiment, make_experiment
 from calib.identification.registry import method_named
+
+METHODS = ("ols", "wls")
+
+
+def condition_numbers(data: Experiment) -> tuple[float, float]:
+    """Return the condition number of the observation matrix, raw and with normalised columns."""
+    matrix = data.problem.rows[0].matrix.reshape(-1, len(data.truth))
+    normalised = matrix / np.linalg.norm(matrix, axis=0)
+    return float(np.linalg.cond(matrix)), float(np.linalg.cond(normalised))
+
+
+def relative_errors(data: Experiment, values: np.ndarray) -> tuple[float, float]:
+    """Return the errors [%] of base parameters (b,), and of the noise-free torques that follow from them."""
+    wrong_values = np.linalg.norm(values - data.truth)
+    wrong_torque = np.linalg.norm(data.matrix @ values - data.torque)
+    value_error = 100.0 * wrong_values / np.linalg.norm(data.truth)
+    torque_error = 100.0 * wrong_torque / np.linalg.norm(data.torque)
+    return float(value_error), float(torque_error)
+
+
+def table_lines(condition: Condition, sets: int) -> Iterator[str]:
+    """Yield the lines of a condition with its motion, one per method.
+
+    Args:
+        condition: the condition.
+        sets: number of data sets.
+    """
+    experiments = [make_experiment(condition, seed) for seed in range(sets)]
+    # all data sets share the motion and the truth
+    data = experiments[-1]
+    raw, normalised = condition_numbers(data)
+    for name in METHODS:
+        method = method_named(name)
+        estimates = [method.estimate(experiment.problem).estimate.values for experiment in experiments]
+        errors = [relative_errors(data, values) for values in estimates]
+        value_error, torque_error = np.median(errors, axis=0)
+        _, mean_error = relative_errors(data, np.mean(estimates, axis=0))
+        start = f"| {condition.name} {condition.motion} | {raw:.3g} | {normalised:.3g} | {name} |"
+        yield f"{start} {value_error:.3g} | {torque_error:.3g} | {mean_error:.3g} |"
 
 
 def main() -> None:
@@ -27,26 +67,12 @@ def main() -> None:
     parser.add_argument("motions", nargs="+", help="random, designed, or a folder of calib excite")
     parser.add_argument("--conditions", default="MCS-TX40-1-1,MCS-TX40-1-2")
     parser.add_argument("--data-sets", type=int, default=8)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     print("| | cond(W) | normalised | method | β [%] | torque [%] | of the mean |\n|---|---:|---:|---|---:|---:|---:|")
-    for condition in read_study(given.conditions.split(",")).conditions:
-        for motion in given.motions:
-            found: dict[str, list[np.ndarray]] = {"ols": [], "wls": []}
-            for seed in range(given.data_sets):
-                data = make_experiment(replace(condition, motion=motion), seed)
-                for name, own in found.items():
-                    own.append(method_named(name).estimate(data.problem).estimate.values)
-            matrix = data.problem.rows[0].matrix.reshape(-1, len(data.truth))
-            conditions = [np.linalg.cond(matrix / scale) for scale in (1.0, np.linalg.norm(matrix, axis=0))]
-            for name, own in found.items():
-                off = [
-                    (np.linalg.norm(x - data.truth), np.linalg.norm(data.matrix @ x - data.torque))
-                    for x in (*own, np.mean(own, axis=0))
-                ]
-                shares = 100.0 * np.array(off) / [np.linalg.norm(data.truth), np.linalg.norm(data.torque)]
-                cells = [*conditions, *np.median(shares[:-1], axis=0), shares[-1, 1]]
-                words = [f"{value:.3g}" for value in cells]
-                print(f"| {condition.name} {motion} | {' | '.join([*words[:2], name, *words[2:]])} |", flush=True)
+    for condition in read_study(arguments.conditions.split(",")).conditions:
+        for motion in arguments.motions:
+            for line in table_lines(replace(condition, motion=motion), arguments.data_sets):
+                print(line, flush=True)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ of noise-free torques along another motion.
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from calib.identification.methods.method import Method
 from calib.identification.registry import method_named
 from calib.identification.survey.networks import ADALINE, HOPFIELD
 
-TRIED: dict[str, Method] = {
+METHODS: dict[str, Method] = {
     "ols": method_named("ols"),
     "adaline": ADALINE,
     "adaline, rate 0.1": replace(ADALINE, rate=0.1),
@@ -30,18 +30,40 @@ TRIED: dict[str, Method] = {
 }
 
 
-def estimated(condition: Condition, sets: int) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """Return estimates (data sets, guesses, b) and the median torque error [%] of each method."""
-    values: dict[str, list[np.ndarray]] = {name: [] for name in TRIED}
-    errors: dict[str, list[float]] = {name: [] for name in TRIED}
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """Estimates of one method on several data sets.
+
+    Attributes:
+        values: (data sets, guesses, b) estimated base parameters.
+        error: median error of the noise-free torques [%].
+    """
+
+    values: np.ndarray
+    error: float
+
+
+def run_trials(condition: Condition, sets: int) -> dict[str, Trials]:
+    """Return the trials of each method on a condition.
+
+    Args:
+        condition: the condition, with its number of guesses.
+        sets: number of data sets.
+    """
+    values: dict[str, list[np.ndarray]] = {name: [] for name in METHODS}
+    errors: dict[str, list[float]] = {name: [] for name in METHODS}
     for seed in range(sets * condition.guesses):
         data = make_experiment(condition, seed)
-        for name, method in TRIED.items():
-            own = method.estimate(data.problem).estimate.values
-            values[name].append(own)
-            errors[name].append(float(np.linalg.norm(data.matrix @ own - data.torque) / np.linalg.norm(data.torque)))
-    shaped = {name: np.reshape(own, (sets, condition.guesses, -1)) for name, own in values.items()}
-    return shaped, {name: 100.0 * float(np.median(own)) for name, own in errors.items()}
+        for name, method in METHODS.items():
+            estimate = method.estimate(data.problem).estimate
+            residual = data.matrix @ estimate.values - data.torque
+            values[name].append(estimate.values)
+            errors[name].append(float(np.linalg.norm(residual) / np.linalg.norm(data.torque)))
+    trials = {}
+    for name in METHODS:
+        by_guess = np.reshape(values[name], (sets, condition.guesses, -1))
+        trials[name] = Trials(by_guess, 100.0 * float(np.median(errors[name])))
+    return trials
 
 
 def main() -> None:
@@ -49,15 +71,18 @@ def main() -> None:
     parser.add_argument("--conditions", default="MCS-TX40-1-1,MCS-TX40-1-2")
     parser.add_argument("--data-sets", type=int, default=8)
     parser.add_argument("--guesses", type=int, default=3)
-    given = parser.parse_args()
-    for condition in read_study(given.conditions.split(",")).conditions:
-        values, errors = estimated(replace(condition, guesses=given.guesses), given.data_sets)
-        plain = values["ols"][:, 0].var(axis=0, ddof=1)
+    arguments = parser.parse_args()
+    for condition in read_study(arguments.conditions.split(",")).conditions:
+        trials = run_trials(replace(condition, guesses=arguments.guesses), arguments.data_sets)
+        # variance of ordinary least squares over the data sets, from the first guess
+        reference = trials["ols"].values[:, 0].var(axis=0, ddof=1)
         print(f"{condition.name}\n\n| | over data sets | over guesses | torque [%] |\n|---|---:|---:|---:|")
-        for name, own in values.items():
-            over = own.var(axis=0, ddof=1).mean(axis=0), own.var(axis=1, ddof=1).mean(axis=0)
-            shares = " | ".join(f"{np.median(one / plain):.3g}" for one in over)
-            print(f"| {name} | {shares} | {errors[name]:.3g} |", flush=True)
+        for name, trial in trials.items():
+            over_sets = trial.values.var(axis=0, ddof=1).mean(axis=0)
+            over_guesses = trial.values.var(axis=1, ddof=1).mean(axis=0)
+            set_share = np.median(over_sets / reference)
+            guess_share = np.median(over_guesses / reference)
+            print(f"| {name} | {set_share:.3g} | {guess_share:.3g} | {trial.error:.3g} |", flush=True)
         print()
 
 

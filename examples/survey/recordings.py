@@ -20,51 +20,70 @@ from calib.cli import run
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """A robot's recordings: learnt from, unseen, and how they are read."""
+class RobotRecordings:
+    """A robot's recordings and how they are read.
+
+    Attributes:
+        train: recordings to identify from, in the robot's folder.
+        unseen: recordings to judge by.
+        options: text of the options file.
+    """
 
     train: tuple[str, ...]
     unseen: tuple[str, ...]
     options: str = ""
 
 
+# Joint 6 of the TX40 moves with joint 5.
+TX40_OPTIONS = """\
+[[coupling]]
+joints = [5, 6]
+label = "6"
+"""
+# Torque constants of the drives [N m/A].
+UR10E_OPTIONS = "gains = [14.87, 13.26, 11.13, 10.62, 11.03, 11.47]\n"
 ROBOTS = {
-    "franka_panda_inria": Recorded(("traj1_first60pct.npz@0:9.387",), ("traj1_first60pct.npz@9.387:11.9",)),
-    "staubli_tx40": Recorded(
-        ("tx40_first_5p4s.npz@0:4",), ("tx40_first_5p4s.npz@4:",), '[[coupling]]\njoints = [5, 6]\nlabel = "6"\n'
+    "franka_panda_inria": RobotRecordings(("traj1_first60pct.npz@0:9.387",), ("traj1_first60pct.npz@9.387:11.9",)),
+    "staubli_tx40": RobotRecordings(("tx40_first_5p4s.npz@0:4",), ("tx40_first_5p4s.npz@4:",), TX40_OPTIONS),
+    "ur10e_innopolis": RobotRecordings(
+        ("ur-20_02_10-30sec_12harm.npz",), ("ur-20_02_19_14harm50sec.npz",), UR10E_OPTIONS
     ),
-    "ur10e_innopolis": Recorded(
-        ("ur-20_02_10-30sec_12harm.npz",), ("ur-20_02_19_14harm50sec.npz",),
-        "gains = [14.87, 13.26, 11.13, 10.62, 11.03, 11.47]\n",
-    ),
-    "kuka_lwr4plus_iit": Recorded(("measurements_1.npz@2.5:8.75",), ("measurements_1.npz@8.75:15",)),
-}  # fmt: skip
+    "kuka_lwr4plus_iit": RobotRecordings(("measurements_1.npz@2.5:8.75",), ("measurements_1.npz@8.75:15",)),
+}
 
 
 def compare(name: str, data: Path, out: Path) -> int:
-    """Write the table of one robot; return the command's exit code."""
-    one, folder = ROBOTS[name], data / name
+    """Write the table of one robot; return the command's exit code.
+
+    Args:
+        name: name of the robot, one of `ROBOTS`.
+        data: folder of the robots' folders.
+        out: folder of the tables.
+    """
+    recordings = ROBOTS[name]
+    folder = data / name
+    arguments = ["compare", str(folder / "model.urdf")]
+    arguments += [str(folder / path) for path in recordings.train]
+    for path in recordings.unseen:
+        arguments += ["--validate", str(folder / path)]
     with tempfile.TemporaryDirectory() as scratch:
         options = Path(scratch) / "options.toml"
-        options.write_text(one.options)
-        words = ["compare", str(folder / "model.urdf"), *(str(folder / path) for path in one.train)]
-        for path in one.unseen:
-            words += ["--validate", str(folder / path)]
-        return run([*words, "--options", str(options), "--out", str(out / f"{name}.csv")])
+        options.write_text(recordings.options)
+        return run([*arguments, "--options", str(options), "--out", str(out / f"{name}.csv")])
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("CALIB_DATA", "../shared/data")))
     parser.add_argument("--out", type=Path, default=Path("survey-recordings"))
-    given = parser.parse_args()
-    given.out.mkdir(parents=True, exist_ok=True)
-    codes = [
-        compare(name, given.data, given.out)
-        for name in ROBOTS
-        if not (given.out / f"{name}.csv").exists() and (given.data / name).is_dir()
-    ]
-    return max(codes, default=0)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    codes = [0]
+    for name in ROBOTS:
+        table = arguments.out / f"{name}.csv"
+        if (arguments.data / name).is_dir() and not table.exists():
+            codes.append(compare(name, arguments.data, arguments.out))
+    return max(codes)
 
 
 if __name__ == "__main__":

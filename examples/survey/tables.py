@@ -24,169 +24,300 @@ from calib.identification.registry import METHODS
 
 HERE = Path(__file__).parent
 STUDIES = ("MCS-*", "unfiltered", "wrong-beliefs", "designed", "low-rate", "controller")
-MERITS = ("MCS-TX40-1-1", "MCS-TX40-4-2", "MCS-RV2SQ-1-2")  # conditions of which all figures are shown
+# conditions of which all figures of merit are printed
+MERIT_CONDITIONS = ("MCS-TX40-1-1", "MCS-TX40-4-2", "MCS-RV2SQ-1-2")
+# conditions of the coverage table, without "MCS-"
+COVERAGE_CONDITIONS = ("TX40-1-1", "TX40-1-2", "TX40-1-3", "TX40-4-1", "TX40-4-2", "RV2SQ-1-1", "RV2SQ-1-2")
+# columns of the merit table behind method, runs and failures: heading and figure of merit
+MERIT_COLUMNS = {
+    "torque [%]": "torque_error",
+    "β [%]": "beta_error",
+    "in σ": "beta_sigma",
+    "covered [%]": "coverage",
+    "d_τ [%]": "survey_tau",
+    "d_q [%]": "survey_q",
+    "iterations": "iterations",
+    "simulations": "simulations",
+    "CPU [s]": "cpu",
+}
+# columns of the cost table: heading, robot and decimation factor
+COST_COLUMNS = {"RV2SQ": ("rv2sq", 1), "TX40": ("tx40", 1), "TX40, decimated": ("tx40", 4)}
+# largest number of conditions in one torque table
+MAX_COLUMNS = 5
 
 
 def number(value: float) -> str:
     """Return a number with three digits; a dash for NaN."""
     if math.isnan(value):
         return "–"
-    return "∞" if math.isinf(value) else f"{value:.3g}" if value < 1e4 else f"{value:.0e}"
+    if math.isinf(value):
+        return "∞"
+    if value < 1e4:
+        return f"{value:.3g}"
+    return f"{value:.0e}"
 
 
-def torque_table(conditions: Sequence[ConditionSummary]) -> Iterator[str]:
-    """Yield a table of median torque errors [%]: a line per method, a column per condition; the one to take in bold."""
-    names = list(dict.fromkeys(method.method for one in conditions for method in one.methods))
-    short = [one.condition.name.removeprefix("MCS-") for one in conditions]
-    yield f"| method | {' | '.join(short)} |"
-    yield f"|---|{'---:|' * len(short)}"
-    for name in names:
-        yield f"| {name} | {' | '.join(_cell(one, name) for one in conditions)} |"
-    yield f"| runs | {' | '.join(_runs(one) for one in conditions)} |"
+def table_line(cells: Iterable[str]) -> str:
+    """Return the cells as a line of a Markdown table."""
+    return f"| {' | '.join(cells)} |"
 
 
-def _cell(one: ConditionSummary, name: str) -> str:
-    found = next((method for method in one.methods if method.method == name), None)
-    if found is None:
+def header_rule(columns: int) -> str:
+    """Return the line below a heading: one column of words, then columns of numbers."""
+    return f"|---|{'---:|' * columns}"
+
+
+def short_name(condition: Condition) -> str:
+    return condition.name.removeprefix("MCS-")
+
+
+def count_range(counts: Sequence[int]) -> str:
+    """Return the smallest and the largest count, as one number where they are equal."""
+    low, high = min(counts), max(counts)
+    if low == high:
+        return str(low)
+    return f"{low}–{high}"
+
+
+def method_named(summary: ConditionSummary, name: str) -> MethodSummary | None:
+    """Return the summary of one method on a condition; None for a method without rows."""
+    for method in summary.methods:
+        if method.method == name:
+            return method
+    return None
+
+
+def median_figure(summary: ConditionSummary, name: str, figure: str) -> str:
+    """Return the median of a method's figure of merit on a condition; empty for a method without rows."""
+    method = method_named(summary, name)
+    if method is None:
         return ""
-    failed = sum(found.failures.values())
-    text = number(found.figures["torque_error"].median) + (f" ({failed}/{found.trials} failed)" if failed else "")
-    if not found.enough:
-        return f"{text} (n = {found.trials})"
-    return f"**{text}**" if found.chosen else f"{text} ·" if found.as_good else text
+    return number(method.figures[figure].median)
 
 
-def _runs(one: ConditionSummary) -> str:
-    counts = sorted({method.trials for method in one.methods})
-    return "–".join(map(str, dict.fromkeys((counts[0], counts[-1])))) if counts else "0"
+def torque_table(summaries: Sequence[ConditionSummary]) -> Iterator[str]:
+    """Yield a table of median torque errors [%]: a line per method, a column per condition; the one to take in bold."""
+    # each name once, in the order of the conditions
+    names: dict[str, None] = {}
+    for summary in summaries:
+        for method in summary.methods:
+            names[method.method] = None
+    yield table_line(["method", *(short_name(summary.condition) for summary in summaries)])
+    yield header_rule(len(summaries))
+    for name in names:
+        yield table_line([name, *(_torque_cell(summary, name) for summary in summaries)])
+    yield table_line(["runs", *map(_run_count, summaries)])
 
 
-def merit_table(one: ConditionSummary) -> Iterator[str]:
+def _torque_cell(summary: ConditionSummary, name: str) -> str:
+    """Return the median torque error [%] of a method, with its failures and its mark of the rule."""
+    method = method_named(summary, name)
+    if method is None:
+        return ""
+    text = number(method.figures["torque_error"].median)
+    failures = sum(method.failures.values())
+    if failures:
+        text += f" ({failures}/{method.trials} failed)"
+    if not method.enough:
+        return f"{text} (n = {method.trials})"
+    return marked(text, chosen=method.chosen, as_good=method.as_good)
+
+
+def marked(text: str, *, chosen: bool, as_good: bool) -> str:
+    """Return the text in bold for the method to take, with a dot for one that is as good as the best."""
+    if chosen:
+        return f"**{text}**"
+    if as_good:
+        return f"{text} ·"
+    return text
+
+
+def _run_count(summary: ConditionSummary) -> str:
+    if not summary.methods:
+        return "0"
+    return count_range([method.trials for method in summary.methods])
+
+
+def merit_table(summary: ConditionSummary) -> Iterator[str]:
     """Yield a table of all figures of one condition, one line per method."""
-    header = ("runs", "failed", "torque [%]", "β [%]", "in σ", "covered [%]", "d_τ [%]", "d_q [%]")
-    header += ("iterations", "simulations")
-    yield f"| method | {' | '.join(header)} | CPU [s] |"
-    yield f"|---|{'---:|' * (len(header) + 1)}"
-    for method in one.methods:
-        yield f"| {' | '.join(_figures(method))} |"
+    yield table_line(["method", "runs", "failed", *MERIT_COLUMNS])
+    yield header_rule(2 + len(MERIT_COLUMNS))
+    for method in summary.methods:
+        failures = sum(method.failures.values())
+        figures = [number(method.figures[figure].median) for figure in MERIT_COLUMNS.values()]
+        yield table_line([method.method, str(method.trials), str(failures), *figures])
 
 
-def _figures(method: MethodSummary) -> list[str]:
-    keys = ("torque_error", "beta_error", "beta_sigma", "coverage", "survey_tau", "survey_q")
-    keys += ("iterations", "simulations", "cpu")
-    failed = str(sum(method.failures.values()))
-    return [method.method, str(method.trials), failed, *(number(method.figures[key].median) for key in keys)]
+def coverage_table(summaries: Sequence[ConditionSummary], names: Sequence[str]) -> Iterator[str]:
+    """Yield the share [%] of parameters within the stated 95 % interval, median over runs: a column per condition.
 
-
-def coverage_table(conditions: Sequence[ConditionSummary], names: Sequence[str]) -> Iterator[str]:
-    """Yield the share [%] of parameters within the stated 95 % interval, median over runs: a column per condition."""
-    chosen = [one for name in names for one in conditions if one.condition.name == f"MCS-{name}"]
-    yield f"| method | {' | '.join(names)} |"
-    yield f"|---|{'---:|' * len(names)}"
-    for name in METHODS:
-        found = [next((method for method in one.methods if method.method == name), None) for one in chosen]
-        cells = ["" if own is None else number(own.figures["coverage"].median) for own in found]
+    Args:
+        summaries: summaries of the conditions.
+        names: conditions of the columns, without "MCS-".
+    """
+    by_name = {short_name(summary.condition): summary for summary in summaries}
+    columns = [by_name[name] for name in names if name in by_name]
+    yield table_line(["method", *(short_name(summary.condition) for summary in columns)])
+    yield header_rule(len(columns))
+    for method in METHODS:
+        cells = [median_figure(summary, method, "coverage") for summary in columns]
         if any(cells):
-            yield f"| {name} | {' | '.join(cells)} |"
+            yield table_line([method, *cells])
 
 
 def motion_table(random: Sequence[ConditionSummary], designed: Sequence[ConditionSummary]) -> Iterator[str]:
     """Yield median torque and parameter errors [%] on random and on designed motions, for conditions that have both."""
-    pairs = [(one, own) for own in designed for one in random if one.condition == _as_random(own, one) and own.methods]
-    names = [f"{what}, {one.condition.name.removeprefix('MCS-')}" for one, _ in pairs for what in ("torque", "β")]
-    yield f"| random → designed [%] | {' | '.join(names)} |"
-    yield f"|---|{'---:|' * len(names)}"
-    for name in METHODS:
+    pairs = []
+    for summary in designed:
+        partners = [partner for partner in random if _differ_by_motion(summary.condition, partner.condition)]
+        if summary.methods and partners:
+            pairs.append((partners[0], summary))
+    header = ["random → designed [%]"]
+    for partner, _ in pairs:
+        name = short_name(partner.condition)
+        header += [f"torque, {name}", f"β, {name}"]
+    yield table_line(header)
+    yield header_rule(len(header) - 1)
+    for method in METHODS:
         cells = []
         for pair in pairs:
-            both = [method for one in pair for method in one.methods if method.method == name]
-            medians = [[number(one.figures[key].median) for one in both] for key in ("torque_error", "beta_error")]
-            cells += [" → ".join(own) if len(own) == 2 else "" for own in medians]
+            cells.append(_both_motions(pair, method, "torque_error"))
+            cells.append(_both_motions(pair, method, "beta_error"))
         if any(cells):
-            yield f"| {name} | {' | '.join(cells)} |"
+            yield table_line([method, *cells])
 
 
-def _as_random(one: ConditionSummary, other: ConditionSummary) -> Condition:
-    """Return a condition with motion, guesses and name of another."""
-    theirs = other.condition
-    return replace(one.condition, motion=theirs.motion, guesses=theirs.guesses, name=theirs.name)
+def _differ_by_motion(designed: Condition, random: Condition) -> bool:
+    """Return whether two conditions are equal but for motion, guesses and name."""
+    return random == replace(designed, motion=random.motion, guesses=random.guesses, name=random.name)
 
 
-GROUPS = {"RV2SQ": ("rv2sq", 1), "TX40": ("tx40", 1), "TX40, decimated": ("tx40", 4)}
+def _both_motions(pair: tuple[ConditionSummary, ConditionSummary], method: str, figure: str) -> str:
+    """Return a method's figure on random and on designed motion; empty if it has no rows on one of them."""
+    random, designed = (median_figure(summary, method, figure) for summary in pair)
+    if random and designed:
+        return f"{random} → {designed}"
+    return ""
 
 
 def cost_table(rows: Iterable[TrialRow]) -> Iterator[str]:
     """Yield mean processor time per trial of each method; runs and failures over the 15 conditions."""
-    digests = [one.digest for one in read_study(["MCS-*"]).conditions]
-    own = [row for row in rows if row.digest in digests and row.current]
-    yield f"| method | runs | without an estimate | {' | '.join(f'{name} [CPU s]' for name in GROUPS)} |"
-    yield f"|---|{'---:|' * (2 + len(GROUPS))}"
-    total = dict.fromkeys(GROUPS, 0.0)
-    for name in METHODS:
-        mine = [row for row in own if row.method == name]
-        counts = [sum(row.digest == digest for row in mine) for digest in digests]
-        failed, cells = sum(not row.found for row in mine), []
-        for group, (robot, factor) in GROUPS.items():
-            times = [row.cpu for row in mine if (row.robot, row.decimation) == (robot, factor) and row.cpu == row.cpu]
-            total[group] += sum(times) / len(times) if times else float("nan")
-            cells.append(number(sum(times) / len(times)) if times else "")
-        span = "–".join(map(str, dict.fromkeys((min(counts), max(counts)))))
-        yield f"| {name} | {span} | {failed} of {len(mine)} | {' | '.join(cells)} |"
-    minutes = [number(100 * value / 60) for value in total.values()]
+    digests = [condition.digest for condition in read_study(["MCS-*"]).conditions]
+    by_method: dict[str, list[TrialRow]] = {name: [] for name in METHODS}
+    for row in rows:
+        if row.digest in digests and row.current and row.method in by_method:
+            by_method[row.method].append(row)
+    yield table_line(["method", "runs", "without an estimate", *(f"{name} [CPU s]" for name in COST_COLUMNS)])
+    yield header_rule(2 + len(COST_COLUMNS))
+    # seconds of one trial by all methods together
+    totals = dict.fromkeys(COST_COLUMNS, 0.0)
+    for name, method_rows in by_method.items():
+        counts = dict.fromkeys(digests, 0)
+        failures = 0
+        for row in method_rows:
+            counts[row.digest] += 1
+            failures += not row.found
+        cells = [name, count_range([*counts.values()]), f"{failures} of {len(method_rows)}"]
+        for column, (robot, factor) in COST_COLUMNS.items():
+            mean = _mean_time(method_rows, robot, factor)
+            totals[column] += mean
+            cells.append("" if math.isnan(mean) else number(mean))
+        yield table_line(cells)
+    minutes = [number(100 * seconds / 60) for seconds in totals.values()]
     yield f"| all, 100 runs each [CPU min] | | | {' | '.join(minutes)} |"
 
 
+def _mean_time(rows: Iterable[TrialRow], robot: str, factor: int) -> float:
+    """Return the mean processor time [s] of the rows of a robot and a decimation factor; NaN without a time."""
+    times = [row.cpu for row in rows if row.robot == robot and row.decimation == factor and not math.isnan(row.cpu)]
+    if not times:
+        return math.nan
+    return sum(times) / len(times)
+
+
 def recordings_table(folder: Path) -> Iterator[str]:
-    """Yield errors on unseen motion [%] of each method on real recordings, with its seconds; bold: the one to take."""
-    tables = {path.stem: list(csv.DictReader(path.read_text().splitlines())) for path in sorted(folder.glob("*.csv"))}
-    yield f"| method | {' | '.join(tables)} |"
-    yield f"|---|{'---:|' * len(tables)}"
-    for name in METHODS:
-        found = [next((row for row in own if row["method"] == name), None) for own in tables.values()]
-        cells = ["" if row is None else _recorded(row) for row in found]
+    """Yield errors on unseen motion [%] of each method on real recordings, with its seconds; bold: the one to take.
+
+    Args:
+        folder: tables of `recordings.py`, one per robot.
+    """
+    # robot -> method -> row of the robot's table
+    robots: dict[str, dict[str, dict[str, str]]] = {}
+    for path in sorted(folder.glob("*.csv")):
+        reader = csv.DictReader(path.read_text().splitlines())
+        robots[path.stem] = {row["method"]: row for row in reader}
+    yield table_line(["method", *robots])
+    yield header_rule(len(robots))
+    for method in METHODS:
+        cells = [_recording_cell(by_method.get(method)) for by_method in robots.values()]
         if any(cells):
-            yield f"| {name} | {' | '.join(cells)} |"
+            yield table_line([method, *cells])
 
 
-def _recorded(row: dict[str, str]) -> str:
+def _recording_cell(row: dict[str, str] | None) -> str:
+    """Return the error on unseen motion [%] with its σ and seconds; empty for a method without a row."""
+    # methods that simulate the closed loop do not run on these recordings
+    if row is None or "[loop]" in row["failure"]:
+        return ""
     if row["failure"]:
-        return "" if "[loop]" in row["failure"] else "no estimate"
-    text = f"{float(row['unseen_percent']):.3g} ± {float(row['sigma']):.2g}"
-    text = f"**{text}**" if row["take"] == "yes" else f"{text} ·" if row["as_good"] == "yes" else text
-    return f"{text} ({float(row['seconds']):.2g} s)"
+        return "no estimate"
+    error, sigma, seconds = float(row["unseen_percent"]), float(row["sigma"]), float(row["seconds"])
+    text = marked(f"{error:.3g} ± {sigma:.2g}", chosen=row["take"] == "yes", as_good=row["as_good"] == "yes")
+    return f"{text} ({seconds:.2g} s)"
 
 
 def sections(rows: Sequence[TrialRow], recordings: Path) -> dict[str, list[str]]:
-    """Return the lines of each table, by the name of its place in the README."""
-    made: dict[str, list[str]] = {}
+    """Return the lines of each table, by the name of its place in the README.
+
+    Args:
+        rows: rows of the studies.
+        recordings: folder of the tables of `recordings.py`.
+    """
+    tables: dict[str, list[str]] = {}
     survey: list[ConditionSummary] = []
     for name in STUDIES:
-        conditions = [one for one in summarise(read_study([name]), rows) if one.methods]
-        lines = made.setdefault(name.removesuffix("-*"), [])
-        for part in range(0, len(conditions), 5):
-            lines += [*torque_table(conditions[part : part + 5]), ""]
+        summaries = [summary for summary in summarise(read_study([name]), rows) if summary.methods]
+        lines: list[str] = []
+        for first in range(0, len(summaries), MAX_COLUMNS):
+            lines += torque_table(summaries[first : first + MAX_COLUMNS])
+            lines.append("")
+        tables[name.removesuffix("-*")] = lines
         if name == "MCS-*":
-            shown = ("TX40-1-1", "TX40-1-2", "TX40-1-3", "TX40-4-1", "TX40-4-2", "RV2SQ-1-1", "RV2SQ-1-2")
-            made["coverage"] = list(coverage_table(conditions, shown))
-            for one in conditions:
-                if one.condition.name in MERITS:
-                    made.setdefault("merit", []).extend([f"{one.condition.name}:", "", *merit_table(one), ""])
-            survey = conditions
+            survey = summaries
+            tables["coverage"] = list(coverage_table(survey, COVERAGE_CONDITIONS))
+            tables["merit"] = _merit_lines(survey)
         if name == "designed":
-            lines += motion_table(survey, conditions)
-    made["cost"] = list(cost_table(rows))
-    made["recordings"] = list(recordings_table(recordings))
-    return made
+            lines += motion_table(survey, summaries)
+    tables["cost"] = list(cost_table(rows))
+    tables["recordings"] = list(recordings_table(recordings))
+    return tables
 
 
-def written(text: str, made: dict[str, list[str]]) -> str:
+def _merit_lines(summaries: Iterable[ConditionSummary]) -> list[str]:
+    lines: list[str] = []
+    for summary in summaries:
+        if summary.condition.name in MERIT_CONDITIONS:
+            lines += [f"{summary.condition.name}:", "", *merit_table(summary), ""]
+    return lines
+
+
+def with_tables(text: str, tables: dict[str, list[str]]) -> str:
     """Return the README with each table in its place, between <!-- NAME --> and <!-- end -->."""
-    for name, lines in made.items():
-        block = "\n".join([f"<!-- {name} -->", *lines, "<!-- end -->"])
-        text, count = re.subn(rf"<!-- {name} -->.*?<!-- end -->", lambda _, own=block: own, text, flags=re.DOTALL)
-        if count != 1:
-            raise SystemExit(f"README.md has {count} places for the table '{name}', <!-- {name} --> … <!-- end -->")
+    for name, lines in tables.items():
+        start, end = f"<!-- {name} -->", "<!-- end -->"
+        places = re.findall(f"{start}.*?{end}", text, flags=re.DOTALL)
+        if len(places) != 1:
+            raise SystemExit(f"README.md has {len(places)} places for the table '{name}', {start} … {end}")
+        text = text.replace(places[0], "\n".join([start, *lines, end]))
     return text
+
+
+def print_merits(rows: Sequence[TrialRow], name: str) -> None:
+    """Print all figures of merit of one condition."""
+    for study in STUDIES:
+        for summary in summarise(read_study([study]), rows):
+            if summary.condition.name == name:
+                print("\n".join(merit_table(summary)))
 
 
 def main() -> None:
@@ -194,19 +325,17 @@ def main() -> None:
     parser.add_argument("--rows", type=Path, default=HERE / "rows")
     parser.add_argument("--full", default="", help="all figures of this condition")
     parser.add_argument("--readme", action="store_true", help="write the tables into README.md")
-    given = parser.parse_args()
-    rows = read_rows(given.rows)
-    if given.full:
-        conditions = [one for name in STUDIES for one in summarise(read_study([name]), rows)]
-        chosen = [one for one in conditions if one.condition.name == given.full]
-        print("\n".join(line for one in chosen for line in merit_table(one)))
+    arguments = parser.parse_args()
+    rows = read_rows(arguments.rows)
+    if arguments.full:
+        print_merits(rows, arguments.full)
         return
-    made = sections(rows, HERE / "recordings")
-    if given.readme:
+    tables = sections(rows, HERE / "recordings")
+    if arguments.readme:
         readme = HERE / "README.md"
-        readme.write_text(written(readme.read_text(), made))
+        readme.write_text(with_tables(readme.read_text(), tables))
         return
-    for name, lines in made.items():
+    for name, lines in tables.items():
         print("\n".join([f"## {name}", "", *lines, ""]))
 
 

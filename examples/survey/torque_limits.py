@@ -17,14 +17,20 @@ from calib.apps.studies.experiment import set_up
 from calib.identification.closed_loop.simulation import Sensing, simulate
 from calib.simulation import known_robots
 
+# share of the torque limit from which a joint is at it
+LIMIT_SHARE = 0.999
+
 
 def main() -> None:
     for condition in read_study(sys.argv[1:] or ["MCS-RV2SQ-1-3"]).conditions:
-        setup, controller = set_up(condition.robot, condition.duration), known_robots.controller(condition.robot)
-        for words, sigma in (("with encoder noise", condition.sigma_q), ("without", 0.0)):
+        setup = set_up(condition)
+        controller = known_robots.controller(condition.robot)
+        limit = LIMIT_SHARE * np.asarray(controller.limit)
+        for label, sigma in (("with encoder noise", condition.sigma_q), ("without", 0.0)):
             run = simulate(setup.plant, controller, setup.reference, Sensing(sigma), np.random.default_rng(0))
-            share = 100.0 * np.mean(np.abs(run.torque) >= 0.999 * np.asarray(controller.limit), axis=0)
-            print(f"{condition.name}, {words}: {np.round(share, 1)}")
+            limited = np.abs(run.torque) >= limit
+            share = 100.0 * np.mean(limited, axis=0)
+            print(f"{condition.name}, {label}: {np.round(share, 1)}")
 
 
 if __name__ == "__main__":

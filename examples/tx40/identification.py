@@ -15,28 +15,30 @@ once: with a wrong controller it grows although the parameters stay right, and o
 that answered the noise, which no prediction can. `torque_error` compares fairly: the torque of another motion,
 noise-free, against the truth. A dash: that estimate could not be simulated along that motion.
 
-    python examples/tx40/identification.py --out tx40-study [--quick] [--seed 0] [--tried NAME …] [--readme]
+    python examples/tx40/identification.py --out tx40-study [--quick] [--seed 0] [--tried NAME …] [--methods NAME …]
+        [--readme]
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import calib
 from calib import files
 from calib.dynamics import base as bases
-from calib.errors import CalibError, NotConverged
+from calib.errors import NotConverged
 from calib.estimation.essential import Rule, eliminate
 from calib.estimation.linear import subsystem_std
 from calib.estimation.triangles import collect, combine
 from calib.estimation.whiteness import examine
 from calib.identification.closed_loop.controllers import identify_controller, pd
-from calib.identification.closed_loop.instrumental import Instrumental, Round, identify_instrumental
+from calib.identification.closed_loop.instrumental import Instrumental, identify_instrumental
 from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
 from calib.identification.methods.parameter_constraints import hold, make_constraints
 from calib.identification.rows import ObservationRows
@@ -47,41 +49,80 @@ from calib.toolkit.simulations import LoopController, Plant, Reference, Sensing,
 from calib.toolkit.statistics import LinearFit
 from calib.toolkit.torque_models import Base, Case, ConstraintSettings, IdentificationModel, make_case, observe
 
+# rate of the controller [Hz], and control periods per logged sample
 RATE, EVERY = 5000.0, 5
 FILTERS = FilterOptions(cutoff=50.0, band=20.0, clock="stamps")
-REACH = np.array([2.8, 1.8, 2.0, 3.5, 1.9, 4.0])  # [rad]
+# random motions: amplitudes [rad], speeds [rad/s], largest acceleration [rad/s²], harmonics
+REACH = np.array([2.8, 1.8, 2.0, 3.5, 1.9, 4.0])
 SPEED = 0.8 * np.deg2rad([287.0, 287.0, 430.0, 410.0, 320.0, 700.0])
-OFFSETS = np.array([0.3, -0.4, 0.2, 0.1, -0.1, 0.05])  # [N m], chosen
-UNMODELLED = 0.05  # of each joint's rms torque, chosen
-DEGRADED = np.array([2.3, 2.7, 7.0, 9.0, 12.0, 13.0]) * 1e-3  # noise of the logged positions [rad], chosen: see above
-LOOP, LOOP_BAND = 3e-4, 10.0  # noise of the positions that the controller sees [rad], its colour [Hz], chosen
+ACCELERATION, HARMONICS = 40.0, 20
+# torque offsets [N m], chosen
+OFFSETS = np.array([0.3, -0.4, 0.2, 0.1, -0.1, 0.05])
+# σ of the encoders [rad] and of the logged torques [N m]
+ENCODER_NOISE, TORQUE_NOISE = np.deg2rad(1e-4), 0.05
+# unmodelled torque: share of each joint's rms torque, chosen; its colour [Hz]
+UNMODELLED, UNMODELLED_BAND = 0.05, 10.0
+# noise of the logged positions of degraded data [rad], chosen: see above
+DEGRADED = np.array([2.3, 2.7, 7.0, 9.0, 12.0, 13.0]) * 1e-3
+# noise of the positions that the controller sees [rad], its colour [Hz], chosen
+LOOP, LOOP_BAND = 3e-4, 10.0
+# rounds of an iteration, at most
+MAX_ROUNDS = 20
 KINDS = ("clean", "degraded", "in the loop")
-TRIED = ("identified", "kp +30 %, kd -30 %", "bandwidth / 2", "bandwidth / 3")  # controllers, on degraded data
+# the table has the first two
+METHODS = ("IV", "PC-IV", "DIDIM")
+COLUMNS = ("LS", "PC-LS", "IV", "PC-IV")
+# controllers, on degraded data
+TRIED = ("identified", "kp +30 %, kd -30 %", "bandwidth / 2", "bandwidth / 3")
 MARKS = ("<!-- the table is written by --readme -->", "<!-- end of the table -->")
+# kinds of error and their labels in the README
+PARTS = {"direct": "direct", "cross": "cross", "torque_error": "another motion, noise-free"}
+# errors in the slides [%], and the number of their essential parameters
 SLIDES = {
-    "clean": {"direct": {"LS": [5.2, 5.0, 5.0, 5.6, 7.2, 7.1], "IV": [5.4, 5.3, 5.1, 5.7, 7.2, 7.5]},
-              "cross": {"LS": [6.1, 6.3, 6.7], "IV": [6.4, 6.8, 7.0]}},
-    "degraded": {"direct": {"LS": [25.3, 24.7, 25.2, 25.8, 27.5, 28.0], "IV": [6.1, 5.9, 6.0, 5.9, 8.0, 8.1]},
-                 "cross": {"LS": [26.4, 26.5, 27.8], "IV": [7.1, 7.6, 7.9]}},
+    "clean": {
+        "direct": {"LS": [5.2, 5.0, 5.0, 5.6, 7.2, 7.1], "IV": [5.4, 5.3, 5.1, 5.7, 7.2, 7.5]},
+        "cross": {"LS": [6.1, 6.3, 6.7], "IV": [6.4, 6.8, 7.0]},
+    },
+    "degraded": {
+        "direct": {"LS": [25.3, 24.7, 25.2, 25.8, 27.5, 28.0], "IV": [6.1, 5.9, 6.0, 5.9, 8.0, 8.1]},
+        "cross": {"LS": [26.4, 26.5, 27.8], "IV": [7.1, 7.6, 7.9]},
+    },
     "identified controllers": {"direct": {"IV": [6.1, 6.3, 5.9, 6.4, 7.9, 8.1]}},
     "essential": 27,
-}  # fmt: skip
+}
+Metrics = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class Log:
-    """One recorded motion: what was asked, what is true, positions as logged, and what identification sees of them."""
+    """One recorded motion.
+
+    Attributes:
+        reference: the motion that the controller was asked for.
+        run: the simulated run.
+        positions: (N, n) positions as logged [rad].
+        case: the filtered recording.
+        rows: its rows for identification.
+    """
 
     reference: Reference
     run: SimulatedRun
-    seen: np.ndarray
+    positions: np.ndarray
     case: Case
     rows: ObservationRows
 
 
 @dataclass(frozen=True)
 class Study:
-    """Data shared by all parts of the study."""
+    """Data shared by all parts of the study.
+
+    Attributes:
+        plant: the true robot.
+        model: the model to identify.
+        base: its base parameters.
+        controller: the true controller.
+        seed: seed of all noise.
+    """
 
     plant: Plant
     model: IdentificationModel
@@ -91,133 +132,211 @@ class Study:
 
     @property
     def truth(self) -> np.ndarray:
+        """True base parameters (b,)."""
         return self.base.transform @ self.plant.parameters
 
 
-def references(quick: bool, seed: int) -> tuple[Reference, list[Reference]]:
+@dataclass(frozen=True)
+class Extent:
+    """How much of the study is run.
+
+    Attributes:
+        duration: duration of a random motion [s].
+        candidates: random motions of which the training motion is the best.
+        points: points of the moves.
+        kinds: kinds of data.
+    """
+
+    duration: float = 10.0
+    candidates: int = 30
+    points: int = 8
+    kinds: tuple[str, ...] = KINDS
+
+
+QUICK = Extent(8.0, 5, 4, KINDS[:2])
+
+
+def references(extent: Extent, seed: int) -> tuple[Reference, list[Reference]]:
     """Return the training motion (best condition number of some random motions) and three other motions."""
     model = known_robots.model(known_robots.plant("tx40", coupled=True, offset=OFFSETS))
-    kept = bases.find(model).kept
-    duration = 8.0 if quick else 10.0
+    base_columns = bases.find(model).kept
 
-    def draw(number: int) -> Reference:
-        return random_fourier(-REACH, REACH, SPEED, duration, RATE, 20, acceleration=40.0, seed=[seed, number])
+    def random_motion(number: int) -> Reference:
+        return random_fourier(
+            -REACH, REACH, SPEED, extent.duration, RATE, HARMONICS, acceleration=ACCELERATION, seed=[seed, number]
+        )
 
     def condition(reference: Reference) -> float:
-        part = slice(None, None, 50)
-        matrix = model.regressor(reference.q[part], reference.v[part], reference.a[part])[:, :, kept]
-        matrix = matrix.reshape(-1, len(kept))
+        matrix = base_regressor(model, base_columns, reference, 50).reshape(-1, len(base_columns))
         return float(np.linalg.cond(matrix / np.linalg.norm(matrix, axis=0)))
 
-    training = min((draw(number) for number in range(5 if quick else 30)), key=condition)
-    points = np.random.default_rng([seed, 99]).uniform(-0.7, 0.7, (4 if quick else 8, 6)) * REACH
+    training = min(map(random_motion, range(extent.candidates)), key=condition)
+    points = np.random.default_rng([seed, 99]).uniform(-0.7, 0.7, (extent.points, 6)) * REACH
     moves = trapezoidal(points, 0.6 * SPEED, 12.0, RATE, pause=0.2)
-    return training, [draw(1001), draw(1002), moves]
+    return training, [random_motion(1001), random_motion(1002), moves]
+
+
+def base_regressor(model: IdentificationModel, columns: np.ndarray, reference: Reference, step: int) -> np.ndarray:
+    """Return the base columns of the regressor (N / step, n, b) along a reference.
+
+    Args:
+        model: the model.
+        columns: (b,) its base columns.
+        reference: the motion, N samples.
+        step: samples of the motion per sample of the regressor.
+    """
+    part = slice(None, None, step)
+    return model.regressor(reference.q[part], reference.v[part], reference.a[part])[:, :, columns]
 
 
 def unmodelled(study: Study, reference: Reference) -> np.ndarray:
     """Return the size of the torque that no model holds (n,) [N m], from the torque of a motion without noise."""
-    silent = simulate(study.plant, study.controller, reference, Sensing(every=EVERY))
-    return UNMODELLED * np.sqrt(np.mean(silent.torque**2, axis=0))
+    noise_free = simulate(study.plant, study.controller, reference, Sensing(every=EVERY))
+    return UNMODELLED * np.sqrt(np.mean(noise_free.torque**2, axis=0))
 
 
 def record(study: Study, reference: Reference, push: np.ndarray, kind: str, number: int) -> Log:
-    """Simulate a motion with noise and unmodelled torque of a size, and log it."""
-    sensing = Sensing(np.deg2rad(1e-4), 0.0, 0.05, push, push_band=10.0, every=EVERY)
+    """Simulate a motion with noise and unmodelled torque, and log it.
+
+    Args:
+        study: robot, model and controller.
+        reference: the motion.
+        push: (n,) size of the unmodelled torque [N m].
+        kind: one of `KINDS`.
+        number: number of the motion, for the seed of its noise.
+    """
+    sensing = Sensing(ENCODER_NOISE, 0.0, TORQUE_NOISE, push, push_band=UNMODELLED_BAND, every=EVERY)
     if kind == "in the loop":
         sensing = replace(sensing, sigma_q=LOOP, q_band=LOOP_BAND)
     run = simulate(study.plant, study.controller, reference, sensing, [study.seed, number])
-    seen = run.measured
+    positions = run.measured
     if kind == "degraded":
-        seen = seen + DEGRADED * np.random.default_rng([study.seed, number, 7]).normal(size=seen.shape)
-    recording = Recording(run.t, seen, run.tau, "torque", tuple(f"joint_{j + 1}" for j in range(6)), file=kind)
+        rng = np.random.default_rng([study.seed, number, 7])
+        positions = positions + DEGRADED * rng.normal(size=positions.shape)
+    names = tuple(f"joint_{joint + 1}" for joint in range(6))
+    recording = Recording(run.t, positions, run.tau, "torque", names, file=kind)
     case = make_case(kind, make_motion(recording, FILTERS))
-    return Log(reference, run, seen, case, observe(study.model, study.base.kept, case, case.motion.decimator))
+    rows = observe(study.model, study.base.kept, case, case.motion.decimator)
+    return Log(reference, run, positions, case, rows)
 
 
-def relative(target: np.ndarray, predicted: np.ndarray) -> tuple[float, list[float]]:
-    """Return 100 ‖τ - τ̂‖ / ‖τ‖ [%] of all joints and of each."""
-    gone, size = target - predicted, target
-    joints = 100.0 * np.linalg.norm(gone, axis=0) / np.linalg.norm(size, axis=0)
-    return float(100.0 * np.linalg.norm(gone) / np.linalg.norm(size)), joints.tolist()
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Measured and predicted torques (N, n) [N m]."""
+
+    measured: np.ndarray
+    predicted: np.ndarray
+
+    @property
+    def residual(self) -> np.ndarray:
+        return self.measured - self.predicted
+
+    @property
+    def error(self) -> float:
+        """100 ‖τ - τ̂‖ / ‖τ‖ [%] of all joints together."""
+        return float(100.0 * np.linalg.norm(self.residual) / np.linalg.norm(self.measured))
+
+    @property
+    def joint_errors(self) -> list[float]:
+        """The same of each joint [%]."""
+        shares = np.linalg.norm(self.residual, axis=0) / np.linalg.norm(self.measured, axis=0)
+        return (100.0 * shares).tolist()
 
 
-def with_measured(log: Log, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def with_measured(log: Log, values: np.ndarray) -> Prediction:
     """Return decimated torque and prediction W x, W from the log."""
-    return log.rows.target, log.rows.matrix @ values
+    return Prediction(log.rows.target, log.rows.matrix @ values)
 
 
-def with_simulated(
-    study: Study, log: Log, values: np.ndarray, controller: LoopController
-) -> tuple[np.ndarray, np.ndarray]:
+def with_simulated(study: Study, log: Log, values: np.ndarray, controller: LoopController) -> Prediction:
     """Return decimated torque and prediction Z x, Z from a noise-free simulation with x itself."""
     plant = Plant(study.model.bodies, study.model.terms, study.base.to_standard(values))
-    loop = Loop(controller, log.reference, EVERY)
-    own = simulated_case(log.case, simulate(plant, controller, log.reference, Sensing(every=EVERY)), loop)
-    rows = observe(study.model, study.base.kept, own, log.case.motion.decimator)
-    return rows.target, rows.matrix @ values
+    run = simulate(plant, controller, log.reference, Sensing(every=EVERY))
+    case = simulated_case(log.case, run, Loop(controller, log.reference, EVERY))
+    rows = observe(study.model, study.base.kept, case, log.case.motion.decimator)
+    return Prediction(rows.target, rows.matrix @ values)
 
 
 def torque_error(study: Study, reference: Reference, values: np.ndarray) -> list[float]:
     """Return the error of the torque along a reference, joint by joint, against the truth [%]: no noise anywhere."""
-    part = slice(None, None, 20)
-    matrix = study.model.regressor(reference.q[part], reference.v[part], reference.a[part])[:, :, study.base.kept]
-    return relative(matrix @ study.truth, matrix @ values)[1]
+    matrix = base_regressor(study.model, study.base.kept, reference, 20)
+    return Prediction(matrix @ study.truth, matrix @ values).joint_errors
 
 
 def judge(
-    study: Study, training: Log, others: list[Log], results: dict[str, Instrumental], controller: LoopController
-) -> dict[str, Any]:
-    """Return the errors of least squares and of instrumental methods (direct and cross), and the test results."""
+    study: Study, training: Log, validation: list[Log], results: dict[str, Instrumental], controller: LoopController
+) -> Metrics:
+    """Return the errors of least squares and of instrumental methods (direct and cross), and the test results.
+
+    Args:
+        study: robot, model and true controller.
+        training: the log that was identified from.
+        validation: logs of other motions.
+        results: name of an instrumental method to its result.
+        controller: the controller that the methods assume.
+    """
     first = next(iter(results.values()))
-    values = {"LS": first.ordinary.estimate.values, "PC-LS": consistent(study, first).estimate.values}
-    values |= {name: result.fit.estimate.values for name, result in results.items()}
+    values = {"LS": first.ordinary.estimate.values, "PC-LS": constrained(study, first).estimate.values}
+    for name, result in results.items():
+        values[name] = result.fit.estimate.values
 
-    def predicted(name: str, log: Log) -> tuple[np.ndarray, np.ndarray]:
-        return (
-            with_measured(log, values[name])
-            if name.endswith("LS")
-            else with_simulated(study, log, values[name], controller)
-        )
+    def prediction(name: str, log: Log) -> Prediction:
+        if name.endswith("LS"):
+            return with_measured(log, values[name])
+        return with_simulated(study, log, values[name], controller)
 
-    def cross(name: str, log: Log) -> float | None:
+    def cross_error(name: str, log: Log) -> float | None:
         try:
-            return relative(*predicted(name, log))[0]
-        except CalibError:  # a poor estimate need not be a possible robot everywhere
+            return prediction(name, log).error
+        except calib.CalibError:
+            # A poor estimate need not be physically consistent along every motion.
             return None
 
-    return {
-        "direct": {name: relative(*predicted(name, training))[1] for name in values},
-        "cross": {name: [cross(name, log) for log in others] for name in values},
-        "torque_error": {name: torque_error(study, others[0].reference, own) for name, own in values.items()},
+    metrics: Metrics = {"direct": {}, "cross": {}, "torque_error": {}}
+    for name in values:
+        metrics["direct"][name] = prediction(name, training).joint_errors
+        metrics["cross"][name] = [cross_error(name, log) for log in validation]
+        metrics["torque_error"][name] = torque_error(study, validation[0].reference, values[name])
+    return metrics | {
         "estimated": len(first.names),
-        "rounds": {name: [vars(one) for one in finite(result)] for name, result in results.items()},
+        "rounds": {name: finite_rounds(result) for name, result in results.items()},
         "verdict": verdict(first),
         "constrained_forms_apart": float(results["PC-IV"].apart.max()),
     }
 
 
-def consistent(study: Study, result: Instrumental) -> LinearFit:
+def constrained(study: Study, result: Instrumental) -> LinearFit:
     """Return the least-squares estimate of the same rows with the sign constraints of PC-IV (PC-IDIM-LS)."""
-    data, std = result.problem.least_squares(), result.ordinary.group_std
-    bounds = dict.fromkeys(signs(result.names), (0.0, np.inf))
+    data = result.problem.least_squares()
+    std = result.ordinary.group_std
+    bounds = dict.fromkeys(positive_names(result.names), (0.0, np.inf))
     settings = ConstraintSettings(signs=False, inertia=0, bounds=bounds)
-    asked = make_constraints(settings, study.model, study.base, result.names, [None] * study.base.b)
-    return hold(result.ordinary, combine(data, std), data, std, asked, stated_noise=True)[0]
+    constraints = make_constraints(settings, study.model, study.base, result.names, [None] * study.base.b)
+    fit, _ = hold(result.ordinary, combine(data, std), data, std, constraints, stated_noise=True)
+    return fit
 
 
-def finite(result: Instrumental) -> list[Round]:
+def finite_rounds(result: Instrumental) -> list[dict[str, Any]]:
     """Return the rounds of an iteration; a change that is not finite (first round) becomes 1."""
-    return [one if np.isfinite(one.change) else replace(one, change=1.0) for one in result.rounds]
+    rounds = []
+    for step in result.rounds:
+        content = dict(vars(step))
+        if not np.isfinite(step.change):
+            content["change"] = 1.0
+        rounds.append(content)
+    return rounds
 
 
-def verdict(result: Instrumental) -> dict[str, Any]:
+def verdict(result: Instrumental) -> Metrics:
     """Return the test of least squares, and the largest difference of both estimates in standard deviations."""
     return {
-        "F": result.verdict.statistic, "p": result.verdict.p, "least_squares_biased": result.verdict.biased(),
-        "largest_shift_in_sigma": float(result.shift.max()), "cragg_donald": result.strength.cragg_donald,
+        "F": result.verdict.statistic,
+        "p": result.verdict.p,
+        "least_squares_biased": result.verdict.biased(),
+        "largest_shift_in_sigma": float(result.shift.max()),
+        "cragg_donald": result.strength.cragg_donald,
         "instruments_valid": result.valid,
-    }  # fmt: skip
+    }
 
 
 def estimate(study: Study, log: Log, controller: LoopController, method: str) -> Instrumental:
@@ -225,156 +344,216 @@ def estimate(study: Study, log: Log, controller: LoopController, method: str) ->
 
     The regular robot they start from has the motors' inertia, as on a data sheet.
     """
+    recording = (log.case, Loop(controller, log.reference, EVERY))
+    positive = positive_names(study.base.names) if method == "PC-IV" else ()
     return identify_instrumental(
-        study.model, study.base, [(log.case, Loop(controller, log.reference, EVERY))], log.case.motion.decimator,
-        method="didim" if method == "DIDIM" else "iv", limit=20,
+        study.model,
+        study.base,
+        [recording],
+        log.case.motion.decimator,
+        method="didim" if method == "DIDIM" else "iv",
+        limit=MAX_ROUNDS,
         inertia=np.array(known_robots.truth("tx40")["drives"]["Ia"]),
-        positive=signs(study.base.names) if method == "PC-IV" else (),
-    )  # fmt: skip
+        positive=positive,
+    )
 
 
-def essential_count(study: Study, training: Log) -> dict[str, Any]:
+def essential_count(study: Study, training: Log) -> Metrics:
     """Return the number of base parameters that an F-test keeps on clean data (the slides: 27 of 60)."""
     rows = training.rows
     samples, joints, p = rows.matrix.shape
+    # joint by joint, so that each has a σ of its own
     group = np.repeat(np.arange(joints), samples)
-    matrix, target = rows.matrix.transpose(1, 0, 2).reshape(-1, p), rows.target.T.ravel()
-    data = collect(matrix, target, group, study.base.names, study.base.units)
-    gone = eliminate(data, Rule.F, std=subsystem_std(data))
-    return {"F": len(gone.kept), "names": [study.base.names[k] for k in gone.kept], "slides": SLIDES["essential"]}
+    matrix = rows.matrix.transpose(1, 0, 2).reshape(-1, p)
+    data = collect(matrix, rows.target.T.ravel(), group, study.base.names, study.base.units)
+    kept = eliminate(data, Rule.F, std=subsystem_std(data)).kept
+    return {"F": len(kept), "names": [study.base.names[k] for k in kept], "slides": SLIDES["essential"]}
 
 
-def controllers(study: Study, log: Log) -> dict[str, LoopController]:
+def assumed_controllers(study: Study, log: Log) -> dict[str, LoopController]:
     """Return the controllers to try on degraded data: identified from that log, and wrong ones."""
-    found = identify_controller(log.reference, log.seen, np.asarray(log.run.tau), RATE / EVERY)
-    right = study.controller
-    assumed = (found.controller, pd(1.3 * right.kp, 0.7 * right.kd), right.slower(2.0), right.slower(3.0))
-    return dict(zip(TRIED, assumed))
+    identified = identify_controller(log.reference, log.positions, np.asarray(log.run.tau), RATE / EVERY)
+    true = study.controller
+    wrong_gains = pd(1.3 * true.kp, 0.7 * true.kd)
+    controllers = (identified.controller, wrong_gains, true.slower(2.0), true.slower(3.0))
+    return dict(zip(TRIED, controllers))
 
 
-def run(out: Path, quick: bool = False, seed: int = 0, tried: Container[str] = TRIED) -> dict[str, Any]:
-    """Run the study, on degraded data with the named ones of the controllers; write and return the metrics."""
+def run_controllers(study: Study, log: Log, validation: list[Log], names: Container[str]) -> Metrics:
+    """Return the metrics of IV and PC-IV on degraded data with assumed controllers.
+
+    Args:
+        study: robot, model and true controller.
+        log: the degraded log.
+        validation: degraded logs of other motions.
+        names: controllers to try.
+    """
+    metrics: Metrics = {}
+    for name, controller in assumed_controllers(study, log).items():
+        if name not in names:
+            continue
+        try:
+            results = {method: estimate(study, log, controller, method) for method in ("IV", "PC-IV")}
+        except NotConverged as error:
+            # A wrong controller need not hold the robot.
+            metrics[name] = {"failed": str(error)}
+        else:
+            metrics[name] = judge(study, log, validation, results, controller)
+    return metrics
+
+
+def run(
+    out: Path, quick: bool = False, seed: int = 0, tried: Container[str] = TRIED, methods: Sequence[str] = METHODS
+) -> Metrics:
+    """Run the study; write and return the metrics.
+
+    Args:
+        out: folder for metrics and figures.
+        quick: shorter motions, fewer candidates, two kinds of data.
+        seed: seed of motions and noise.
+        tried: controllers on degraded data.
+        methods: instrumental methods, IV and PC-IV among them.
+    """
+    extent = QUICK if quick else Extent()
     plant = known_robots.plant("tx40", coupled=True, offset=OFFSETS)
     model = known_robots.model(plant)
     study = Study(plant, model, bases.find(model), known_robots.controller("tx40"), seed)
-    training, others = references(quick, seed)
-    metrics: dict[str, Any] = {
+    training, unseen = references(extent, seed)
+    motions = [training, *unseen]
+    pushes = [unmodelled(study, motion) for motion in motions]
+    metrics: Metrics = {
         "parameters": {"standard": model.p, "base": study.base.b},
         "by_construction": ["unmodelled torque", "noise of the degraded data", "offsets", "truth"],
         "slides": SLIDES,
     }
-    pushes = [unmodelled(study, reference) for reference in (training, *others)]
-    for kind in KINDS[: 2 if quick else None]:
-        motions = enumerate(zip((training, *others), pushes))
-        log, *rest = (record(study, reference, push, kind, number) for number, (reference, push) in motions)
+    for kind in extent.kinds:
+        logs = []
+        for number, (motion, push) in enumerate(zip(motions, pushes)):
+            logs.append(record(study, motion, push, kind, number))
+        log, *validation = logs
         if kind == "clean":
             metrics["essential"] = essential_count(study, log)
-        results = {name: estimate(study, log, study.controller, name) for name in ("IV", "PC-IV", "DIDIM")}
-        metrics[kind] = judge(study, log, rest, results, study.controller)
+        results = {name: estimate(study, log, study.controller, name) for name in methods}
+        metrics[kind] = judge(study, log, validation, results, study.controller)
         draw(study, log, results["IV"], out / f"residuals_{kind.replace(' ', '_')}.png")
         if kind == "degraded":
-            metrics["wrong controllers"] = {}
-            for name, controller in controllers(study, log).items():
-                if name not in tried:
-                    continue
-                try:
-                    found = {each: estimate(study, log, controller, each) for each in ("IV", "PC-IV")}
-                except NotConverged as error:  # a wrong controller need not hold the robot
-                    metrics["wrong controllers"][name] = {"failed": str(error)}
-                else:
-                    metrics["wrong controllers"][name] = judge(study, log, rest, found, controller)
+            metrics["wrong controllers"] = run_controllers(study, log, validation, tried)
     metrics["parameters"]["essential"] = metrics["essential"]["F"]
     files.write_json(out / "metrics.json", metrics)
     return metrics
 
 
-def signs(names: tuple[str, ...]) -> tuple[str, ...]:
+def positive_names(names: Sequence[str]) -> tuple[str, ...]:
     """Return the names of parameters that physics keeps positive: Ia, Fv, Fc, and moments ZZ about joint axes."""
     return tuple(name for name in names if name.startswith(("Ia", "Fv", "Fc", "ZZ")))
 
 
-def show(metrics: dict[str, Any]) -> None:
+def show(metrics: Metrics) -> None:
     """Print the tables next to those of the slides."""
-    count = metrics["parameters"]
-    print(
-        f"{count['standard']} standard, {count['base']} base parameters; F-test keeps {count['essential']} (slides: 27)"
-    )
-    for kind in filter(metrics.__contains__, KINDS):
-        table(kind, metrics[kind], SLIDES.get(kind, {}))
-    for name, found in metrics["wrong controllers"].items():
-        if "failed" in found:
-            print(f"\ndegraded, controller {name}: {found['failed']}")
-            continue
-        table(f"degraded, controller {name}", found, {})
+    counts = metrics["parameters"]
+    sizes = f"{counts['standard']} standard, {counts['base']} base parameters"
+    print(f"{sizes}; F-test keeps {counts['essential']} (slides: 27)")
+    for kind in KINDS:
+        if kind in metrics:
+            show_errors(kind, metrics[kind], SLIDES.get(kind, {}))
+    for name, errors in metrics["wrong controllers"].items():
+        title = f"degraded, controller {name}"
+        if "failed" in errors:
+            print(f"\n{title}: {errors['failed']}")
+        else:
+            show_errors(title, errors, {})
 
 
-def table(title: str, found: dict[str, Any], slides: dict[str, Any]) -> None:
-    """Print one set [%]: direct and torque_error joint by joint, cross motion by motion."""
-    said, rounds = found["verdict"], {name: len(one) for name, one in found["rounds"].items()}
-    test = f"F = {said['F']:.3g}, largest shift {said['largest_shift_in_sigma']:.2g} sigma"
-    print(f"\n{title}: {found['estimated']} parameters, rounds {rounds}")
-    print(f"  least squares biased: {said['least_squares_biased']} ({test})")
-    for part in ("direct", "cross", "torque_error"):
-        for method, errors in found[part].items():
-            known = slides.get(part, {}).get(method)
-            beside = "" if known is None else "   slides " + " ".join(f"{x:5.1f}" for x in known)
-            print(f"  {part:12} {method:6}" + " ".join("     -" if x is None else f"{x:6.2f}" for x in errors) + beside)
+def show_errors(title: str, metrics: Metrics, slides: Metrics) -> None:
+    """Print one set [%]: direct and torque_error joint by joint, cross motion by motion.
+
+    Args:
+        title: name of the set.
+        metrics: metrics of the set.
+        slides: errors in the slides, by part and method.
+    """
+    test = metrics["verdict"]
+    rounds = {name: len(steps) for name, steps in metrics["rounds"].items()}
+    print(f"\n{title}: {metrics['estimated']} parameters, rounds {rounds}")
+    numbers = f"F = {test['F']:.3g}, largest shift {test['largest_shift_in_sigma']:.2g} sigma"
+    print(f"  least squares biased: {test['least_squares_biased']} ({numbers})")
+    for part in PARTS:
+        for method, errors in metrics[part].items():
+            cells = ["     -" if error is None else f"{error:6.2f}" for error in errors]
+            line = f"  {part:12} {method:6}{' '.join(cells)}"
+            if method in slides.get(part, {}):
+                line += "   slides " + " ".join(f"{error:5.1f}" for error in slides[part][method])
+            print(line)
 
 
-def draw(study: Study, log: Log, found: Instrumental, path: Path) -> None:
+def draw(study: Study, log: Log, result: Instrumental, path: Path) -> None:
     """Draw autocorrelation, partial autocorrelation and histogram of residuals, joint by joint, as the slides do."""
     import matplotlib.pyplot as plt
 
-    series = {
-        "LS": np.subtract(*with_measured(log, found.ordinary.estimate.values)),
-        "IV": np.subtract(*with_simulated(study, log, found.fit.estimate.values, study.controller)),
-    }
+    least_squares = with_measured(log, result.ordinary.estimate.values)
+    instrumental = with_simulated(study, log, result.fit.estimate.values, study.controller)
+    series = {"LS": least_squares.residual, "IV": instrumental.residual}
+    x = np.linspace(-4.0, 4.0, 100)
+    normal_density = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
     figure, axes = plt.subplots(3, 6, figsize=(15, 7))
-    for j in range(6):
-        for k, (name, values) in enumerate(series.items()):
-            looked = examine(values[:, j])
-            lags = np.arange(1, len(looked.acf) + 1) + 0.3 * k
-            for axis, heights in ((axes[0, j], looked.acf), (axes[1, j], looked.pacf)):
+    for joint, (acf_axis, pacf_axis, histogram) in enumerate(axes.T):
+        for k, (name, residuals) in enumerate(series.items()):
+            residual = residuals[:, joint]
+            correlation = examine(residual)
+            lags = np.arange(1, len(correlation.acf) + 1) + 0.3 * k
+            for axis, heights in ((acf_axis, correlation.acf), (pacf_axis, correlation.pacf)):
                 axis.vlines(lags, 0.0, heights, color=f"C{k}", lw=1.0, label=name)
-                axis.axhspan(-looked.bound, looked.bound, color="0.9", zorder=0)
+                axis.axhspan(-correlation.bound, correlation.bound, color="0.9", zorder=0)
                 axis.set_ylim(-0.6, 1.0)
-            axes[2, j].hist(values[:, j] / values[:, j].std(), 40, histtype="step", color=f"C{k}", density=True)
-        x = np.linspace(-4.0, 4.0, 100)
-        axes[2, j].plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), "k:", lw=0.8)
-        axes[0, j].set_title(f"joint {j + 1}")
-    for row, name in zip(axes[:, 0], ("autocorrelation", "partial autocorrelation", "residual / std")):
-        row.set_ylabel(name)
+            histogram.hist(residual / residual.std(), 40, histtype="step", color=f"C{k}", density=True)
+        histogram.plot(x, normal_density, "k:", lw=0.8)
+        acf_axis.set_title(f"joint {joint + 1}")
+    for axis, label in zip(axes[:, 0], ("autocorrelation", "partial autocorrelation", "residual / std")):
+        axis.set_ylabel(label)
     axes[0, 0].legend(fontsize=7)
     figure.tight_layout()
     figure.savefig(path, dpi=80)
     plt.close(figure)
 
 
-def readme_rows(metrics: dict[str, Any]) -> list[str]:
+def readme_rows(metrics: Metrics) -> list[str]:
     """Return the README's table [%]: joints 1 to 6, or three other motions."""
-    sets = {kind: metrics[kind] for kind in KINDS if kind in metrics}
-    sets |= {
-        f"degraded, {name}": found for name, found in metrics["wrong controllers"].items() if "failed" not in found
-    }
+    # label of a set: its metrics, and the slides' errors by part and method
+    sets: dict[str, tuple[Metrics, Metrics]] = {}
+    for kind in KINDS:
+        if kind in metrics:
+            sets[kind] = metrics[kind], SLIDES.get(kind, {})
+    for name, errors in metrics["wrong controllers"].items():
+        slides = SLIDES["identified controllers"] if name == "identified" else {}
+        if "failed" not in errors:
+            sets[f"degraded, {name}"] = errors, slides
     rows = ["| | LS | PC-LS | IV | PC-IV | slides: LS, IV |", "|---|---|---|---|---|---|"]
-    for kind, found in sets.items():
-        known = SLIDES.get("identified controllers" if kind == "degraded, identified" else kind, {})
-        for part, words in (("direct", "direct"), ("cross", "cross"), ("torque_error", "another motion, noise-free")):
-            cells = [_cell(found[part][name]) for name in ("LS", "PC-LS", "IV", "PC-IV")]
-            said = [_cell(known[part][name]) if name in known.get(part, {}) else "–" for name in ("LS", "IV")]
-            rows.append(f"| {kind}, {words} | {' | '.join(cells)} | {' / '.join(said) if known.get(part) else '–'} |")
+    for kind, (errors, slides) in sets.items():
+        for part, label in PARTS.items():
+            cells = [_cell(errors[part][name]) for name in COLUMNS]
+            rows.append(f"| {kind}, {label} | {' | '.join(cells)} | {_slides_cell(slides.get(part, {}))} |")
     return rows
 
 
-def _cell(values: list[float | None]) -> str:
-    return " ".join("–" if x is None else f"{x:.1f}" for x in values)
+def _slides_cell(errors: dict[str, list[float]]) -> str:
+    """Return the slides' errors of LS and IV; a dash for those that they do not have."""
+    if not errors:
+        return "–"
+    cells = [_cell(errors[name]) if name in errors else "–" for name in ("LS", "IV")]
+    return " / ".join(cells)
 
 
-def write_readme(metrics: dict[str, Any], path: Path) -> None:
+def _cell(errors: Sequence[float | None]) -> str:
+    cells = ["–" if error is None else f"{error:.1f}" for error in errors]
+    return " ".join(cells)
+
+
+def write_readme(metrics: Metrics, path: Path) -> None:
     """Put the table between the marks of a README."""
-    text = path.read_text(encoding="utf-8")
-    head, rest = text.split(MARKS[0])
-    files.write(path, "\n".join([head + MARKS[0], *readme_rows(metrics), MARKS[1] + rest.split(MARKS[1])[1]]))
+    start, end = MARKS
+    head, rest = path.read_text(encoding="utf-8").split(start)
+    _, tail = rest.split(end)
+    files.write(path, "\n".join([head + start, *readme_rows(metrics), end + tail]))
 
 
 def main() -> None:
@@ -383,12 +562,13 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="shorter motions, fewer candidates, two sets")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--tried", nargs="+", choices=TRIED, default=TRIED, help="controllers on degraded data")
+    parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS, help="IV and PC-IV among them")
     parser.add_argument("--readme", action="store_true", help="put the table into the README beside this script")
-    options = parser.parse_args()
-    options.out.mkdir(parents=True, exist_ok=True)
-    metrics = run(options.out, options.quick, options.seed, options.tried)
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    metrics = run(arguments.out, arguments.quick, arguments.seed, arguments.tried, arguments.methods)
     show(metrics)
-    if options.readme:
+    if arguments.readme:
         write_readme(metrics, Path(__file__).with_name("README.md"))
 
 
