@@ -60,7 +60,7 @@ def teach(path: str) -> None:
     write_measured(replace(seen, sigma=None, sigma_rotation=None), path, degrees=False)
 
 
-def missed(q: np.ndarray) -> float:
+def target_error(q: np.ndarray) -> float:
     """Return the distance of the real tool from the taught places at joint values q (50, 6) [rad]: rms [mm]."""
     off = cell.true_poses(ur5(), q)[:, :3, 3] - cell.true_poses(ur5(), TAUGHT)[:, :3, 3]
     return float(1e3 * np.sqrt(np.mean(np.sum(off**2, axis=1))))
