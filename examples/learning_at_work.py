@@ -141,7 +141,7 @@ def ridge(w: np.ndarray, y: np.ndarray, samples: int) -> np.ndarray:
     target = left.T @ y
     squares = float(y @ y)
     best_evidence = -np.inf
-    best_denominator = singular**2
+    best_denominator = np.full_like(singular, np.inf)
     for ratio in RIDGES:
         size = ratio * singular[0] ** 2
         denominator = singular**2 + size
@@ -212,9 +212,8 @@ def errors_by_length(robot: str) -> Iterator[dict[str, float]]:
 
 def line(robot: str, row: dict[str, float]) -> str:
     """Return a line of the table."""
-    cells = [robot]
-    for name in ("seconds", "identify", "update", *REFERENCES):
-        cells.append(f"{row[name]:.4g}")
+    columns = ("seconds", "identify", "update", *REFERENCES)
+    cells = [robot, *(f"{row[name]:.4g}" for name in columns)]
     best = min(row[name] for name in REFERENCES)
     cells.append(f"{row['identify'] / best:.2f}, {row['update'] / best:.2f}")
     return f"| {' | '.join(cells)} |"
