@@ -76,24 +76,25 @@ KR300_B = "kuka_kr300_tuk/traj_B.npz"
 UR10E_8 = "ur10e_innopolis/ur-20_02_05-20sec_8harm.npz"
 UR10E_12 = "ur10e_innopolis/ur-20_02_10-30sec_12harm.npz"
 UR10E_14 = "ur10e_innopolis/ur-20_02_19_14harm50sec.npz"
-GAINS = {"gains": [14.87, 13.26, 11.13, 10.62, 11.03, 11.47]}
-WRIST = {"coupling": [{"joints": [5, 6], "label": "6"}]}
-# name, recording to learn from, unseen recording, options of the identification
+DEFAULTS = calib.IdentifySettings()
+GAINS = calib.IdentifySettings(gains=(14.87, 13.26, 11.13, 10.62, 11.03, 11.47))  # [N m/A]
+WRIST = calib.IdentifySettings(coupling=({"joints": [5, 6], "label": "6"},))  # one motor moves axes 5 and 6
+# name, recording to learn from, unseen recording, settings of the identification
 MOTIONS = (
-    ("Panda, first 9.4 s", f"{PANDA}@0:9.387", f"{PANDA}@9.387:", {}),
-    ("Panda, first 4 s", f"{PANDA}@0:4", f"{PANDA}@4:", {}),
-    ("Panda, first 1 s", f"{PANDA}@0:1", f"{PANDA}@4:", {}),
-    ("Panda, last 8.8 s", f"{PANDA}@3.13:", f"{PANDA}@0:3.13", {}),
+    ("Panda, first 9.4 s", f"{PANDA}@0:9.387", f"{PANDA}@9.387:", DEFAULTS),
+    ("Panda, first 4 s", f"{PANDA}@0:4", f"{PANDA}@4:", DEFAULTS),
+    ("Panda, first 1 s", f"{PANDA}@0:1", f"{PANDA}@4:", DEFAULTS),
+    ("Panda, last 8.8 s", f"{PANDA}@3.13:", f"{PANDA}@0:3.13", DEFAULTS),
     ("UR10e, 12 harmonics", UR10E_12, UR10E_14, GAINS),
     ("UR10e, 8 harmonics", UR10E_8, UR10E_14, GAINS),
     ("UR10e, 8 harmonics", UR10E_8, UR10E_12, GAINS),
     ("UR10e, 4 s of 12 harmonics", f"{UR10E_12}@8:12", UR10E_14, GAINS),
     ("TX40, first 4 s", f"{TX40}@0:4", f"{TX40}@4:", WRIST),
     ("TX40, first 2.7 s", f"{TX40}@0:2.7", f"{TX40}@2.7:", WRIST),
-    ("KR300 A", KR300_A, KR300_B, {}),
-    ("KR300 B", KR300_B, KR300_A, {}),
-    ("TIAGo, first 50 s", f"{TIAGO}@0:50", f"{TIAGO}@50:", {}),
-    ("LWR4+, first half", f"{LWR}@2.5:8.75", f"{LWR}@8.75:15", {}),
+    ("KR300 A", KR300_A, KR300_B, DEFAULTS),
+    ("KR300 B", KR300_B, KR300_A, DEFAULTS),
+    ("TIAGo, first 50 s", f"{TIAGO}@0:50", f"{TIAGO}@50:", DEFAULTS),
+    ("LWR4+, first half", f"{LWR}@2.5:8.75", f"{LWR}@8.75:15", DEFAULTS),
 )
 
 
@@ -227,13 +228,12 @@ def torque_row(name: str, split: str, model: calib.DynamicsModel) -> str:
 
 def motion_rows(chosen: Sequence[str] = ()) -> Iterator[str]:
     """Yield the rows of the torques' table, all or those whose first cells are chosen."""
-    for name, train, unseen, options in MOTIONS:
+    for name, train, unseen, settings in MOTIONS:
         split = Path(unseen).name
         if chosen and not f"{name} | {split}".startswith(tuple(chosen)):
             continue
         robot = (DATA / train).parent / "model.urdf"
-        settings = parse_options(options)
-        model = calib.identify_dynamics(robot, str(DATA / train), validate=str(DATA / unseen), options=settings)
+        model = calib.identify_dynamics(robot, str(DATA / train), settings, validate=str(DATA / unseen))
         yield torque_row(name, split, model)
 
 

@@ -61,7 +61,7 @@ def measure(path: str, poses: int = 80) -> None:
 
 def teach(path: str) -> None:
     """Write target positions [m] in the instrument's frame, and joint values [rad] near their solutions."""
-    exact = cell.SimulatedInstrument(position_sigma=0.0, orientation_sigma=0.0, encoder_sigma=0.0)
+    exact = calib.SimulatedInstrument(position_sigma=0.0, orientation_sigma=0.0, encoder_sigma=0.0)
     targets = cell.measure(replace(ur5(), instrument=exact), TAUGHT)
     write_measured(replace(targets, sigma=None, sigma_rotation=None), path, degrees=False)
 
@@ -89,7 +89,7 @@ def random_motion(arm: virtual_arm.MovingArm, limits: tuple[np.ndarray, np.ndarr
 
 def tracker(plan: str, path: str, robot: str = "tx40") -> None:
     """Measure planned poses with a laser tracker: joints [deg] and the reflector's position [mm], a row per pose."""
-    instrument = cell.SimulatedInstrument("laser tracker", position_sigma=15e-6, orientation_sigma=None)
+    instrument = calib.SimulatedInstrument("laser tracker", position_sigma=15e-6, orientation_sigma=None)
     arm = virtual_cells.virtual_cell(robot, 0, instrument)
     q = read_poses(Path(plan), Joints.of(arm.nominal.joint_names))
     write_measured(cell.measure(arm, q, seed=1), path)

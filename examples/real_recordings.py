@@ -9,20 +9,16 @@ import argparse
 import os
 import tempfile
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 import calib
-from calib.data.poses.fit_options import FitOptions
-from calib.identification.identify_options import parse_options
 from calib.procedure.export.delivery import prediction
-from calib.procedure.kinematic_stage import fit, inputs
 
 DATA = Path(os.environ.get("CALIB_DATA", "../shared/data"))
-WRIST = {"coupling": [{"joints": [5, 6], "label": "6"}]}
+WRIST = calib.IdentifySettings(coupling=({"joints": [5, 6], "label": "6"},))  # one motor moves axes 5 and 6
 
 
 @dataclass(frozen=True)
@@ -59,14 +55,14 @@ class DynamicsRow:
         document: how the document's row begins.
         train: the recording to learn from, below `DATA`.
         unseen: another motion, in the same folder.
-        options: of the identification.
+        settings: of the identification.
         exported: whether the exported robot is judged, too.
     """
 
     document: str
     train: str
     unseen: str
-    options: dict[str, Any] = field(default_factory=dict)
+    settings: calib.IdentifySettings | None = None
     exported: bool = False
 
     unit = "%"
@@ -74,7 +70,7 @@ class DynamicsRow:
 
     def run(self) -> tuple[float, ...]:
         """Make the figures anew."""
-        return dynamics(DATA / self.train, self.unseen, self.options, self.exported)
+        return dynamics(DATA / self.train, self.unseen, self.settings, self.exported)
 
 
 def geometry(robot: Path, measured: str, unseen: str, holdout: float) -> tuple[float, ...]:
@@ -83,8 +79,8 @@ def geometry(robot: Path, measured: str, unseen: str, holdout: float) -> tuple[f
     unseen_files = []
     if unseen:
         unseen_files.append(robot.parent / unseen)
-    measurements = inputs.gather(robot, [robot.parent / measured], unseen_files, settings=settings)
-    (validation,) = fit.run(measurements, FitOptions(), settings).validation.values()
+    fit = calib.fit_geometry(robot, robot.parent / measured, settings, validate=unseen_files)
+    (validation,) = fit.validation.values()
     nominal, corrected = validation.errors
     delivered = validation.alone or corrected  # what robot.urdf holds, without joint corrections
     return rms_mm(nominal.main), rms_mm(delivered.main), rms_mm(corrected.main)
@@ -95,14 +91,13 @@ def rms_mm(errors: np.ndarray) -> float:
     return 1e3 * float((errors**2).mean() ** 0.5)
 
 
-def dynamics(train: Path, unseen: str, options: dict[str, Any], exported: bool) -> tuple[float, ...]:
+def dynamics(train: Path, unseen: str, settings: calib.IdentifySettings | None, exported: bool) -> tuple[float, ...]:
     """Return the relative torque error [%] on a validation motion: identified model, in motion, exported robot.
 
     The second one where joints stand in that motion, the third one where it is asked for.
     """
     robot = train.parent / "model.urdf"
-    settings = parse_options(options)
-    model = calib.identify_dynamics(robot, str(train), validate=str(train.parent / unseen), options=settings)
+    model = calib.identify_dynamics(robot, str(train), settings, validate=str(train.parent / unseen))
     (validation,) = model.validation.values()
     figures = [validation.raw.total]
     if validation.stands:

@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+import calib
 from calib import files
 from calib.data.images.image_folders import find_corners, read_images
 from calib.data.images.lens import Lens
@@ -51,7 +52,7 @@ from calib.simulation.camera_cell import (
     take_pictures,
     views,
 )
-from calib.simulation.cell import Cell, SimulatedInstrument, measure
+from calib.simulation.cell import Cell, measure
 from calib.simulation.truth import position_errors
 from calib.simulation.virtual_cells import rigid, virtual_cell
 from calib.transforms import pose
@@ -64,8 +65,8 @@ MAX_VIEWS = 1000  # different postures of a fit that is timed
 SMALL = Lens("pinhole", np.array([780.0, 782.0, 400.0, 298.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (800, 600))
 ENCODER = 1e-5  # noise of the joint values [rad]
 NOISE = 0.05  # of projected corners [px]
-CAMERA = SimulatedInstrument("camera", encoder_sigma=ENCODER)
-TRACKER = SimulatedInstrument("laser tracker", 20e-6, None, encoder_sigma=ENCODER)
+CAMERA = calib.SimulatedInstrument("camera", encoder_sigma=ENCODER)
+TRACKER = calib.SimulatedInstrument("laser tracker", 20e-6, None, encoder_sigma=ENCODER)
 RENDERED = "rigid arm, rendered images"
 PROJECTED = "hidden deflections, projected corners"
 

@@ -23,13 +23,14 @@ import pinocchio
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+import calib
 from calib import cli
 from calib.robot.kinematics import forward
-from calib.simulation.cell import Cell, SimulatedInstrument, measure, true_poses
+from calib.simulation.cell import Cell, measure, true_poses
 from calib.simulation.virtual_cells import virtual_cell
 
 HERE = Path(__file__).parent
-TRACKER = SimulatedInstrument("laser tracker", 20e-6, None)
+TRACKER = calib.SimulatedInstrument("laser tracker", 20e-6, None)
 POSES = 40
 VALIDATION = 20
 HIDDEN = 3  # poses that the tracker did not see
