@@ -39,19 +39,23 @@ class Log:
         log = np.load(path)
         rate = 1.0 / np.median(np.diff(log["t"]))
         grid = np.arange(log["t"][0], log["t"][-1], 1.0 / rate)
-        q = np.column_stack([np.interp(grid, log["t"], column) for column in log["q"].T])
-        tau = np.column_stack([np.interp(grid, log["t"], column) for column in log["tau"].T])
-        smooth = filtfilt(*butter(4, cutoff / (rate / 2)), q, axis=0)
-        v = np.gradient(smooth, 1 / rate, axis=0)
+        numerator, denominator = butter(4, cutoff / (rate / 2))
+        q = filtfilt(numerator, denominator, _resampled(grid, log["t"], log["q"]), axis=0)
+        v = np.gradient(q, 1 / rate, axis=0)
         a = np.gradient(v, 1 / rate, axis=0)
         decimated = slice(None, None, max(1, round(rate / RATE)))
         self.t = grid[decimated]
-        self.tau = tau[decimated]
-        self.rows = _regressor(model, smooth[decimated], v[decimated], a[decimated])
+        self.tau = _resampled(grid, log["t"], log["tau"])[decimated]
+        self.rows = _regressor(model, q[decimated], v[decimated], a[decimated])
         self.payload_torque = np.zeros_like(self.tau)
         if payload is not None:
             last_body = slice(10 * (model.njoints - 2), 10 * (model.njoints - 1))
             self.payload_torque = self.rows[:, :, last_body] @ _payload_parameters(model, payload)
+
+
+def _resampled(grid: np.ndarray, t: np.ndarray, series: np.ndarray) -> np.ndarray:
+    """Return series (N, n) at instants t (N,) [s], interpolated at the instants of a grid."""
+    return np.column_stack([np.interp(grid, t, column) for column in series.T])
 
 
 def _regressor(model: pin.Model, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -61,8 +65,10 @@ def _regressor(model: pin.Model, q: np.ndarray, v: np.ndarray, a: np.ndarray) ->
     for position, velocity, acceleration in zip(q, v, a):
         bodies = pin.computeJointTorqueRegressor(model, data, position, velocity, acceleration)
         coulomb = np.diag(np.tanh(velocity / SIGN_WIDTH))
+        viscous = np.diag(velocity)
+        rotor = np.diag(acceleration)
         offset = np.eye(len(velocity))
-        rows.append(np.hstack([bodies, coulomb, np.diag(velocity), np.diag(acceleration), offset]))
+        rows.append(np.hstack([bodies, coulomb, viscous, rotor, offset]))
     return np.array(rows)
 
 
@@ -84,15 +90,15 @@ def _evidence(rows: np.ndarray, tau: np.ndarray, mean: np.ndarray, scale: np.nda
         groups: (p,) number of the group that a parameter shares its precision with.
     """
     samples, n, _ = rows.shape
-    rest = tau - rows @ mean
+    target = tau - rows @ mean
     scaled = [rows[:, j] * scale for j in range(n)]
     # joint by joint: Hessian, gradient and constant of the sum of squares
     hessian = [matrix.T @ matrix for matrix in scaled]
-    gradient = [matrix.T @ rest[:, j] for j, matrix in enumerate(scaled)]
-    squares = (rest**2).sum(axis=0)
+    gradient = [matrix.T @ target[:, j] for j, matrix in enumerate(scaled)]
+    squares = (target**2).sum(axis=0)
     precision = np.full(groups.max() + 1, 1e-2)
     rows_as_one = np.full(n, 10.0)
-    noise = 0.01 * rest.var(axis=0) + 1e-6
+    noise = 0.01 * target.var(axis=0) + 1e-6
     for _ in range(ROUNDS):
         variance = noise * rows_as_one
         information = sum(hessian[j] / variance[j] for j in range(n))
@@ -101,16 +107,22 @@ def _evidence(rows: np.ndarray, tau: np.ndarray, mean: np.ndarray, scale: np.nda
         determined = 1 - precision[groups] * np.diag(covariance)
         for k in range(len(precision)):
             members = groups == k
+            number = max(determined[members].sum(), 0.1)
             size = max((x[members] ** 2).sum(), 1e-12)
-            precision[k] = np.clip(max(determined[members].sum(), 0.1) / size, 1e-6, 1e8)
+            precision[k] = np.clip(number / size, 1e-6, 1e8)
         for j in range(n):
             residual_squares = squares[j] - 2 * x @ gradient[j] + x @ hessian[j] @ x
             freedom = samples - np.trace(covariance @ hessian[j]) / rows_as_one[j]
             noise[j] = max(residual_squares / max(freedom, samples * 0.05), 1e-8)
-            residual = rest[:, j] - scaled[j] @ x
-            rho = np.clip(np.corrcoef(residual[1:], residual[:-1])[0, 1], 0, 0.99)
-            rows_as_one[j] = min((1 + rho) / (1 - rho), MAX_ROWS_AS_ONE)
+            rows_as_one[j] = _correlated_rows(target[:, j] - scaled[j] @ x)
     return mean + scale * x
+
+
+def _correlated_rows(residual: np.ndarray) -> float:
+    """Return how many rows count as one, by the lag-one correlation ρ of residuals (N,): (1 + ρ) / (1 - ρ)."""
+    correlation = np.corrcoef(residual[1:], residual[:-1])[0, 1]
+    rho = np.clip(correlation, 0, 0.99)
+    return min((1 + rho) / (1 - rho), MAX_ROWS_AS_ONE)
 
 
 def recorded_model(urdf: Path, joints: Sequence[str] = ()) -> pin.Model:

@@ -16,6 +16,7 @@ from scipy.signal import lfilter
 import calib
 from calib.apps.cell_demo import demo
 from calib.data.poses.pose_lists import read_poses
+from calib.data.recordings.recording import Recording
 from calib.data.schema import Joints
 from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
@@ -164,27 +165,38 @@ def log(path: str, robot: str, motion: str, what: str = "torque", load: str = ""
         load: "load": with the load of `moving`.
     """
     arm = moving(robot, load == "load")
-    noise_seed = sum(map(ord, path))
     if Path(motion).is_dir():
-        design = coefficients.read(Path(motion))
-        t = np.arange(round(design.period * design.rate) + 1) / design.rate
-        reference = virtual_arm.play(t, *design.orders(t), 2)
+        reference = played_design(Path(motion))
     else:
         limits = (np.maximum(arm.chain.lower, -2.5), np.minimum(arm.chain.upper, 2.5))
         reference = random_motion(arm, limits, seed=int(motion))
+    noise_seed = sum(map(ord, path))
     recording = virtual_arm.record(arm, reference, noise_seed)
-    if what == "both":
-        write_log(recording, path)
-        return
-    if what == "link":
-        recording = replace(recording, effort=recording.tau_link)
-    elif what == "current":
-        recording = replace(recording, effort=recording.effort / GAINS)
-    file = write_log(replace(recording, tau_link=None), path)
-    if what == "current":
-        header, rows = file.read_text().split("\n", 1)
-        header = header.replace("tau_", "current_").replace("[Nm]", "[A]")
-        file.write_text(header + "\n" + rows)
+    match what:
+        case "both":
+            write_log(recording, path)
+        case "link":
+            write_log(replace(recording, effort=recording.tau_link, tau_link=None), path)
+        case "current":
+            write_currents(recording, path)
+        case _:
+            write_log(replace(recording, tau_link=None), path)
+
+
+def played_design(folder: Path) -> Reference:
+    """Return the motion of a design's folder, played twice."""
+    design = coefficients.read(folder)
+    t = np.arange(round(design.period * design.rate) + 1) / design.rate
+    return virtual_arm.play(t, *design.orders(t), 2)
+
+
+def write_currents(recording: Recording, path: str) -> None:
+    """Write a log with motor currents [A] in place of torques."""
+    currents = recording.effort / GAINS
+    file = write_log(replace(recording, effort=currents, tau_link=None), path)
+    header, rows = file.read_text().split("\n", 1)
+    header = header.replace("tau_", "current_").replace("[Nm]", "[A]")
+    file.write_text(header + "\n" + rows)
 
 
 def degrade(log: str, path: str, noise: str = "1") -> None:
@@ -192,9 +204,9 @@ def degrade(log: str, path: str, noise: str = "1") -> None:
     header, rows = Path(log).read_text(encoding="utf-8").split("\n", 1)
     names = header.split(",")
     values = np.loadtxt(rows.splitlines(), delimiter=",")
-    positions = [name.startswith("q_") for name in names]
-    sigma = np.degrees(1e-3 * float(noise))
-    values[:, positions] += sigma * np.random.default_rng(0).normal(size=(len(values), sum(positions)))
+    positions = [k for k, name in enumerate(names) if name.startswith("q_")]
+    white = np.random.default_rng(0).normal(size=(len(values), len(positions)))
+    values[:, positions] += np.degrees(1e-3 * float(noise)) * white
     write_numbers(path, names, values)
 
 
@@ -206,7 +218,8 @@ def platform(folder: str) -> None:
     nominal = find("dualv").mechanism
     rng = np.random.default_rng(0)
     parameters = loop_parameters(nominal)
-    true = closed(changed(nominal.robot, parameters, 1e-3 * rng.normal(size=len(parameters))))
+    errors = 1e-3 * rng.normal(size=len(parameters))
+    true = closed(changed(nominal.robot, parameters, errors))
     _measure_platform(true, nominal, Path(folder, "measured.csv"), rng)
 
     model = make_parallel_model(true, ["Fv Fc"], v0=0.05, payloads=["plate"])
@@ -221,9 +234,12 @@ def platform(folder: str) -> None:
 def _measure_platform(true: ClosedRobot, nominal: ClosedRobot, path: Path, rng: np.random.Generator) -> None:
     """Write 60 platform poses with encoder readings: motors [deg], x, y [mm] and turn [deg]."""
     x = 0.9 * rng.uniform(nominal.robot.lower, nominal.robot.upper, (60, 3))
-    q = true.place(x).q[:, nominal.robot.actuated] + 1e-5 * rng.normal(size=(60, 4))
-    header = [*(f"{name} [deg]" for name in nominal.robot.joint_names), "x [mm]", "y [mm]", "rz [deg]"]
-    write_numbers(path, header, np.column_stack([np.degrees(q), 1e3 * x[:, :2], np.degrees(x[:, 2])]))
+    q = true.place(x).q[:, nominal.robot.actuated]
+    encoders = q + 1e-5 * rng.normal(size=q.shape)
+    header = [f"{name} [deg]" for name in nominal.robot.joint_names]
+    header += ["x [mm]", "y [mm]", "rz [deg]"]
+    table = np.column_stack([np.degrees(encoders), 1e3 * x[:, :2], np.degrees(x[:, 2])])
+    write_numbers(path, header, table)
 
 
 def _log_platform(regressor: PlatformRegressor, true: ClosedRobot, path: Path, rng: np.random.Generator) -> None:
@@ -237,11 +253,13 @@ def _log_platform(regressor: PlatformRegressor, true: ClosedRobot, path: Path, r
     velocity = (amplitude * (frequency * np.cos(angle))).sum(axis=0)
     acceleration = (amplitude * (-(frequency**2) * np.sin(angle))).sum(axis=0)
     motion = regressor.motion(x, velocity, acceleration)
-    q = motion.posture.q[:, true.robot.actuated] + 1e-5 * rng.normal(size=(len(t), 4))
+    q = motion.posture.q[:, true.robot.actuated]
+    encoders = q + 1e-5 * rng.normal(size=q.shape)
     tau = regressor.torques(motion) + 0.5 * rng.normal(size=q.shape)
-    motors = true.robot.joint_names
-    header = ["t [s]", *(f"{name}_q [deg]" for name in motors), *(f"{name}_tau [Nm]" for name in motors)]
-    write_numbers(path, header, np.column_stack([t, np.degrees(q), tau]))
+    header = ["t [s]"]
+    header += [f"{name}_q [deg]" for name in true.robot.joint_names]
+    header += [f"{name}_tau [Nm]" for name in true.robot.joint_names]
+    write_numbers(path, header, np.column_stack([t, np.degrees(encoders), tau]))
 
 
 def bring(session: str) -> None:
