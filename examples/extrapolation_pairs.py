@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import extrapolation_simulated as simulated
 import numpy as np
@@ -60,8 +61,15 @@ class Pair:
 
 # open recordings
 
-# a log's name, and from where to where [s] it is read
-Part = tuple[str, tuple[float, float]]
+
+class Part(NamedTuple):
+    """Part of a log: its name, begin and end [s]."""
+
+    log: str
+    begin: float = 0.0
+    end: float = np.inf
+
+
 # folder of each robot, and which of its samples are read: every first, second, fifth
 FOLDERS = {
     "Panda": ("franka_panda_inria", 2),
@@ -97,9 +105,9 @@ def _read(robot: str, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def _write_parts(robot: str, parts: Sequence[Part], stem: Path) -> list[Path]:
     """Write parts of a robot's logs as npz files of t, q, tau; return their paths."""
     paths = []
-    for k, (name, (low, high)) in enumerate(parts):
-        t, q, tau = _read(robot, name)
-        inside = (t >= low) & (t < high)
+    for k, part in enumerate(parts):
+        t, q, tau = _read(robot, part.log)
+        inside = (t >= part.begin) & (t < part.end)
         path = Path(f"{stem}_{k}.npz")
         np.savez(path, t=t[inside] - t[inside][0], q=q[inside], tau=tau[inside])
         paths.append(path)
@@ -128,9 +136,9 @@ def _halves(robot: str, name: str, window: float, criterion: Callable[..., float
     for k, (begin, end) in enumerate(pairwise(edges)):
         half = upper if is_upper[k] else lower
         # adjacent windows become one part
-        if half and half[-1][1][1] == begin:
-            begin = half.pop()[1][0]
-        half.append((name, (begin, end)))
+        if half and half[-1].end == begin:
+            begin = half.pop().begin
+        half.append(Part(name, begin, end))
     return lower, upper
 
 
@@ -169,7 +177,7 @@ def _open(
 
 def _span(robot: str, begin: float, end: float = np.inf) -> list[Part]:
     """Return the part of a robot's only log between two instants [s]."""
-    return [(FILES[robot], (begin, end))]
+    return [Part(FILES[robot], begin, end)]
 
 
 def _speeds(robot: str, name: str, window: float) -> Callable:
@@ -190,12 +198,11 @@ def _reach(robot: str, name: str, window: float, joint: int) -> Callable:
     return partial(_halves, robot, name, window, mean_position)
 
 
-ALL = (0.0, np.inf)
-STILL = [(f"01_17-p{k}", ALL) for k in range(1, 6)]
-SINGLE = [(f"01_22-joint_{k}", (4.0, 14.0)) for k in range(1, 7)]
+STILL = [Part(f"01_17-p{k}") for k in range(1, 6)]
+SINGLE = [Part(f"01_22-joint_{k}", 4.0, 14.0) for k in range(1, 7)]
 EIGHT, TEN, TWELVE = "02_05-20sec_8harm", "02_06-20sec_10harm", "02_10-30sec_12harm"
 FIVE, SEVEN, FOURTEEN = "02_06-20sec_5harm", "02_10-20sec_7harm", "02_19_14harm50sec"
-LATER = (FOURTEEN, (10.0, 30.0))
+LATER = Part(FOURTEEN, 10.0, 30.0)
 PANDA_PAIRS = [
     _open("Panda", "first 9.4 s → rest", _span("Panda", 0, 9.387), _span("Panda", 9.387), quick=True),
     _open("Panda", "first 4 s → rest", _span("Panda", 0, 4), _span("Panda", 4)),
@@ -206,20 +213,20 @@ PANDA_PAIRS = [
     _open("Panda", "low joint 2 → high joint 2", _reach("Panda", FILES["Panda"], 1.3, 2), across=True),
 ]
 UR10E_PAIRS = [
-    _open("UR10e", "8 → 14 harmonics", [(EIGHT, ALL)], [LATER], quick=True),
-    _open("UR10e", "7 → 5 harmonics", [(SEVEN, ALL)], [(FIVE, ALL)]),
-    _open("UR10e", "2 s of 12 → 14 harmonics", [(TWELVE, (8, 10))], [LATER], quick=True),
-    _open("UR10e", "2 s of 14 → 12 harmonics", [(FOURTEEN, (20, 22))], [(TWELVE, ALL)]),
-    _open("UR10e", "4 s of 12 → 14 harmonics", [(TWELVE, (8, 12))], [LATER]),
-    _open("UR10e", "5 s of 5 → 12 harmonics", [(FIVE, (3, 8))], [(TWELVE, (10, 25))]),
-    _open("UR10e", "2 s of 8 → 10 harmonics", [(EIGHT, (12, 14))], [(TEN, (5, 25))]),
-    _open("UR10e", "single joints → 10 harmonics", SINGLE, [(TEN, (5, 25))], across=True, quick=True),
+    _open("UR10e", "8 → 14 harmonics", [Part(EIGHT)], [LATER], quick=True),
+    _open("UR10e", "7 → 5 harmonics", [Part(SEVEN)], [Part(FIVE)]),
+    _open("UR10e", "2 s of 12 → 14 harmonics", [Part(TWELVE, 8, 10)], [LATER], quick=True),
+    _open("UR10e", "2 s of 14 → 12 harmonics", [Part(FOURTEEN, 20, 22)], [Part(TWELVE)]),
+    _open("UR10e", "4 s of 12 → 14 harmonics", [Part(TWELVE, 8, 12)], [LATER]),
+    _open("UR10e", "5 s of 5 → 12 harmonics", [Part(FIVE, 3, 8)], [Part(TWELVE, 10, 25)]),
+    _open("UR10e", "2 s of 8 → 10 harmonics", [Part(EIGHT, 12, 14)], [Part(TEN, 5, 25)]),
+    _open("UR10e", "single joints → 10 harmonics", SINGLE, [Part(TEN, 5, 25)], across=True, quick=True),
     _open("UR10e", "five postures and single joints → 14 harmonics", STILL + SINGLE, [LATER], across=True),
     _open(
         "UR10e",
         "five postures and joint 6 → 7 harmonics",
-        [*STILL, ("01_22-joint_6", (4, 40))],
-        [(SEVEN, ALL)],
+        [*STILL, Part("01_22-joint_6", 4, 40)],
+        [Part(SEVEN)],
         across=True,
     ),
     _open("UR10e", "slow windows → fast ones", _speeds("UR10e", EIGHT, 2.0), across=True),
@@ -238,10 +245,10 @@ TX40_PAIRS = [
     _open("TX40", "low joint 3 → high joint 3", _reach("TX40", FILES["TX40"], 0.9, 3), across=True, options=WRIST),
 ]
 KR300_PAIRS = [
-    _open("KR300", "A → B", [("A", ALL)], [("B", ALL)], across=True, quick=True),
-    _open("KR300", "B → A", [("B", ALL)], [("A", ALL)], across=True),
-    _open("KR300", "5 s of A → B", [("A", (0, 5))], [("B", ALL)], across=True),
-    _open("KR300", "3 s of B → rest of B", [("B", (2, 5))], [("B", (5, 10))]),
+    _open("KR300", "A → B", [Part("A")], [Part("B")], across=True, quick=True),
+    _open("KR300", "B → A", [Part("B")], [Part("A")], across=True),
+    _open("KR300", "5 s of A → B", [Part("A", 0, 5)], [Part("B")], across=True),
+    _open("KR300", "3 s of B → rest of B", [Part("B", 2, 5)], [Part("B", 5, 10)]),
     _open("KR300", "slow windows of A → fast ones", _speeds("KR300", "A", 1.25), across=True),
 ]
 TIAGO_PAIRS = [
