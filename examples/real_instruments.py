@@ -20,6 +20,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -166,26 +167,55 @@ def span(values: np.ndarray, digits: int) -> str:
     return f"{values.min():.{digits}g}–{values.max():.{digits}g}"
 
 
-def study(row: Row) -> str:
-    """Return a row of the table."""
+@dataclass(frozen=True, eq=False)
+class SharedResults:
+    """What the rows of a recording have in common.
+
+    Attributes:
+        robot: as `identify` takes it.
+        case: the recording to learn from.
+        unseen: another motion.
+        plain: the identification by least squares.
+        consistent: the estimate (b,) under physical constraints; None where it failed.
+    """
+
+    robot: Any
+    case: Case
+    unseen: Case
+    plain: Identification
+    consistent: np.ndarray | None
+
+
+@lru_cache(maxsize=1)
+def shared_results(train: str) -> SharedResults:
+    """Return what all rows of a recording have in common."""
+    row = next(row for row in ROWS if row.train == train)
     folder = DATA / row.folder
-    inputs = recordings.gather(
-        folder / "model.urdf", [folder / row.train], [folder / row.unseen], options=settings(row)
-    )
+    train_files = [folder / row.train]
+    unseen_files = [folder / row.unseen]
+    inputs = recordings.gather(folder / "model.urdf", train_files, unseen_files, options=settings(row))
     (case,) = inputs.cases
     (unseen,) = inputs.unseen
-    motion = case.motion
     plain = identify(inputs.robot, [case], inputs.options.settings)
+    return SharedResults(inputs.robot, case, unseen, plain, estimate(row, inputs.robot, case, "pc-wls"))
+
+
+def study(row: Row) -> str:
+    """Return a row of the table."""
+    shared = shared_results(row.train)
+    plain = shared.plain
+    case = shared.case
+    motion = case.motion
     series, period = nearest_series(motion, row.period, row.harmonics)
     distance = 1e3 * (motion.q - series.q).std(axis=0)
     noise = 1e3 * motion.cutoffs.noise
     acceleration_noise = motion.cutoffs.acceleration_noise(motion.cutoff, motion.rate)
     noise_share = 100.0 * acceleration_noise / motion.a.std(axis=0)
     series_values, tests = series_estimate(plain, case, series)
-    estimates = [plain.fitted.estimate.values, estimate(row, inputs.robot, case, "pc-wls"), series_values]
+    estimates = [plain.fitted.estimate.values, shared.consistent, series_values]
     # the series as reference of a simulated loop
     with_reference = replace(case, motion=replace(motion, q_ref=frozen(series.q)))
-    estimates += [estimate(row, inputs.robot, with_reference, method, loop=PD) for method in LOOP_METHODS]
+    estimates += [estimate(row, shared.robot, with_reference, method, loop=PD) for method in LOOP_METHODS]
     cells = [
         row.name,
         f"{row.harmonics} of {period:.2f} s",
@@ -194,7 +224,7 @@ def study(row: Row) -> str:
         f"{noise_share.max():.2g} %",
         tests,
     ]
-    cells += [error_cell(plain, values, unseen) for values in estimates]
+    cells += [error_cell(plain, values, shared.unseen) for values in estimates]
     return f"| {' | '.join(cells)} |"
 
 

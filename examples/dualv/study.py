@@ -1,10 +1,11 @@
 """The DualV study: parameters of an actuation-redundant parallel robot by its inverse dynamic and power models.
 
-    python examples/dualv/study.py --out dualv-study [--seeds 5] [--trials 5] [--readme]
+    python examples/dualv/study.py --out dualv-study [--seeds 5] [--trials 5] [--design] [--readme]
 
 A simulated DualV (Briot, Gautier & Krut 2013, two papers) runs designed motions without and with a payload of 5.37 kg,
 under computed torque with an internal preload. IDIM-WLS on the platform's coordinates and PIM-WLS on the power identify
 it from encoders and motor torques alone, from two motions at a time; the papers' Table II stands beside.
+The motions are stored, in `motions`; `--design` searches for them again, which takes most of the study's time.
 The truth obeys the model, its friction and noise are chosen: methods are compared, not a real robot's errors with the
 papers'.
 """
@@ -15,9 +16,10 @@ import argparse
 import json
 import os
 import time
+import tomllib
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +27,16 @@ import matplotlib.pyplot as plt
 import numpy as np
 from computed_torque import ComputedTorque, ParallelRun, simulate
 
+from calib import files
 from calib.estimation.essential import Rule, eliminate
 from calib.identification.identify import identify_model
 from calib.parallel.excite import ParallelExcitation, design_parallel
 from calib.parallel.mechanism.parallel_model import make_parallel_model, rows_named
 from calib.parallel.mechanism.velocities import distributed, overconstraint
 from calib.parallel.robots import find
+from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.settings import ExcitationSettings
+from calib.robot.tables import dumps
 from calib.toolkit.model_identification import Identification
 from calib.toolkit.recordings import FilterOptions, Recording, make_motion
 from calib.toolkit.statistics import Estimate
@@ -59,6 +64,7 @@ PAPERS = {  # identified value, sigma %: Table II of either paper
 }  # fmt: skip
 CROSS = (0.0987, 0.0841, 0.1492)  # the IDIM paper's relative errors of x, y, rz
 COORDINATES = ("x", "y", "rz")
+MOTIONS = Path(__file__).with_name("motions")
 MARKS = ("<!-- the table is written by --readme -->", "<!-- end of the table -->")
 
 
@@ -70,14 +76,20 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("dualv-study"))
     parser.add_argument("--seeds", type=int, default=SEEDS, help="of motions and noise; three at least")
     parser.add_argument("--trials", type=int, default=SEEDS, help="identifications, each from three of the motions")
+    parser.add_argument(
+        "--design", action="store_true", help="search for the motions, and store them beside this script"
+    )
     parser.add_argument("--workers", type=int, default=2, help="local processes for the designs")
     parser.add_argument("--readme", action="store_true", help="put the tables into the README beside this script")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     began, used = time.perf_counter(), os.times()
     seeds = range(options.seeds)
-    with ProcessPoolExecutor(options.workers) as pool:
-        designs = list(pool.map(designed, seeds))
+    if options.design:
+        with ProcessPoolExecutor(options.workers) as pool:
+            for seed, design in zip(seeds, pool.map(designed, seeds)):
+                store(design, seed)
+    designs = [Motion.read(seed) for seed in seeds]
     robot = Robot()
     runs = [{label: robot.run(designs[k], LOADS[label], k) for label in LOADS} for k in seeds]
     found = [Trial(robot, *(runs[(k + later) % len(runs)] for later in range(3))) for k in seeds[: options.trials]]
@@ -100,13 +112,38 @@ def put_into_readme(rows: list[str]) -> None:
     path.write_text("\n".join([head + MARKS[0], *rows, tail]), encoding="utf-8")
 
 
-def designed(seed: int) -> ParallelExcitation:
+def designed(seed: int, evaluations: int = MOST) -> ParallelExcitation:
     """Return a motion that excites robot and payload within 127 N m (a fifth of it kept free) and 25 g."""
     robot = Robot()
-    settings = ExcitationSettings(period=0.5, harmonics=5, starts=1, evaluations=MOST, seed=seed, rate=RATE)
+    settings = ExcitationSettings(period=0.5, harmonics=5, starts=1, evaluations=evaluations, seed=seed, rate=RATE)
     limits = np.array([ACCELERATION, ACCELERATION, np.inf])
     loaded = replace(robot.model, preload=(PRELOAD,))
     return design_parallel(find("dualv"), loaded, robot.values, settings, acceleration=limits)
+
+
+def store(design: ParallelExcitation, seed: int) -> None:
+    """Write a designed motion of the platform, with what was reached, to its folder beside this script."""
+    content = coefficients.table(design.periodic(design.found), "dualv", ())
+    torques, accelerations = design.peaks
+    content["reached"] = {
+        "evaluations": design.found.evaluations, "merit": design.found.merit, "condition": design.condition.table(),
+        "peak_torque": torques.tolist(), "peak_g": (accelerations[:2] / 9.81).tolist(),
+    }  # fmt: skip
+    files.write(MOTIONS / str(seed) / coefficients.NAME, dumps(content))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A stored motion of the platform's coordinates, and what its design reached."""
+
+    series: coefficients.Periodic
+    reached: dict[str, Any]
+
+    @classmethod
+    def read(cls, seed: int) -> Motion:
+        folder = MOTIONS / str(seed)
+        content = tomllib.loads((folder / coefficients.NAME).read_text(encoding="utf-8"))
+        return cls(coefficients.read(folder), content["reached"])
 
 
 class Robot:
@@ -120,9 +157,9 @@ class Robot:
         for name, value in PAYLOAD.items():
             self.values[self.model.names.index(name)] = value
 
-    def run(self, design: ParallelExcitation, carried: tuple[str, ...], seed: int) -> ParallelRun:
+    def run(self, motion: Motion, carried: tuple[str, ...], seed: int) -> ParallelRun:
         controller = ComputedTorque(self.values, preload=PRELOAD, rate=RATE, encoder=ENCODER_NOISE, torque=TORQUE_NOISE)
-        orders = design.orders(np.arange(int(SECONDS * RATE)) / RATE)
+        orders = motion.series.orders(np.arange(int(SECONDS * RATE)) / RATE)
         return simulate(self.model, self.values, controller, *orders, carried, seed)
 
 
@@ -207,20 +244,13 @@ class Trial:
         }
 
 
-def report(designs: list[ParallelExcitation], found: list[Trial]) -> dict[str, Any]:
+def report(designs: list[Motion], found: list[Trial]) -> dict[str, Any]:
     """Return the metrics of all seeds."""
     return {
         "truth": {name: float(found[0].truth[name]) for name in NINE},
         "base_parameters": {name: getattr(found[0], name).found.base.b for name in ("idim", "pim")},
         "inertial_base_parameters": found[0].inertial,
-        "designs": [
-            {
-                "evaluations": one.found.evaluations, "merit": one.found.merit,
-                "condition": one.condition.table(), "peak_torque": one.peaks[0].tolist(),
-                "peak_g": (one.peaks[1][:2] / 9.81).tolist(),
-            }
-            for one in designs
-        ],
+        "designs": [motion.reached for motion in designs],
         "runs": [trial.metrics() for trial in found],
     }  # fmt: skip
 

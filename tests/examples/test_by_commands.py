@@ -51,6 +51,7 @@ def test_scripts_are_short(study):
     assert len(re.findall(r"^\s*calib |^identify \S+\.csv", text, re.M)) <= 15
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("study", ["tx40", "dualv"])
 def test_prints_what_is_stored(study, tmp_path):

@@ -1,21 +1,19 @@
 """The search for exciting motions stands beside its peers as the study says; its motions: `test_lwr4plus_tables`."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scripts import run_here
 
 STUDIES = Path(__file__).parents[2] / "examples/lwr4plus"
 
 
 @pytest.mark.slow
-def test_exact_gradients_beat_differences(tmp_path: Path) -> None:
+def test_exact_gradients_beat_differences(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Exact gradients beat differences and chance in the same time."""
-    script = STUDIES / "excitation_peers.py"
-    subprocess.run([sys.executable, script, "--out", tmp_path, "--quick"], check=True, capture_output=True)
+    run_here(STUDIES / "excitation_peers.py", "--out", tmp_path, "--quick", capsys=capsys)
     found = json.loads((tmp_path / "metrics.json").read_text())
     best = {
         name: one["curve"][-1][1] if one["curve"] else np.inf

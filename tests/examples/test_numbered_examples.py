@@ -1,23 +1,13 @@
 """The numbered examples: short, complete, and they do what their first line says."""
 
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
-from scripts import require_same_package, run_here
+from scripts import run_here
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 NUMBERED = sorted(EXAMPLES.glob("0*.py"))
-
-
-def run(name: str, *arguments: object) -> str:
-    require_same_package()
-    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
 
 
 def figures(pattern: str, said: str) -> list[float]:
@@ -62,37 +52,41 @@ def test_04_compensate(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_03_session_as_script(tmp_path):
-    said = run("03_session_as_script.py", tmp_path)
+def test_03_session_as_script(tmp_path, capsys):
+    said = run_here(EXAMPLES / "03_session_as_script.py", tmp_path, capsys=capsys)
     assert "Provide" in said and "marginal: cell7" in said  # its arm hides what no rigid geometry explains
     assert (tmp_path / "cell7/certificate.html").is_file()
     assert (tmp_path / "cell7/9-export/robot.urdf").is_file()
 
 
 @pytest.mark.slow
-def test_05_design_excitation(tmp_path):
-    raw, _ = figures(r"([\d.]+) (?:raw|normalised)", said := run("05_design_excitation.py", tmp_path))
+def test_05_design_excitation(tmp_path, capsys):
+    raw, _ = figures(
+        r"([\d.]+) (?:raw|normalised)", said := run_here(EXAMPLES / "05_design_excitation.py", tmp_path, capsys=capsys)
+    )
     assert raw < 200 and "all limits are respected" in said
     assert (tmp_path / "motion/trajectory.yaml").is_file()
 
 
 @pytest.mark.slow
-def test_06_identify_dynamics(tmp_path):
-    said = run("06_identify_dynamics.py", tmp_path)
+def test_06_identify_dynamics(tmp_path, capsys):
+    said = run_here(EXAMPLES / "06_identify_dynamics.py", tmp_path, capsys=capsys)
     (unexplained,) = figures(r"unseen: ([\d.]+) % of the torque unexplained", said)
     assert unexplained < 8.0
 
 
 @pytest.mark.slow
-def test_07_plan_on_the_identified_model(tmp_path):
-    maker, identified = figures(r"model: ([\d.]+) s", run("07_plan_on_identified_model.py", tmp_path))
+def test_07_plan_on_the_identified_model(tmp_path, capsys):
+    maker, identified = figures(
+        r"model: ([\d.]+) s", run_here(EXAMPLES / "07_plan_on_identified_model.py", tmp_path, capsys=capsys)
+    )
     assert 0.1 < maker < identified  # friction, and a margin for what is not known
     assert (tmp_path / "motion/motion.csv").is_file()
 
 
 @pytest.mark.slow
-def test_08_certificate_and_fleet(tmp_path):
-    said = run("08_certificate_and_fleet.py", tmp_path)
+def test_08_certificate_and_fleet(tmp_path, capsys):
+    said = run_here(EXAMPLES / "08_certificate_and_fleet.py", tmp_path, capsys=capsys)
     assert said.count(": waits, ") == 2 and said.count("done, pass") == 2
     assert all((tmp_path / f"cell{k}/certificate.html").is_file() for k in (1, 2))
 

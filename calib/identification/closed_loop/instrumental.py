@@ -498,7 +498,14 @@ def _estimate_round(task: _Fixed, plant: Plant, runs: Runs, std: np.ndarray, tau
 def _sign_columns(task: _Fixed, case: Case) -> np.ndarray:
     """Return the columns (M, rows, k) of a case's drive terms whose value jumps with the sign of the speed."""
     base_signs, richer_signs = task.signs
-    matrix = observe(task.model, task.base.kept[base_signs], case, task.decimator).matrix
+    model = task.model
+    columns = task.base.kept[base_signs]
+    if isinstance(model, IdentificationModel) and model.torque_rows.projection is None:
+        # without the columns of the bodies, which cost most
+        terms = [model.columns[column - model.inertial] for column in columns]
+        matrix = observe_terms(terms, case, task.decimator, torque_rows=model.torque_rows)
+    else:
+        matrix = observe(model, columns, case, task.decimator).matrix
     if not richer_signs.any():
         return matrix
     return np.concatenate([matrix, task.friction.columns(case)[:, :, richer_signs]], axis=2)

@@ -144,6 +144,7 @@ def test_command_finds_built_pages(tmp_path, monkeypatch, capsys) -> None:
 SLOW = [page for page in PAGES if "<!-- slow -->" in page.read_text(encoding="utf-8") and page.stem != "lwr_study"]
 
 
+@pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("page", SLOW, ids=[page.stem for page in SLOW])
 def test_slow_blocks_run(page: Path, tmp_path: Path) -> None:
