@@ -31,7 +31,7 @@ COLUMNS = "100"
 _NUMBER = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 _FENCE = re.compile(
     r"(?:^<!-- (?P<mark>slow|data: \S+) -->\n)?^```(?P<kind>sh|python)\n(?P<code>.*?)^```\n"
-    r"(?:\n*```text(?: within (?P<within>\d+) %)?\n(?P<shown>.*?)^```\n)?",
+    r"(?:\n*```text(?: within (?P<within>\d+) %)?\n(?P<expected>.*?)^```\n)?",
     re.M | re.S,
 )
 
@@ -44,7 +44,7 @@ class Block:
         kind: sh or python.
         code: its text.
         line: of the page, from 1, where it begins.
-        shown: what the page says that it prints, line by line.
+        expected: what the page says that it prints, line by line.
         mark: ``slow``, ``data: NAME`` or "".
         tolerance: relative, of its numbers.
     """
@@ -52,16 +52,19 @@ class Block:
     kind: str
     code: str
     line: int
-    shown: list[str] = field(default_factory=list)
+    expected: list[str] = field(default_factory=list)
     mark: str = ""
     tolerance: float = TOLERANCE
 
     def left_out(self, slow: bool) -> str:
         """Return why the block does not run; "" where it does."""
-        place = DATA / self.mark.removeprefix("data: ")
-        if self.mark.startswith("data: ") and not place.is_dir():
-            return f"{place} is absent"
-        return "slow" if self.mark == "slow" and not slow else ""
+        if self.mark.startswith("data: "):
+            recordings = DATA / self.mark.removeprefix("data: ")
+            if not recordings.is_dir():
+                return f"{recordings} is absent"
+        if self.mark == "slow" and not slow:
+            return "slow"
+        return ""
 
 
 @dataclass
@@ -82,80 +85,133 @@ def pages() -> list[Path]:
 
 def read(text: str) -> list[Block]:
     """Return the code blocks of a page."""
-    return [
-        Block(
-            found["kind"], found["code"], text.count("\n", 0, found.start()) + 1,
-            (found["shown"] or "").splitlines(), found["mark"] or "",
-            float(found["within"]) / 100.0 if found["within"] else TOLERANCE,
-        )
-        for found in _FENCE.finditer(text)
-    ]  # fmt: skip
+    blocks = []
+    for match in _FENCE.finditer(text):
+        line = text.count("\n", 0, match.start()) + 1
+        block = Block(match["kind"], match["code"], line, mark=match["mark"] or "")
+        if match["expected"]:
+            block.expected = match["expected"].splitlines()
+        if match["within"]:
+            block.tolerance = float(match["within"]) / 100.0
+        blocks.append(block)
+    return blocks
 
 
 def run(page: Path, folder: Path, slow: bool = False) -> Report:
     """Run the blocks of a page in a new folder, slow ones if wanted; a block that fails ends it."""
-    text, started = page.read_text(encoding="utf-8"), sum(os.times()[:4])
+    text = page.read_text(encoding="utf-8")
+    started = _processor_seconds()
     folder.mkdir(parents=True)
     (folder / "examples").symlink_to(ROOT / "examples")
     names: dict[str, object] = {"__name__": "page"}
     report = Report(page.stem, [], [], text, 0.0)
     for block in read(text):
-        place = f"{page.name}, line {block.line}"
-        if why := block.left_out(slow):
-            report.remarks.append(f"{place}: left out, {why}")
+        where = f"{page.name}, line {block.line}"
+        reason = block.left_out(slow)
+        if reason:
+            report.remarks.append(f"{where}: left out, {reason}")
             continue
         printed, error = _run(block, folder, names)
         if error:
-            report.complaints.append(f"{place}: {error}\n{printed}")
+            report.complaints.append(f"{where}: {error}\n{printed}")
             break
-        fresh, wrong = compare(block.shown, printed.splitlines(), block.tolerance)
-        report.fresh = report.fresh.replace("\n".join(block.shown), "\n".join(fresh)) if block.shown else report.fresh
+        fresh, wrong = compare(block.expected, printed.splitlines(), block.tolerance)
+        if block.expected:
+            report.fresh = report.fresh.replace("\n".join(block.expected), "\n".join(fresh))
         if wrong:
-            report.complaints.append(f"{place}: the page shows\n{wrong}\nbut it printed\n{printed}")
-    report.seconds = sum(os.times()[:4]) - started
+            report.complaints.append(f"{where}: the page shows\n{wrong}\nbut it printed\n{printed}")
+    report.seconds = _processor_seconds() - started
     return report
 
 
+def _processor_seconds() -> float:
+    """Return the processor time of this process and of those it has waited for."""
+    return sum(os.times()[:4])
+
+
 def _run(block: Block, folder: Path, names: dict[str, object]) -> tuple[str, str]:
-    """Return what a block prints, and what went wrong."""
+    """Return what a block prints, and what went wrong.
+
+    Args:
+        block: to run.
+        folder: in which it runs.
+        names: the variables of the page's Python blocks; new ones are added.
+    """
     if block.kind == "python":
-        printed = io.StringIO()
-        try:
-            with chdir(folder), redirect_stdout(printed):
-                exec(compile(block.code, "block", "exec"), names)
-        except Exception as error:
-            return printed.getvalue(), f"{type(error).__name__}: {error}"
-        return printed.getvalue(), ""
+        return _run_python(block.code, folder, names)
+    return _run_shell(block.code, folder)
+
+
+def _run_python(code: str, folder: Path, names: dict[str, object]) -> tuple[str, str]:
+    printed = io.StringIO()
+    try:
+        with chdir(folder), redirect_stdout(printed):
+            exec(compile(code, "block", "exec"), names)
+    except Exception as error:
+        return printed.getvalue(), f"{type(error).__name__}: {error}"
+    return printed.getvalue(), ""
+
+
+def _run_shell(code: str, folder: Path) -> tuple[str, str]:
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
-    # of BLAS one thread, as the commands have by themselves, for scripts
-    places = {"PATH": path, "COLUMNS": COLUMNS, "D": str(DATA), "OPENBLAS_NUM_THREADS": "1"}
-    command = ["bash", "-euo", "pipefail", "-c", block.code]
-    done = subprocess.run(
-        command, cwd=folder, env=os.environ | places, capture_output=True, text=True, stdin=subprocess.DEVNULL
+    # scripts get one BLAS thread, as the commands have by themselves
+    variables = {"PATH": path, "COLUMNS": COLUMNS, "D": str(DATA), "OPENBLAS_NUM_THREADS": "1"}
+    result = subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", code],
+        cwd=folder,
+        env=os.environ | variables,
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
     )
-    return done.stdout + done.stderr, f"exit code {done.returncode}" if done.returncode else ""
+    error = ""
+    if result.returncode:
+        error = f"exit code {result.returncode}"
+    return result.stdout + result.stderr, error
 
 
-def compare(shown: list[str], printed: list[str], tolerance: float = TOLERANCE) -> tuple[list[str], str]:
+def compare(expected: list[str], printed: list[str], tolerance: float = TOLERANCE) -> tuple[list[str], str]:
     """Return the lines that a page shows with fresh numbers, and those that no longer hold."""
-    fresh, wrong, left = [], [], list(printed)
-    for line in shown:
-        match = next((one for one in left if _words(one) == _words(line)), None)
+    fresh = []
+    wrong = []
+    unmatched = list(printed)
+    for line in expected:
+        match = _same_words(line, unmatched)
         if match is None:
             fresh.append(line)
-            wrong += [line] if line.strip() not in ("", "…") else []
+            if line.strip() not in ("", "…"):
+                wrong.append(line)
             continue
-        left.remove(match)
-        alike = all(_close(a, b, tolerance) for a, b in zip(_NUMBER.findall(line), _NUMBER.findall(match)))
-        fresh.append(line if alike else match.rstrip())
-        wrong += [] if alike else [line]
+        unmatched.remove(match)
+        if _same_numbers(line, match, tolerance):
+            fresh.append(line)
+        else:
+            fresh.append(match.rstrip())
+            wrong.append(line)
     return fresh, "\n".join(wrong)
 
 
+def _same_words(line: str, printed: list[str]) -> str | None:
+    """Return the first printed line that has the words of a line; None without one."""
+    words = _words(line)
+    for candidate in printed:
+        if _words(candidate) == words:
+            return candidate
+    return None
+
+
+def _same_numbers(line: str, printed: str, tolerance: float) -> bool:
+    numbers = zip(_NUMBER.findall(line), _NUMBER.findall(printed))
+    return all(_close(expected, fresh, tolerance) for expected, fresh in numbers)
+
+
 def _words(line: str) -> list[str]:
+    """Return the words of a line, its numbers as ``#``."""
     return _NUMBER.sub("#", line).split()
 
 
-def _close(a: str, b: str, tolerance: float) -> bool:
-    digit = 10.0 ** -len(a.partition("e")[0].partition(".")[2])
-    return abs(float(a) - float(b)) <= max(1.01 * digit, tolerance * abs(float(b)))
+def _close(expected: str, fresh: str, tolerance: float) -> bool:
+    """Return whether a number holds: within its last digit, or within the relative tolerance."""
+    decimals = len(expected.partition("e")[0].partition(".")[2])
+    last_digit = 10.0**-decimals
+    return abs(float(expected) - float(fresh)) <= max(1.01 * last_digit, tolerance * abs(float(fresh)))

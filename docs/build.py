@@ -20,49 +20,71 @@ from pathlib import Path
 import blocks
 
 HERE = Path(__file__).parent
-RUNS, HTML = HERE / "_build/runs", HERE / "_build/html"
+RUNS = HERE / "_build/runs"
+HTML = HERE / "_build/html"
 WORKERS = 2
+
+
+def pages_with_code() -> dict[str, Path]:
+    """Return the pages that have blocks to run, by their names."""
+    pages = {}
+    for page in blocks.pages():
+        if blocks.read(page.read_text(encoding="utf-8")):
+            pages[page.stem] = page
+    return pages
 
 
 def run_pages(names: list[str], without: list[str], record: bool, slow: bool) -> bool:
     """Run pages, by default all but those left out; return whether all that they show holds."""
-    known = {page.stem: page for page in blocks.pages() if blocks.read(page.read_text(encoding="utf-8"))}
-    if unknown := {*names, *without} - set(known):
-        sys.exit(f"no page with code is called {', '.join(sorted(unknown))}; there are {', '.join(known)}")
-    wanted = {name: known[name] for name in names or known if name not in without}
-    for name in wanted:
-        shutil.rmtree(RUNS / name, ignore_errors=True)
+    pages = pages_with_code()
+    unknown = {*names, *without} - set(pages)
+    if unknown:
+        sys.exit(f"no page with code is called {', '.join(sorted(unknown))}; there are {', '.join(pages)}")
+    chosen = {name: pages[name] for name in names or pages if name not in without}
+    folders = [RUNS / name for name in chosen]
+    for folder in folders:
+        shutil.rmtree(folder, ignore_errors=True)
     good = True
     with ProcessPoolExecutor(WORKERS, get_context("spawn")) as pool:
-        for report in pool.map(blocks.run, wanted.values(), [RUNS / name for name in wanted], [slow] * len(wanted)):
-            print(
-                f"{report.page}: {report.seconds:.0f} s of processor time",
-                *report.remarks,
-                *report.complaints,
-                sep="\n  ",
-                flush=True,
-            )
+        for report in pool.map(blocks.run, chosen.values(), folders, [slow] * len(chosen)):
+            lines = [f"{report.page}: {report.seconds:.0f} s of processor time", *report.remarks, *report.complaints]
+            print("\n  ".join(lines), flush=True)
             if record and report.fresh:
-                wanted[report.page].write_text(report.fresh, encoding="utf-8")
-            good = good and not report.complaints
+                chosen[report.page].write_text(report.fresh, encoding="utf-8")
+            if report.complaints:
+                good = False
     return good
+
+
+def write_html(fresh: bool) -> bool:
+    """Write the HTML with Sphinx; return whether it went without a warning.
+
+    Args:
+        fresh: read every page anew: notebooks run, too, where only the code has changed.
+    """
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-j", str(WORKERS), "-b", "html"]
+    if fresh:
+        command.append("--fresh-env")
+    return subprocess.run([*command, HERE, HTML]).returncode == 0
 
 
 def main() -> None:
     """Build what the command line asks for; exit with 1 where a page or the HTML fails."""
-    read = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    read.add_argument("pages", nargs="*", metavar="PAGE")
-    read.add_argument("--html", action="store_true")
-    read.add_argument("--record", action="store_true")
-    read.add_argument("--slow", action="store_true")
-    read.add_argument("--without", action="append", default=[], metavar="PAGE")
-    given = read.parse_args()
-    good = given.html or run_pages(given.pages, given.without, given.record, given.slow)
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-j", str(WORKERS), "-b", "html", HERE, HTML]
-    command += [] if given.html else ["--fresh-env"]  # notebooks run, too, where only the code has changed
-    good = subprocess.run(command).returncode == 0 and good
-    print(f"{HTML / 'index.html'}" if good else "the documentation has errors")
-    sys.exit(0 if good else 1)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("pages", nargs="*", metavar="PAGE")
+    parser.add_argument("--html", action="store_true")
+    parser.add_argument("--record", action="store_true")
+    parser.add_argument("--slow", action="store_true")
+    parser.add_argument("--without", action="append", default=[], metavar="PAGE")
+    options = parser.parse_args()
+    pages_hold = True
+    if not options.html:
+        pages_hold = run_pages(options.pages, options.without, options.record, options.slow)
+    html_written = write_html(fresh=not options.html)
+    if not (pages_hold and html_written):
+        print("the documentation has errors")
+        sys.exit(1)
+    print(HTML / "index.html")
 
 
 if __name__ == "__main__":

@@ -8,9 +8,8 @@ from typing import Any
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE))
-os.environ["PYTHONPATH"] = os.pathsep.join(
-    [str(HERE.parent / "examples"), os.environ.get("PYTHONPATH", "")]
-)  # notebooks'
+# where notebooks find practice.py
+os.environ["PYTHONPATH"] = os.pathsep.join([str(HERE.parent / "examples"), os.environ.get("PYTHONPATH", "")])
 
 project = "armature-calib"
 author = "the calibration toolkit's founders"
@@ -44,9 +43,9 @@ def setup(app: Any) -> dict[str, bool]:
     """Write the reference before the pages are read, and lay docstrings out as they are in the source."""
     import reference
 
-    def laid_out(app: Any, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
+    def lay_out(app: Any, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
         lines[:] = reference.readable("\n".join(lines)).splitlines()
 
     reference.write()
-    app.connect("autodoc-process-docstring", laid_out, priority=100)
+    app.connect("autodoc-process-docstring", lay_out, priority=100)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -23,8 +23,10 @@ def _drawing(node: Any, inline: bool) -> str:
     svg = formula.svgxml()
     if float(svg.get("height")) > MAX_HEIGHT * EM:
         LOG.warning("equation came out too tall: %s", node.astext(), location=node)
-    width, height = (float(svg.attrib.pop(side)) / EM for side in ("width", "height"))
-    svg.set("style", f"width:{width:.3f}em;height:{height:.3f}em;vertical-align:{formula.getyofst() / EM:.3f}em")
+    width = float(svg.attrib.pop("width")) / EM
+    height = float(svg.attrib.pop("height")) / EM
+    base_line = formula.getyofst() / EM
+    svg.set("style", f"width:{width:.3f}em;height:{height:.3f}em;vertical-align:{base_line:.3f}em")
     svg.set("role", "img")
     svg.set("aria-label", node.astext())
     return ziamath.zmath.ET.tostring(svg, encoding="unicode")
@@ -38,8 +40,12 @@ def visit_inline(self: Any, node: Any) -> None:
 
 def visit_block(self: Any, node: Any) -> None:
     """Write an equation that stands by itself, with its number where it has one."""
-    number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
-    ids = f' id="{node["ids"][0]}"' if node["ids"] else ""
+    number = ""
+    if node.get("number"):
+        number = f'<span class="eqno">({node["number"]})</span>'
+    ids = ""
+    if node["ids"]:
+        ids = f' id="{node["ids"][0]}"'
     self.body.append(f'<div class="math"{ids}>{_drawing(node, inline=False)}{number}</div>')
     raise nodes.SkipNode
 

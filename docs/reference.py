@@ -6,10 +6,11 @@ option, a key, a column or a finding that is declared appears, one that is remov
 
 import pkgutil
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from importlib import import_module
 from inspect import cleandoc
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import calib
@@ -27,25 +28,41 @@ MADE = Path(__file__).parent / "reference/made"
 
 def cell(text: object) -> str:
     """Return a text as a cell of a Markdown table: on one line, its marks as they are."""
-    return re.sub(r"([|<>*_\[\]`$\\~])", r"\\\1", " ".join(str(text).split()))
+    line = " ".join(str(text).split())
+    return re.sub(r"([|<>*_\[\]`$\\~])", r"\\\1", line)
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """Return a Markdown table; its cells are Markdown."""
-    lines = [list(head)]
-    lines += [["---"] * len(lines[0]), *map(list, rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    names = list(head)
+    text = ""
+    for row in [names, ["---"] * len(names), *rows]:
+        text += f"| {' | '.join(row)} |\n"
+    return text
 
 
 def code(text: object) -> str:
     """Return a text as code in a cell."""
-    return f"`{' '.join(str(text).split())}`".replace("|", "\\|") if str(text) else ""
+    line = " ".join(str(text).split())
+    if not line:
+        return ""
+    return f"`{line}`".replace("|", "\\|")
 
 
 def paragraphs(text: str) -> str:
     """Return plain text as Markdown: its paragraphs, indented lines as code."""
-    parts = re.split(r"\n\s*\n", cleandoc(text))
-    return "\n\n".join(f"```text\n{cleandoc(part)}\n```" if part.startswith("  ") else cell(part) for part in parts)
+    result = []
+    for part in re.split(r"\n\s*\n", cleandoc(text)):
+        if part.startswith("  "):
+            result.append(_verbatim(part))
+        else:
+            result.append(cell(part))
+    return "\n\n".join(result)
+
+
+def _verbatim(text: str) -> str:
+    """Return a text as a fenced block."""
+    return f"```text\n{cleandoc(text)}\n```"
 
 
 # ---- commands -------------------------------------------------------------------------------------------------------
@@ -53,44 +70,44 @@ def paragraphs(text: str) -> str:
 
 def commands() -> str:
     """Return the page of all commands, by their groups."""
-    tree, groups = cli.command_tree(), dict[str, list[Any]]()
+    tree = cli.command_tree()
+    groups: dict[str, list[Any]] = {}
     printed = tree.get_help(tree.context_class(tree, info_name="calib"))  # in the order of calib --help
     for name in re.findall(r"^  (\w[\w-]*)  ", printed, flags=re.M):
-        one = tree.commands[name]
-        groups.setdefault(str(one.rich_help_panel or "All commands"), []).append(one)
+        command = tree.commands[name]
+        group = str(command.rich_help_panel or "All commands")
+        groups.setdefault(group, []).append(command)
     parts = ["# Commands\n\n`calib COMMAND --help` prints the same.", exit_codes()]
     for group, members in groups.items():
-        parts += [f"## {group}", *map(_command, members)]
+        parts.append(f"## {group}")
+        parts += [_command(command) for command in members]
     return "\n\n".join(parts) + "\n"
 
 
-def _command(one: Any) -> str:
-    context = one.context_class(one, info_name=f"calib {one.name}")
-    records = [(part, part.get_help_record(context)) for part in one.params]
-    shown = [(part, *record) for part, record in records if record]
-    usage = one.get_usage(context).removeprefix("Usage: ")
-    parts = [
-        f"(command-{one.name})=\n### calib {one.name}",
-        paragraphs(one.help or ""),
-        f"```text\n{cleandoc(usage)}\n```",
-    ]
+def _command(command: Any) -> str:
+    """Return the section of a command: help, usage, and tables of its arguments and options."""
+    context = command.context_class(command, info_name=f"calib {command.name}")
+    usage = command.get_usage(context).removeprefix("Usage: ")
+    parts = [f"(command-{command.name})=\n### calib {command.name}", paragraphs(command.help or ""), _verbatim(usage)]
+    # hidden parameters have no record
+    rows: dict[str, list[tuple[str, str]]] = {"argument": [], "option": []}
+    for parameter in command.params:
+        record = parameter.get_help_record(context)
+        if record:
+            name, meaning = record
+            rows[parameter.param_type_name].append((code(name), cell(meaning)))
     for kind, head in (("argument", "Argument"), ("option", "Option")):
-        rows = [(code(name), cell(words)) for part, name, words in shown if part.param_type_name == kind]
-        if rows:
-            parts.append(table((head, "Meaning"), rows))
+        if rows[kind]:
+            parts.append(table((head, "Meaning"), rows[kind]))
     return "\n\n".join(parts)
 
 
 def exit_codes() -> str:
     """Return the section of exit codes."""
-    rows = re.findall(r"(\d+) (.*?)(?=, \d+ |\. |\.$|: details)", cli.EXIT_CODES)
-    return "\n\n".join(
-        [
-            "(exit-codes)=\n## Exit codes",
-            table(("Code", "Meaning"), [(number, cell(words)) for number, words in rows]),
-            f"130: {cli.INTERRUPTED}.",
-        ]
-    )
+    codes = re.findall(r"(\d+) (.*?)(?=, \d+ |\. |\.$|: details)", cli.EXIT_CODES)
+    rows = [(number, cell(meaning)) for number, meaning in codes]
+    parts = ["(exit-codes)=\n## Exit codes", table(("Code", "Meaning"), rows), f"130: {cli.INTERRUPTED}."]
+    return "\n\n".join(parts)
 
 
 # ---- docstrings -----------------------------------------------------------------------------------------------------
@@ -105,37 +122,52 @@ def readable(docstring: str) -> str:
     Indented paragraphs are equations or code: kept line by line. Paragraphs of names, each with a text beside it that
     goes on below, become tables. Sections (``Args:``) are left to napoleon.
     """
-    parts, literal = re.split(r"\n[ \t]*\n", docstring), False
+    parts = re.split(r"\n[ \t]*\n", docstring)
+    literal = False
     for k, part in enumerate(parts):
         if _SECTION.match(part):
             break
         indented = part.startswith("    ")
-        if indented and not literal and k:
-            parts[k - 1] = parts[k - 1].rstrip() + ("\n\n::" if not parts[k - 1].endswith(":") else ":")
-        elif not indented:
-            parts[k] = _names("``".join(_unmarked(text, n % 2) for n, text in enumerate(part.split("``"))))
+        if not indented:
+            parts[k] = _names(_without_marks(part))
+        elif not literal and k:
+            parts[k - 1] = _before_literal(parts[k - 1].rstrip())
         literal = indented or part.rstrip().endswith("::")
     return "\n\n".join(parts)
 
 
-def _unmarked(text: str, code: int) -> str:
-    """Return text whose bars and last underscores are no marks of reStructuredText; code as it is."""
-    return text if code else re.sub(r"(?<=\w)_(?!\w)", r"\\_", text.replace("|", "∣"))
+def _before_literal(part: str) -> str:
+    """Return a paragraph with the two colons that announce a literal block."""
+    if part.endswith(":"):
+        return f"{part}:"
+    return f"{part}\n\n::"
+
+
+def _without_marks(part: str) -> str:
+    """Return a paragraph whose bars and last underscores are no marks of reStructuredText; code as it is."""
+    pieces = part.split("``")
+    for k in range(0, len(pieces), 2):  # every second one is code
+        plain = pieces[k].replace("|", "∣")
+        pieces[k] = re.sub(r"(?<=\w)_(?!\w)", r"\\_", plain)
+    return "``".join(pieces)
 
 
 def _names(part: str) -> str:
     """Return a paragraph of names with a text beside each as a table; any other as it is."""
     lines = part.splitlines()
-    if len(lines) < 2 or not any(line.startswith(" " * 8) for line in lines) or lines[0].startswith(("=", "..", " ")):
+    has_continuation = any(line.startswith(" " * 8) for line in lines)
+    if len(lines) < 2 or not has_continuation or lines[0].startswith(("=", "..", " ")):
         return part
     rows: list[list[str]] = []
     for line in lines:
-        found = _FILE_ROW.match(line)
+        match = _FILE_ROW.match(line)
         if line.startswith(" ") and rows:
             rows[-1][1] += f" {line.strip()}"
+        elif match:
+            rows.append([_literal(match[1]), match[2]])
         else:
-            rows.append([found[1], found[2]] if found else [line, ""])
-    return _rst_table(("", ""), ([_literal(name), text] for name, text in rows))
+            rows.append([_literal(line), ""])
+    return _rst_table(("", ""), rows)
 
 
 # ---- files ----------------------------------------------------------------------------------------------------------
@@ -143,9 +175,9 @@ def _names(part: str) -> str:
 
 def topic(name: str) -> str:
     """Return the page of a kind of file (reStructuredText, as the docstrings that document it are)."""
-    words, modules = formats.TOPICS[name]
-    parts = [f".. _format-{name}:", f"{name}\n{'=' * len(name)}", f"{_plain(words)} (``calib formats {name}``)"]
-    parts += [readable(cleandoc(import_module(module).__doc__ or "")) for module in modules.split()]
+    summary, modules = formats.TOPICS[name]
+    parts = [f".. _format-{name}:", f"{name}\n{'=' * len(name)}", f"{_plain(summary)} (``calib formats {name}``)"]
+    parts += [readable(docstring) for docstring in _docstrings(modules)]
     if name in COLUMNS:
         parts += ["Columns\n-------", COLUMNS[name]()]
     if name == "session":
@@ -155,21 +187,32 @@ def topic(name: str) -> str:
     return "\n\n".join(parts) + "\n"
 
 
+def _docstrings(modules: str) -> list[str]:
+    """Return the docstrings of modules, whose names are separated by blanks."""
+    return [cleandoc(import_module(module).__doc__ or "") for module in modules.split()]
+
+
 def file_list() -> str:
     """Return the page that lists the kinds of files."""
-    rows = [(f"[{name}](format-{name}.rst)", cell(words)) for name, (words, _) in formats.TOPICS.items()]
-    tree = "\n".join(f"format-{name}" for name in formats.TOPICS)
-    return f"# Files\n\n{table(('Topic', 'What it is'), rows)}\n```{{toctree}}\n:hidden:\n\n{tree}\n```\n"
+    rows = []
+    for name, (summary, _) in formats.TOPICS.items():
+        rows.append((f"[{name}](format-{name}.rst)", cell(summary)))
+    toctree = "\n".join(f"format-{name}" for name in formats.TOPICS)
+    return f"# Files\n\n{table(('Topic', 'What it is'), rows)}\n```{{toctree}}\n:hidden:\n\n{toctree}\n```\n"
 
 
 def _indented(text: str) -> str:
-    return "\n".join(f"    {line}" if line else "" for line in text.splitlines())
+    return indent(text, "    ").removesuffix("\n")
 
 
 def _rst_table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a table in reStructuredText."""
     lines = [".. list-table::", "   :header-rows: 1", ""]
     for row in [head, *rows]:
-        lines += [f"   {'* -' if k == 0 else '  -'} {text}".rstrip() for k, text in enumerate(row)]
+        bullet = "* -"
+        for text in row:
+            lines.append(f"   {bullet} {text}".rstrip())
+            bullet = "  -"
     return "\n".join(lines)
 
 
@@ -177,58 +220,72 @@ def _literal(text: str) -> str:
     return f"``{text}``" if text else ""
 
 
+def _literals(texts: Iterable[str]) -> str:
+    return ", ".join(_literal(text) for text in texts)
+
+
 def _plain(text: str) -> str:
     return re.sub(r"([\\`*|_])", r"\\\1", text)
 
 
 def _keys(name: str) -> str:
-    said = example_words(name)
-    rows = [
-        (_literal(key), _plain(held), _literal(default), _plain(words or said.get(key, "")))
-        for key, held, default, words in formats.keys(name)
-    ]
+    """Return the table of the keys of a kind of TOML file; meanings come from its schema, else from its example."""
+    comments = example_words(name)
+    rows = []
+    for key, allowed, default, meaning in formats.keys(name):
+        rows.append((_literal(key), _plain(allowed), _literal(default), _plain(meaning or comments.get(key, ""))))
     return _rst_table(("Key", "Allowed", "Default", "Meaning"), rows)
 
 
-_EXAMPLE_LINE = re.compile(r"    (?:\[\[([\w.]+)\]\]|\[(\w+).*?\]|(?:# )?(\w+) = .*?(?=$| +#)| )? *(?:# (.*))?")
+_EXAMPLE_LINE = re.compile(
+    r"    (?:\[\[(?P<array>[\w.]+)\]\]|\[(?P<table>\w+).*?\]|(?:# )?(?P<key>\w+) = .*?(?=$| +#)| )?"
+    r" *(?:# (?P<comment>.*))?"
+)
 
 
 def example_words(name: str) -> dict[str, str]:
     """Return what the comments in the example of a kind of TOML file say of its keys, by place (``loop.kp``)."""
-    texts = [import_module(module).__doc__ or "" for module in formats.TOPICS[name][1].split()]
-    texts += [_indented(example())] if name == "session" else []
-    table, key, found = "", "", example_words("constraints") if name == "limits" else {}  # whose tables it takes, too
+    modules = formats.TOPICS[name][1].split()
+    texts = [import_module(module).__doc__ or "" for module in modules]
+    if name == "session":
+        texts.append(_indented(example()))
+    comments: dict[str, str] = {}
+    if name == "limits":
+        comments = example_words("constraints")  # whose tables it takes, too
+    table = ""
+    key = ""
     for line in "\n".join(texts).splitlines():
-        if not (parts := _EXAMPLE_LINE.fullmatch(line)) or not line.strip():
-            table, key = "", ""
+        match = _EXAMPLE_LINE.fullmatch(line)
+        if not match or not line.strip():
+            table = ""
+            key = ""
             continue
-        tables, one, name, words = parts.groups()  # of [payload.tool] the second part is a name that the user gives
-        if tables or one:
-            table = key = tables or one
-        elif name:
-            key = f"{table}.{name}".lstrip(".")
-        if words:
-            found[key] = f"{found.get(key, '')} {words}".strip()
-    return found
+        # of [payload.tool] the second part is a name that the user gives
+        if match["array"] or match["table"]:
+            table = match["array"] or match["table"]
+            key = table
+        elif match["key"]:
+            key = f"{table}.{match['key']}".lstrip(".")
+        if match["comment"]:
+            comments[key] = f"{comments.get(key, '')} {match['comment']}".strip()
+    return comments
 
 
 def _pose_columns() -> str:
-    rows = [
-        (
-            ", ".join(map(_literal, one.names)), one.dimension or "–", _literal(one.family),
-            f"{one.most:g}" if one.most < float("inf") else "–",
-        )
-        for one in vars(columns).values()
-        if isinstance(one, Column)
-    ]  # fmt: skip
+    """Return the table of the columns of measured poses."""
+    rows = []
+    for column in vars(columns).values():
+        if isinstance(column, Column):
+            largest = "–" if column.most == float("inf") else f"{column.most:g}"
+            rows.append((_literals(column.names), column.dimension or "–", _literal(column.family), largest))
     return _rst_table(("Names", "Dimension", "Unit stated under", "Largest value [SI]"), rows)
 
 
 def _series() -> str:
-    rows = [
-        (_literal(ours), ", ".join(map(_literal, theirs)), ", ".join(map(_literal, SCALES.get(ours, ()))))
-        for ours, theirs in SYNONYMS.items()
-    ]
+    """Return the table of the series of recordings."""
+    rows = []
+    for series, synonyms in SYNONYMS.items():
+        rows.append((_literal(series), _literals(synonyms), _literals(SCALES.get(series, ()))))
     return _rst_table(("Series", "Accepted names", "Units"), rows)
 
 
@@ -246,59 +303,66 @@ def finding_list() -> str:
         "file makes a finding a note. The numbers and names are examples."
     )
     parts = ["# Findings", intro]
-    for line in Path(findings.__file__).with_suffix(".toml").read_text(encoding="utf-8").splitlines():
-        if found := re.match(r"# -+ \d+ (.+?) -+$", line):
-            parts.append(f"## {found[1]}")
-        elif found := re.match(r"\[([\w-]+)\]$", line):
-            parts.append(_finding(found[1], findings.catalogue()[found[1]]))
+    catalogue = findings.catalogue()
+    text = Path(findings.__file__).with_suffix(".toml").read_text(encoding="utf-8")
+    for line in text.splitlines():
+        section = re.match(r"# -+ \d+ (.+?) -+$", line)
+        entry = re.match(r"\[([\w-]+)\]$", line)
+        if section:
+            parts.append(f"## {section[1]}")
+        elif entry:
+            parts.append(_finding(entry[1], catalogue[entry[1]]))
     return "\n\n".join(parts) + "\n"
 
 
-def _finding(name: str, one: findings.CatalogueEntry) -> str:
-    says, advice = findings.example_texts(name)
+def _finding(name: str, entry: findings.CatalogueEntry) -> str:
+    """Return the section of a finding."""
+    sentence, advice = findings.example_texts(name)
     rows = [
-        ("Says", cell(says)),
-        ("Level", cell(findings.levels(one))),
-        ("Means", cell(one.means)),
+        ("Says", cell(sentence)),
+        ("Level", cell(findings.levels(entry))),
+        ("Means", cell(entry.means)),
         ("Do", cell(advice)),
-        ("Accept", code(f'accept = ["{one.accept}"]') if one.accept else ""),
     ]
-    return f"(finding-{name})=\n### {name}\n\n" + table(("", ""), [row for row in rows if row[1]])
+    if entry.accept:
+        rows.append(("Accept", code(f'accept = ["{entry.accept}"]')))
+    filled = [row for row in rows if row[1]]
+    return f"(finding-{name})=\n### {name}\n\n" + table(("", ""), filled)
 
 
 def terms() -> str:
     """Return the glossary."""
-    entries = "\n\n".join(f"{term}\n: {meaning}" for term, meaning in findings.glossary().items())
     head = (
         "# Glossary\n\nThe field's terms as this toolkit uses them, one meaning each. `calib explain TERM` prints one."
     )
-    return f"{head}\n\n{entries}\n"
+    entries = [f"{term}\n: {meaning}" for term, meaning in findings.glossary().items()]
+    return "\n\n".join([head, *entries]) + "\n"
 
 
 def method_list() -> str:
     """Return the page of identification methods, effects and library robots."""
-    methods = [(code(one.name), cell(one.description), cell(one.source), cell(one.assumes)) for one in calib.methods()]
-    shapes = [(code(name), cell(one.unit), cell(", ".join(one.settings))) for name, one in SHAPES.items()]
-    robots = [(code(name), str(arm.n), "yes" if arm.inertias is not None else "no") for name, arm in _arms()]
-    return (
-        "\n\n".join(
-            [
-                "# Methods, effects, robots",
-                "## Identification methods\n\n`calib identify --method NAME`.",
-                table(("Method", "What it does", "Source", "Assumes"), methods),
-                "## Shapes of drive torque\n\n`[[term]] shape = NAME` of the options of `calib identify`; formulas: "
-                "`calib.dynamics.shape_kernels`.",
-                table(("Shape", "Unit of its parameter", "Settings"), shapes),
-                "## Robots of the library\n\nAny command takes these names where it takes a file.",
-                table(("Name", "Joints", "Masses known"), robots),
-            ]
-        )
-        + "\n"
-    )
-
-
-def _arms() -> Iterator[tuple[str, Any]]:
-    return ((name, library.load(name)) for name in library.names())
+    methods = []
+    for method in calib.methods():
+        row = (code(method.name), cell(method.description), cell(method.source), cell(method.assumes))
+        methods.append(row)
+    shapes = []
+    for name, shape in SHAPES.items():
+        shapes.append((code(name), cell(shape.unit), cell(", ".join(shape.settings))))
+    robots = []
+    for name in library.names():
+        arm = library.load(name)
+        robots.append((code(name), str(arm.n), "no" if arm.inertias is None else "yes"))
+    parts = [
+        "# Methods, effects, robots",
+        "## Identification methods\n\n`calib identify --method NAME`.",
+        table(("Method", "What it does", "Source", "Assumes"), methods),
+        "## Shapes of drive torque\n\n`[[term]] shape = NAME` of the options of `calib identify`; formulas: "
+        "`calib.dynamics.shape_kernels`.",
+        table(("Shape", "Unit of its parameter", "Settings"), shapes),
+        "## Robots of the library\n\nAny command takes these names where it takes a file.",
+        table(("Name", "Joints", "Masses known"), robots),
+    ]
+    return "\n\n".join(parts) + "\n"
 
 
 # ---- Python ---------------------------------------------------------------------------------------------------------
@@ -306,27 +370,36 @@ def _arms() -> Iterator[tuple[str, Any]]:
 
 def api() -> dict[str, str]:
     """Return the pages of the Python API: `import calib`, and the modules of `calib.poses` and `calib.trajectories`."""
-    given = [(name, getattr(calib, name)) for name in calib.__all__]
+    members: dict[str, list[str]] = {"Functions": [], "Settings": [], "Results": []}
+    for name in calib.__all__:
+        if not isinstance(getattr(calib, name), type):
+            members["Functions"].append(name)
+        elif name.endswith("Settings"):
+            members["Settings"].append(name)
+        else:
+            members["Results"].append(name)
     parts = ["calib\n=====", ".. automodule:: calib\n   :no-members:"]
-    for title, members in (
-        ("Functions", [name for name, one in given if not isinstance(one, type)]),
-        ("Settings", [name for name, one in given if isinstance(one, type) and name.endswith("Settings")]),
-        ("Results", [name for name, one in given if isinstance(one, type) and not name.endswith("Settings")]),
-    ):
+    for title, names in members.items():
         parts.append(f"{title}\n{'-' * len(title)}")
-        parts += [_documented(f"calib.{name}", getattr(calib, name)) for name in members]
-    return {"api-calib.rst": "\n\n".join(parts) + "\n"} | {
-        f"api-{package.__name__.removeprefix('calib.')}.rst": _package(package) for package in (poses, trajectories)
-    }
+        parts += [_documented(name) for name in names]
+    pages = {"api-calib.rst": "\n\n".join(parts) + "\n"}
+    for package in (poses, trajectories):
+        name = package.__name__.removeprefix("calib.")
+        pages[f"api-{name}.rst"] = _package(package)
+    return pages
 
 
-def _documented(name: str, one: Any) -> str:
-    return f".. autoclass:: {name}\n   :members:" if isinstance(one, type) else f".. autofunction:: {name}"
+def _documented(name: str) -> str:
+    """Return the directive that documents a name of `import calib`."""
+    if isinstance(getattr(calib, name), type):
+        return f".. autoclass:: calib.{name}\n   :members:"
+    return f".. autofunction:: calib.{name}"
 
 
 def _package(package: Any) -> str:
+    """Return the page of a package and its modules."""
     name = package.__name__
-    modules = sorted(one.name for one in pkgutil.walk_packages(package.__path__, f"{name}."))
+    modules = sorted(module.name for module in pkgutil.walk_packages(package.__path__, f"{name}."))
     parts = [f"{name}\n{'=' * len(name)}", f".. automodule:: {name}\n   :no-members:"]
     for module in modules:
         parts += [f"{module}\n{'-' * len(module)}", f".. automodule:: {module}\n   :members:"]
@@ -340,13 +413,16 @@ def write() -> None:
         "findings.md": finding_list(),
         "glossary.md": terms(),
         "methods.md": method_list(),
+        "files.md": file_list(),
     }
-    pages["files.md"] = file_list()
-    pages |= {f"format-{name}.rst": topic(name) for name in formats.TOPICS} | api()
+    for name in formats.TOPICS:
+        pages[f"format-{name}.rst"] = topic(name)
+    pages |= api()
     MADE.mkdir(parents=True, exist_ok=True)
-    for old in set(MADE.iterdir()) - {MADE / name for name in pages}:
-        old.unlink()
+    for path in MADE.iterdir():
+        if path.name not in pages:
+            path.unlink()
     for name, text in pages.items():
-        place = MADE / name
-        if not place.exists() or place.read_text(encoding="utf-8") != text:
-            place.write_text(text, encoding="utf-8")
+        path = MADE / name
+        if not path.exists() or path.read_text(encoding="utf-8") != text:
+            path.write_text(text, encoding="utf-8")

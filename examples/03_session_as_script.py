@@ -10,11 +10,13 @@ import calib
 practice.enter(__file__)
 
 # little effort for the motions, to be quick: the defaults search longer
-little = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2}
-session = calib.new_session("cell7", "lwr4plus", "cmm", poses=40, validation=20, torques="both", **little)
+quick_search = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2}
+session = calib.new_session("cell7", "lwr4plus", "cmm", poses=40, validation=20, torques="both", **quick_search)
 
-while (now := next(calib.run_sessions(session))).state == "waits":
-    print(now)  # what an engineer would now do at the robot, and into which folder the files go
+outcome = next(calib.run_sessions(session))
+while outcome.state == "waits":
+    print(outcome)  # what an engineer would now do at the robot, and into which folder the files go
     practice.bring(session)
-print(now)
-print(f"{now.verdict}: {session / 'certificate.html'}")
+    outcome = next(calib.run_sessions(session))
+print(outcome)
+print(f"{outcome.verdict}: {session / 'certificate.html'}")

@@ -16,5 +16,5 @@ commands = calib.compensate(fit, "targets.csv", frame="measured", tool="tool")
 print(commands)
 commands.save("commands.csv")
 
-for words, q in (("nominal joints", commands.nominal), ("commands", commands.q)):
-    print(f"{words}: the real tool is off by {practice.missed(q):.3f} mm rms")
+for name, q in (("nominal joints", commands.nominal), ("commands", commands.q)):
+    print(f"{name}: the real tool is off by {practice.target_error(q):.3f} mm rms")

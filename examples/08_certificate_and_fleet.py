@@ -10,13 +10,16 @@ import calib
 practice.enter(__file__)
 
 # two robots of a kind; `calib new cell1 --robot ur5 --instrument cmm --geometry-only` makes such a folder, too
-cells = [calib.new_session(f"cell{k}", "ur5", "cmm", poses=20, validation=8, seed=k, dynamics=False) for k in (1, 2)]
+counts = {"poses": 20, "validation": 8}
+cell1 = calib.new_session("cell1", "ur5", "cmm", seed=1, dynamics=False, **counts)
+cell2 = calib.new_session("cell2", "ur5", "cmm", seed=2, dynamics=False, **counts)
 for _ in range(2):
-    for now in calib.run_sessions(cells):
-        print(now)
-        if now.state == "waits":  # yours: copy the measured files into 3-measured
-            practice.bring(now.folder)
+    for outcome in calib.run_sessions([cell1, cell2]):
+        print(outcome)
+        if outcome.state == "waits":  # yours: copy the measured files into 3-measured
+            practice.bring(outcome.folder)
 
-for cell in cells:
+for cell in (cell1, cell2):
     print(f"{cell / 'certificate.html'} and, for robots and simulators, {cell / '6-export'}:")
-    print("  " + ", ".join(sorted(path.name for path in (cell / "6-export").iterdir())))
+    names = sorted(path.name for path in (cell / "6-export").iterdir())
+    print("  " + ", ".join(names))

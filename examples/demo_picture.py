@@ -20,7 +20,7 @@ from calib.procedure.export.delivery import prediction
 from calib.procedure.session.folder import Session
 from calib.workers.threads import one_blas_thread
 
-KEPT = Path(__file__).with_name("demo.png")
+PICTURE_FILE = Path(__file__).with_name("demo.png")
 README = Path(__file__).parents[1] / "README.md"
 SENTENCES = (  # of the README: where a figure stands, and its form
     "unseen poses: {nominal_mm:.2f} mm before, {calibrated_mm:.2f} mm after",
@@ -31,26 +31,31 @@ FIELD = re.compile(r"\{(\w+):(\S+)\}")
 
 
 def main() -> None:
-    with tempfile.TemporaryDirectory() as place:
-        found = run(Path(place) / "demo")
-        about = PngInfo()
-        about.add_text("figures", json.dumps(found))
-        with Image.open(Path(place, "demo", PICTURE)) as image:
-            image.save(KEPT, pnginfo=about, dpi=image.info["dpi"])
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "demo"
+        values = run(folder)
+        metadata = PngInfo()
+        metadata.add_text("figures", json.dumps(values))
+        with Image.open(folder / PICTURE) as image:
+            image.save(PICTURE_FILE, pnginfo=metadata, dpi=image.info["dpi"])
     text = README.read_text(encoding="utf-8")
     for sentence in SENTENCES:
-        text = pattern(sentence).sub(sentence.format(**found), text)
+        text = pattern(sentence).sub(sentence.format(**values), text)
     README.write_text(text, encoding="utf-8")
-    print(json.dumps(found, indent=1))
+    print(json.dumps(values, indent=1))
 
 
 def run(folder: Path) -> dict[str, float]:
     """Run the demonstration in a new folder; return its figures for README and picture."""
-    began = time.process_time()
+    started = time.process_time()
     with one_blas_thread():  # as in the command
-        found = demo.run(folder, demo.ROBOT, 0, print, lambda words: None, plots="png")
-    seconds = time.process_time() - began
-    return figures(found.session) | {"processor_seconds": seconds, "memory_mb": found.memory}
+        result = demo.run(folder, demo.ROBOT, 0, print, _say_nothing, plots="png")
+    seconds = time.process_time() - started
+    return figures(result.session) | {"processor_seconds": seconds, "memory_mb": result.memory}
+
+
+def _say_nothing(message: object) -> None:
+    """Leave out the progress of the demonstration."""
 
 
 def figures(session: Session) -> dict[str, float]:
@@ -68,23 +73,27 @@ def figures(session: Session) -> dict[str, float]:
 
 def pattern(sentence: str) -> re.Pattern[str]:
     """Return the pattern that finds a sentence in the README, with one group per figure."""
-    return re.compile(FIELD.sub(r"([\\d.]+)", re.escape(sentence).replace(r"\{", "{").replace(r"\}", "}")))
+    escaped = re.escape(sentence).replace(r"\{", "{").replace(r"\}", "}")
+    return re.compile(FIELD.sub(r"([\\d.]+)", escaped))
 
 
-def stated() -> dict[str, tuple[float, float]]:
+def readme_figures() -> dict[str, tuple[float, float]]:
     """Return the figures of the README by name, each with half of its last digit."""
-    text, result = README.read_text(encoding="utf-8"), dict[str, tuple[float, float]]()
+    text = README.read_text(encoding="utf-8")
+    values: dict[str, tuple[float, float]] = {}
     for sentence in SENTENCES:
-        found = pattern(sentence).search(text)
-        assert found, f"README does not say '{sentence}'"
-        for (name, _), digits in zip(FIELD.findall(sentence), found.groups(), strict=True):
-            result[name] = float(digits), 0.5 * 10.0 ** -len(digits.partition(".")[2])
-    return result
+        match = pattern(sentence).search(text)
+        assert match, f"README does not say '{sentence}'"
+        names = [name for name, _ in FIELD.findall(sentence)]
+        for name, digits in zip(names, match.groups(), strict=True):
+            decimals = len(digits.partition(".")[2])
+            values[name] = (float(digits), 0.5 * 10.0**-decimals)
+    return values
 
 
-def drawn() -> dict[str, float]:
+def picture_figures() -> dict[str, float]:
     """Return the figures shown in the picture."""
-    with Image.open(KEPT) as image:
+    with Image.open(PICTURE_FILE) as image:
         return json.loads(image.info["figures"])
 
 

@@ -26,6 +26,7 @@ import json
 import signal
 import tempfile
 import time
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -33,75 +34,106 @@ from pathlib import Path
 import extrapolation_plain as plain
 import extrapolation_ridge as ridge
 import numpy as np
-from extrapolation_pairs import PAIRS, Prepared
+from extrapolation_pairs import PAIRS, Pair, Prepared
 from scipy.signal import butter, filtfilt
 
 import calib
 
-CUTOFF, RATE, BORDER = 10.0, 100.0, 0.3  # of both sides of the comparison [Hz, Hz, s]
+CUTOFF = 10.0  # of the low-pass of measured and predicted torques [Hz]
+RATE = 100.0  # at which both are compared [Hz]
+BORDER = 0.3  # at both ends of a recording, where the low-pass has not settled [s]
 STANDING = 0.01  # below which a joint counts as standing [rad/s or m/s]
 MAX_SECONDS = 300  # for a pair
 MARK = "<!-- examples/extrapolation.py -->"
-CUTOFFS = (6.0, 15.0)  # of the ridges' positions [Hz]
+RIDGE_CUTOFFS = (6.0, 15.0)  # of the ridges' positions [Hz]
 PLAIN_RIDGE = "6 Hz, zero"  # the ridge that stands beside plain least squares
+MAX_RATIO = 1.1  # pairs above are counted in the summary
+
+# instants (N,) [s] and torques (N, n) [N m or N] of a recording
+Prediction = tuple[np.ndarray, np.ndarray]
 
 
 def state() -> str:
     """Return a digest of the code of the toolkit and of these scripts."""
-    here = Path(__file__).parent
-    files = [*sorted(Path(calib.__file__).parent.rglob("*.py")), *sorted(here.glob("extrapolation*.py"))]
-    return hashlib.sha1(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
+    toolkit = sorted(Path(calib.__file__).parent.rglob("*.py"))
+    scripts = sorted(Path(__file__).parent.glob("extrapolation*.py"))
+    digest = hashlib.sha1()
+    for path in [*toolkit, *scripts]:
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def resampled(grid: np.ndarray, t: np.ndarray, series: np.ndarray) -> np.ndarray:
+    """Return series (N, n) at instants t (N,) [s], interpolated at the instants of a grid."""
+    return np.column_stack([np.interp(grid, t, column) for column in series.T])
+
+
+def low_passed(series: np.ndarray) -> np.ndarray:
+    """Return series (N, n) at `RATE`, low-passed at `CUTOFF` without delay."""
+    return filtfilt(*butter(4, CUTOFF / (RATE / 2)), series, axis=0)
 
 
 def squared_errors(
-    test: list[Path], predicted: list[tuple[np.ndarray, np.ndarray]], moving: bool = False
+    test: list[Path], predictions: list[Prediction], moving: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return Σ (τ - τ̂)² and Σ τ² per joint (n,) of predictions (instants, torques) of recordings.
+    """Return Σ (τ - τ̂)² and Σ τ² per joint (n,) of predictions of recordings.
 
     Args:
+        test: the recordings (npz: t, q, tau).
+        predictions: instants and torques, one pair per recording.
         moving: of the samples alone in which a joint moves.
     """
     sums = []
-    for path, (t, tau) in zip(test, predicted):
+    for path, (t, tau) in zip(test, predictions):
         log = np.load(path)
-        grid = np.arange(max(log["t"][0], t[0]), min(log["t"][-1], t[-1]), 1.0 / RATE)
-        sides = (np.column_stack([np.interp(grid, s, c) for c in x.T]) for s, x in ((log["t"], log["tau"]), (t, tau)))
-        measured, own = (filtfilt(*butter(4, CUTOFF / (RATE / 2)), side, axis=0) for side in sides)
-        inner = np.broadcast_to(((grid >= grid[0] + BORDER) & (grid <= grid[-1] - BORDER))[:, None], own.shape)
+        start = max(log["t"][0], t[0])
+        end = min(log["t"][-1], t[-1])
+        grid = np.arange(start, end, 1.0 / RATE)
+        measured = low_passed(resampled(grid, log["t"], log["tau"]))
+        predicted = low_passed(resampled(grid, t, tau))
+        settled = (grid >= grid[0] + BORDER) & (grid <= grid[-1] - BORDER)
+        counted = np.broadcast_to(settled[:, None], predicted.shape)
         if moving:
-            q = np.column_stack([np.interp(grid, log["t"], c) for c in log["q"].T])
-            speed = np.gradient(filtfilt(*butter(4, CUTOFF / (RATE / 2)), q, axis=0), 1.0 / RATE, axis=0)
-            inner = inner & (np.abs(speed) > STANDING)
-        sums.append([((measured - own) ** 2 * inner).sum(axis=0), (measured**2 * inner).sum(axis=0)])
-    left, size = np.sum(sums, axis=0)
-    return left, size
+            q = low_passed(resampled(grid, log["t"], log["q"]))
+            velocity = np.gradient(q, 1.0 / RATE, axis=0)
+            counted = counted & (np.abs(velocity) > STANDING)
+        error = ((measured - predicted) ** 2 * counted).sum(axis=0)
+        size = (measured**2 * counted).sum(axis=0)
+        sums.append([error, size])
+    errors, sizes = np.sum(sums, axis=0)
+    return errors, sizes
 
 
 def identified_pair(files: Prepared, folder: Path) -> calib.DynamicsModel:
     """Return the identification of a pair's training files, validated on its test files."""
     options = folder / "options.toml"
     options.write_text(files.options)
-    train, test = ([str(path) for path in paths] for paths in (files.train, files.test))
+    train = [str(path) for path in files.train]
+    test = [str(path) for path in files.test]
     return calib.identify_dynamics(files.robot, train, validate=test, options=options)
 
 
-def _ours(files: Prepared, folder: Path) -> tuple[list[tuple[np.ndarray, np.ndarray]], float | None]:
+def _toolkit(files: Prepared, folder: Path) -> tuple[list[Prediction], float | None]:
     """Return the toolkit's predictions of the test files, and the share of their samples inside 95 % intervals [%]."""
-    outcome = identified_pair(files, folder)
-    predicted = [(case.motion.t, np.asarray(outcome.predictions[case.name])) for case in outcome.inputs.unseen]
-    found = outcome.intervals.values()
-    inside = [one.contains[one.valid].ravel() for one in found]
-    return predicted, 100.0 * float(np.concatenate(inside).mean()) if inside else None
+    model = identified_pair(files, folder)
+    predictions = [(case.motion.t, np.asarray(model.predictions[case.name])) for case in model.inputs.unseen]
+    inside = [intervals.contains[intervals.valid].ravel() for intervals in model.intervals.values()]
+    if not inside:
+        return predictions, None
+    return predictions, 100.0 * float(np.concatenate(inside).mean())
 
 
 def _ridges(files: Prepared) -> dict:
-    """Return the errors of the plain baselines: their names → total and joints [%]."""
-    found = {}
-    for cutoff in CUTOFFS:
-        both = ridge.predict(files.robot, files.train, files.test, cutoff, files.payload, files.joints)
-        for name in ("zero", "cad") if files.masses else ("zero",):
-            found[f"{cutoff:g} Hz, {name}"] = _percent(*squared_errors(files.test, both[name]), files.apart)
-    return found
+    """Return the errors of the ridge regressions: their names → total and joints [%]."""
+    priors = ["zero"]
+    if files.masses:
+        priors.append("cad")
+    errors = {}
+    for cutoff in RIDGE_CUTOFFS:
+        predictions = ridge.predict(files.robot, files.train, files.test, cutoff, files.payload, files.joints)
+        for prior in priors:
+            errors[f"{cutoff:g} Hz, {prior}"] = _errors(files, predictions[prior])
+    return errors
 
 
 def run(name: str) -> dict:
@@ -109,97 +141,166 @@ def run(name: str) -> dict:
     pair = next(pair for pair in PAIRS if pair.name == name)
     signal.signal(signal.SIGALRM, _too_long)
     signal.alarm(MAX_SECONDS)
-    with tempfile.TemporaryDirectory() as place:
-        folder, start = Path(place), time.process_time()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        start = time.process_time()
         files = pair.prepare(folder)
         result: dict = {"pair": name, "across": pair.across, "ridges": _ridges(files)}
-        least = plain.predict(files.robot, files.train, files.test, CUTOFFS[0], files.payload, files.joints)
-        result["plain"] = _percent(*squared_errors(files.test, least), files.apart)
-        result["plain in motion"] = _percent(*squared_errors(files.test, least, moving=True), files.apart)
-        ready = time.process_time()
-        try:
-            predicted, covered = _ours(files, folder)
-            ours = _percent(*squared_errors(files.test, predicted), files.apart)
-            moved = _percent(*squared_errors(files.test, predicted, moving=True), files.apart)
-            result |= {"ours": ours, "in motion": moved, "coverage": covered, "refused": ""}
-        except Exception as error:  # one pair's failure is a row of the table
-            result |= {"ours": None, "in motion": None, "coverage": None, "refused": f"{type(error).__name__}: {error}"}
-        result |= {"seconds": time.process_time() - ready, "preparing": ready - start}
+        cutoff = RIDGE_CUTOFFS[0]
+        least_squares = plain.predict(files.robot, files.train, files.test, cutoff, files.payload, files.joints)
+        result["plain"] = _errors(files, least_squares)
+        result["plain in motion"] = _errors(files, least_squares, moving=True)
+        prepared = time.process_time()
+        result |= _toolkit_row(files, folder)
+        result["seconds"] = time.process_time() - prepared
+        result["preparing"] = prepared - start
     signal.alarm(0)
     return result
+
+
+def _toolkit_row(files: Prepared, folder: Path) -> dict:
+    """Return the toolkit's part of a row; where it fails, the reason."""
+    try:
+        predictions, coverage = _toolkit(files, folder)
+        errors = _errors(files, predictions)
+        errors_in_motion = _errors(files, predictions, moving=True)
+    except Exception as error:  # one pair's failure is a row of the table
+        reason = f"{type(error).__name__}: {error}"
+        return {"ours": None, "in motion": None, "coverage": None, "refused": reason}
+    return {"ours": errors, "in motion": errors_in_motion, "coverage": coverage, "refused": ""}
 
 
 def _too_long(*_: object) -> None:
     raise TimeoutError(f"longer than {MAX_SECONDS} s")
 
 
-def _percent(left: np.ndarray, size: np.ndarray, apart: tuple[int, ...]) -> dict:
-    joints = 100.0 * np.sqrt(left / size)
-    alike = ~np.isin(np.arange(len(left)), apart)
-    return {"total": float(100.0 * np.sqrt(left[alike].sum() / size[alike].sum())), "joints": joints.tolist()}
+def _errors(files: Prepared, predictions: list[Prediction], moving: bool = False) -> dict:
+    """Return the relative errors [%] of predictions of a pair's test files: total, and joint by joint."""
+    errors, sizes = squared_errors(files.test, predictions, moving)
+    joints = 100.0 * np.sqrt(errors / sizes)
+    alike = ~np.isin(np.arange(len(errors)), files.apart)
+    total = 100.0 * np.sqrt(errors[alike].sum() / sizes[alike].sum())
+    return {"total": float(total), "joints": joints.tolist()}
 
 
-def reference(one: dict) -> float:
+def reference(row: dict) -> float:
     """Return the error of the plain reference [%]: the better of ridge and weighted least squares, both at 6 Hz."""
-    return min(one["ridges"][PLAIN_RIDGE]["total"], one["plain"]["total"])
+    return min(row["ridges"][PLAIN_RIDGE]["total"], row["plain"]["total"])
 
 
-def ratios(one: dict) -> tuple[float, float]:
+def best_ridge(row: dict) -> str:
+    """Return the name of the ridge regression with the least error on the test."""
+    return min(row["ridges"], key=lambda name: row["ridges"][name]["total"])
+
+
+def ratios(row: dict) -> tuple[float, float]:
     """Return the toolkit's error over the plain reference's and over the best reference's; infinite if it refused."""
-    if one["ours"] is None:
+    if row["ours"] is None:
         return np.inf, np.inf
-    best = min(one["plain"]["total"], *(x["total"] for x in one["ridges"].values()))
-    return one["ours"]["total"] / reference(one), one["ours"]["total"] / best
+    best = min(row["plain"]["total"], row["ridges"][best_ridge(row)]["total"])
+    error = row["ours"]["total"]
+    return error / reference(row), error / best
 
 
 def head(before: dict) -> str:
     """Return the table's head."""
-    names = ["pair", "regime", "ridge", "plain", "best ridge", *(["before"] if before else []), "toolkit", "in motion"]
-    names += ["ratio", "to best", "worst joint (ridge)", "within 95 %", "s"]
+    names = ["pair", "regime", "ridge", "plain", "best ridge"]
+    if before:
+        names.append("before")
+    names += ["toolkit", "in motion", "ratio", "to best", "worst joint (ridge)", "within 95 %", "s"]
     return f"| {' | '.join(names)} |\n|{'---|' * len(names)}"
 
 
-def line(one: dict, before: dict) -> str:
+def line(row: dict, before: dict) -> str:
     """Return a line of the table; `before`: the errors of another version by pair, None where it refused."""
-    ridged = one["ridges"][PLAIN_RIDGE]
-    best = min(one["ridges"], key=lambda name: one["ridges"][name]["total"])
-    cells = [one["pair"], "across" if one["across"] else "same", _share(ridged["total"]), _share(one["plain"]["total"])]
-    cells.append(f"{_share(one['ridges'][best]['total'])} ({best})")
+    plain_ridge = row["ridges"][PLAIN_RIDGE]
+    best = best_ridge(row)
+    cells = [row["pair"]]
+    cells.append("across" if row["across"] else "same")
+    cells.append(_share(plain_ridge["total"]))
+    cells.append(_share(row["plain"]["total"]))
+    cells.append(f"{_share(row['ridges'][best]['total'])} ({best})")
     if before:
-        cells.append(_share(before.get(one["pair"])))
-    cells.append(_share(one["ours"] and one["ours"]["total"]))
-    if one["ours"] is None:
-        cells += ["–", "–", "–", one["refused"][:80], "–"]
+        cells.append(_share(before.get(row["pair"])))
+    if row["ours"] is None:
+        cells += [_share(None), "–", "–", "–", row["refused"][:80], "–"]
     else:
-        joints = one["ours"]["joints"]
+        joints = row["ours"]["joints"]
         worst = int(np.argmax(joints))
-        cells.append(_share(one["in motion"]["total"]))
-        cells += [f"{x:.2f}" for x in ratios(one)]
-        cells.append(f"{worst + 1}: {joints[worst]:.0f} % ({ridged['joints'][worst]:.0f} %)")
-        cells.append("–" if one["coverage"] is None else f"{one['coverage']:.0f} %")
-    return f"| {' | '.join([*cells, format(one['seconds'], '.0f')])} |"
+        cells.append(_share(row["ours"]["total"]))
+        cells.append(_share(row["in motion"]["total"]))
+        cells += [f"{ratio:.2f}" for ratio in ratios(row)]
+        cells.append(f"{worst + 1}: {joints[worst]:.0f} % ({plain_ridge['joints'][worst]:.0f} %)")
+        cells.append("–" if row["coverage"] is None else f"{row['coverage']:.0f} %")
+    cells.append(f"{row['seconds']:.0f}")
+    return f"| {' | '.join(cells)} |"
 
 
 def _share(value: float | None) -> str:
-    return "refused" if value is None else f"{value:.1f} %"
+    if value is None:
+        return "refused"
+    return f"{value:.1f} %"
 
 
 def summary(rows: list[dict]) -> list[str]:
     """Return lines on all pairs, those of the same regime and those across, open ones and simulated ones."""
-    kinds = {
-        "all": lambda x: True, "same regime": lambda x: not x["across"], "across regimes": lambda x: x["across"],
-        "open": lambda x: not x["pair"].startswith("sim."), "simulated": lambda x: x["pair"].startswith("sim."),
-    }  # fmt: skip
+    groups: dict[str, list[dict]] = {"all": rows, "same regime": [], "across regimes": [], "open": [], "simulated": []}
+    for row in rows:
+        regime = "across regimes" if row["across"] else "same regime"
+        origin = "simulated" if row["pair"].startswith("sim.") else "open"
+        groups[regime].append(row)
+        groups[origin].append(row)
     lines = ["| pairs | number | max ratio | median | above 1.1 | to best: max | median | above 1.1 | within 95 % |"]
     lines.append("|---|---|---|---|---|---|---|---|---|")
-    for name, wanted in kinds.items():
-        own = [x for x in rows if wanted(x)]
-        if own:
-            cells = [f"{x.max():.2f} | {np.median(x):.2f} | {(x > 1.1).sum()}" for x in np.array([*map(ratios, own)]).T]
-            covered = [x["coverage"] for x in own if x["coverage"] is not None]
-            mean = f"{np.mean(covered):.0f} %" if covered else "–"
-            lines.append(f"| {name} | {len(own)} | {' | '.join(cells)} | {mean} |")
+    for name, group in groups.items():
+        if group:
+            lines.append(_summary_line(name, group))
     return lines
+
+
+def _summary_line(name: str, group: list[dict]) -> str:
+    """Return the summary's line of a group of pairs."""
+    cells = [name, str(len(group))]
+    to_plain, to_best = np.transpose([ratios(row) for row in group])
+    for ratio in (to_plain, to_best):
+        cells += [f"{ratio.max():.2f}", f"{np.median(ratio):.2f}", str((ratio > MAX_RATIO).sum())]
+    coverage = [row["coverage"] for row in group if row["coverage"] is not None]
+    cells.append(f"{np.mean(coverage):.0f} %" if coverage else "–")
+    return f"| {' | '.join(cells)} |"
+
+
+def chosen_pairs(quick: bool, texts: list[str]) -> list[Pair]:
+    """Return the pairs to run: the quick ones or all; of these, where texts are given, those whose names hold one."""
+    chosen = []
+    for pair in PAIRS:
+        if quick and not pair.quick:
+            continue
+        if texts and not any(text in pair.name for text in texts):
+            continue
+        chosen.append(pair)
+    return chosen
+
+
+def results(pairs: list[Pair], folder: Path, jobs: int) -> Iterator[dict]:
+    """Yield the rows of pairs in their order; those that the folder holds already are not made again."""
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        tasks = []
+        for pair in pairs:
+            path = folder / f"{hashlib.sha1(pair.name.encode()).hexdigest()[:12]}.json"
+            task = None if path.exists() else pool.submit(run, pair.name)
+            tasks.append((path, task))
+        for path, task in tasks:
+            if task is not None:
+                path.write_text(json.dumps(task.result()))
+            yield json.loads(path.read_text())
+
+
+def write_between_marks(document: Path, lines: list[str]) -> None:
+    """Replace what stands between the two marks of a document."""
+    text_before, _, rest = document.read_text().partition(MARK)
+    text_after = rest.partition(MARK)[2]
+    table = "\n".join(lines)
+    document.write_text(f"{text_before}{MARK}\n{table}\n{MARK}{text_after}")
 
 
 def main() -> None:
@@ -210,36 +311,33 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("extrapolation"), help="where results are kept")
     parser.add_argument("--beside", type=Path, help="results.json of another version: a column of its errors")
     parser.add_argument("--markdown", type=Path, help="document whose tables between the marks are replaced")
-    wanted = parser.parse_args()
+    options = parser.parse_args()
     tree = state()
-    kept = wanted.out / tree
-    kept.mkdir(parents=True, exist_ok=True)
-    chosen = [
-        pair for pair in PAIRS
-        if (pair.quick or not wanted.quick) and (not wanted.only or any(x in pair.name for x in wanted.only))
-    ]  # fmt: skip
-    before = errors_by_pair(wanted.beside) if wanted.beside else {}
+    folder = options.out / tree
+    folder.mkdir(parents=True, exist_ok=True)
+    before = errors_by_pair(options.beside) if options.beside else {}
     print(head(before), flush=True)
     rows = []
-    with ProcessPoolExecutor(wanted.jobs, mp_context=get_context("spawn")) as pool:
-        paths = [kept / f"{hashlib.sha1(pair.name.encode()).hexdigest()[:12]}.json" for pair in chosen]
-        under_way = [None if path.exists() else pool.submit(run, pair.name) for path, pair in zip(paths, chosen)]
-        for path, task in zip(paths, under_way):
-            if task is not None:
-                path.write_text(json.dumps(task.result()))
-            rows.append(json.loads(path.read_text()))
-            print(line(rows[-1], before), flush=True)
-    (wanted.out / "results.json").write_text(json.dumps({"tree": tree, "rows": rows}, indent=1))
-    print("\n".join(["", *summary(rows)]))
-    if wanted.markdown:
-        lines = [*summary(rows), "", head(before), *(line(one, before) for one in rows)]
-        first, _, rest = wanted.markdown.read_text().partition(MARK)
-        wanted.markdown.write_text(f"{first}{MARK}\n" + "\n".join(lines) + f"\n{MARK}{rest.partition(MARK)[2]}")
+    for row in results(chosen_pairs(options.quick, options.only), folder, options.jobs):
+        rows.append(row)
+        print(line(row, before), flush=True)
+    (options.out / "results.json").write_text(json.dumps({"tree": tree, "rows": rows}, indent=1))
+    print()
+    print("\n".join(summary(rows)))
+    if options.markdown:
+        lines = [*summary(rows), "", head(before)]
+        lines += [line(row, before) for row in rows]
+        write_between_marks(options.markdown, lines)
 
 
 def errors_by_pair(path: Path) -> dict[str, float | None]:
     """Return the errors [%] in a results.json by pair; None where the toolkit refused."""
-    return {x["pair"]: x["ours"] and x["ours"]["total"] for x in json.loads(path.read_text())["rows"]}
+    errors: dict[str, float | None] = {}
+    for row in json.loads(path.read_text())["rows"]:
+        errors[row["pair"]] = None
+        if row["ours"] is not None:
+            errors[row["pair"]] = row["ours"]["total"]
+    return errors
 
 
 if __name__ == "__main__":

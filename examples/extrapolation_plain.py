@@ -26,17 +26,28 @@ def predict(
     joints: Sequence[str] = (),
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return instants (N,) and torques (N, n) predicted on each test file; see `extrapolation_ridge.predict`."""
-    model = ridge.chosen(urdf, joints)
-    logs = [ridge.Log(model, path, cutoff) for path in train]
-    inner = [(log.t > log.t[0] + BORDER) & (log.t < log.t[-1] - BORDER) for log in logs]
-    rows = np.concatenate([log.rows[used] for log, used in zip(logs, inner)])
-    tau = np.concatenate([log.tau[used] for log, used in zip(logs, inner)])
+    model = ridge.recorded_model(urdf, joints)
+    regressors = []
+    torques = []
+    for path in train:
+        log = ridge.Log(model, path, cutoff)
+        settled = (log.t > log.t[0] + BORDER) & (log.t < log.t[-1] - BORDER)
+        regressors.append(log.rows[settled])
+        torques.append(log.tau[settled])
+    rows = np.concatenate(regressors)
+    tau = np.concatenate(torques)
     weight = np.ones(tau.shape[1])
     for _ in range(2):
         stacked = (rows * weight[:, None]).reshape(-1, rows.shape[2])
         norms = np.linalg.norm(stacked, axis=0)
         scale = np.where(norms > 0.0, norms, 1.0)
-        values = np.linalg.lstsq(stacked / scale, (tau * weight).ravel(), rcond=RANK)[0] / scale
-        weight = 1.0 / np.maximum(np.std(tau - rows @ values, axis=0), 1e-9)
-    unseen = [ridge.Log(model, path, cutoff, payload) for path in test]
-    return [(log.t, log.rows @ values + log.carried) for log in unseen]
+        target = (tau * weight).ravel()
+        solution = np.linalg.lstsq(stacked / scale, target, rcond=RANK)[0]
+        values = solution / scale
+        residual_std = np.std(tau - rows @ values, axis=0)
+        weight = 1.0 / np.maximum(residual_std, 1e-9)
+    predictions = []
+    for path in test:
+        log = ridge.Log(model, path, cutoff, payload)
+        predictions.append((log.t, log.rows @ values + log.payload_torque))
+    return predictions

@@ -15,61 +15,117 @@ import pinocchio as pin
 from scipy.signal import butter, filtfilt
 
 RATE = 100.0  # of the rows [Hz]
-ROUNDS, MAX_ROWS_AS_ONE = 60, 10.0
-SCALES = [1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]  # of a body's parameters: m, m c, inertias
+ROUNDS = 60  # of MacKay's updates
+MAX_ROWS_AS_ONE = 10.0  # correlated samples that count as one, at most
+SIGN_WIDTH = 0.01  # velocity within which Coulomb friction changes its sign [rad/s or m/s]
+# the groups of parameters that share a precision, and typical sizes of a body's: m, m c, inertias
+BODY_GROUPS = [0, 1, 1, 1, 2, 2, 2, 2, 2, 2]
+BODY_SCALES = [1, 0.3, 0.3, 0.3, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1]
+DRIVE_GROUPS = [3, 4, 5, 6]  # Coulomb, viscous, rotor, offset
+DRIVE_SCALES = [1, 1, 0.3, 1]
 
 
 class Log:
-    """Observation matrices (N, n, 14 n) and torques (N, n) [N m or N] of a file, at instants t (N,) [s]."""
+    """Regressor and torques of a recording.
+
+    Attributes:
+        t: (N,) instants [s].
+        rows: (N, n, 14 n) regressor: of each body ten parameters, then Coulomb, viscous, rotor and offset by joint.
+        tau: (N, n) torques [N m or N].
+        payload_torque: (N, n) torques of the payload [N m or N]; zero without one.
+    """
 
     def __init__(self, model: pin.Model, path: Path, cutoff: float, payload: dict | None = None):
         log = np.load(path)
         rate = 1.0 / np.median(np.diff(log["t"]))
         grid = np.arange(log["t"][0], log["t"][-1], 1.0 / rate)
-        q, tau = (np.column_stack([np.interp(grid, log["t"], c) for c in log[key].T]) for key in ("q", "tau"))
-        smooth = filtfilt(*butter(4, cutoff / (rate / 2)), q, axis=0)
-        v = np.gradient(smooth, 1 / rate, axis=0)
+        numerator, denominator = butter(4, cutoff / (rate / 2))
+        q = filtfilt(numerator, denominator, _resampled(grid, log["t"], log["q"]), axis=0)
+        v = np.gradient(q, 1 / rate, axis=0)
         a = np.gradient(v, 1 / rate, axis=0)
-        every = slice(None, None, max(1, round(rate / RATE)))
-        self.t, self.tau, data = grid[every], tau[every], model.createData()
-        bodies = [pin.computeJointTorqueRegressor(model, data, *x) for x in zip(smooth[every], v[every], a[every])]
-        drives = [np.hstack([np.diag(np.tanh(x / 0.01)), np.diag(x), np.diag(y), np.eye(len(x))]) for x, y in zip(
-            v[every], a[every])]  # fmt: skip
-        self.rows = np.concatenate([bodies, drives], axis=2)
-        self.carried = np.zeros_like(self.tau)
+        decimated = slice(None, None, max(1, round(rate / RATE)))
+        self.t = grid[decimated]
+        self.tau = _resampled(grid, log["t"], log["tau"])[decimated]
+        self.rows = _regressor(model, q[decimated], v[decimated], a[decimated])
+        self.payload_torque = np.zeros_like(self.tau)
         if payload is not None:
-            flange = next(frame for frame in reversed(model.frames) if frame.type == pin.FrameType.BODY)
-            body = flange.placement.act(pin.Inertia(payload["mass"], np.array(payload["com"]), np.zeros((3, 3))))
-            last = slice(10 * (model.njoints - 2), 10 * (model.njoints - 1))
-            self.carried = self.rows[:, :, last] @ body.toDynamicParameters()
+            last_body = slice(10 * (model.njoints - 2), 10 * (model.njoints - 1))
+            self.payload_torque = self.rows[:, :, last_body] @ _payload_parameters(model, payload)
+
+
+def _resampled(grid: np.ndarray, t: np.ndarray, series: np.ndarray) -> np.ndarray:
+    """Return series (N, n) at instants t (N,) [s], interpolated at the instants of a grid."""
+    return np.column_stack([np.interp(grid, t, column) for column in series.T])
+
+
+def _regressor(model: pin.Model, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return the regressor (N, n, 14 n) of a motion: positions, velocities and accelerations (N, n)."""
+    data = model.createData()
+    rows = []
+    for position, velocity, acceleration in zip(q, v, a):
+        bodies = pin.computeJointTorqueRegressor(model, data, position, velocity, acceleration)
+        coulomb = np.diag(np.tanh(velocity / SIGN_WIDTH))
+        viscous = np.diag(velocity)
+        rotor = np.diag(acceleration)
+        offset = np.eye(len(velocity))
+        rows.append(np.hstack([bodies, coulomb, viscous, rotor, offset]))
+    return np.array(rows)
+
+
+def _payload_parameters(model: pin.Model, payload: dict) -> np.ndarray:
+    """Return the standard parameters (10,) of a payload at the last joint: mass [kg], com [m] in the tip's frame."""
+    flange = next(frame for frame in reversed(model.frames) if frame.type == pin.FrameType.BODY)
+    body = pin.Inertia(payload["mass"], np.array(payload["com"]), np.zeros((3, 3)))
+    return flange.placement.act(body).toDynamicParameters()
 
 
 def _evidence(rows: np.ndarray, tau: np.ndarray, mean: np.ndarray, scale: np.ndarray, groups: np.ndarray) -> np.ndarray:
-    """Return the parameters (p,) of rows (N, n, p) and torques (N, n) around a prior mean."""
+    """Return the parameters (p,) of a ridge regression whose precisions and noise are chosen by evidence.
+
+    Args:
+        rows: (N, n, p) regressor.
+        tau: (N, n) torques.
+        mean: (p,) of the prior.
+        scale: (p,) typical sizes of the parameters.
+        groups: (p,) number of the group that a parameter shares its precision with.
+    """
     samples, n, _ = rows.shape
-    rest = tau - rows @ mean
-    b = [rows[:, j] * scale for j in range(n)]
-    h, g, c = [x.T @ x for x in b], [x.T @ rest[:, j] for j, x in enumerate(b)], (rest**2).sum(axis=0)
-    precision, as_one, noise = np.full(groups.max() + 1, 1e-2), np.full(n, 10.0), 0.01 * rest.var(axis=0) + 1e-6
+    target = tau - rows @ mean
+    scaled = [rows[:, j] * scale for j in range(n)]
+    # joint by joint: Hessian, gradient and constant of the sum of squares
+    hessian = [matrix.T @ matrix for matrix in scaled]
+    gradient = [matrix.T @ target[:, j] for j, matrix in enumerate(scaled)]
+    squares = (target**2).sum(axis=0)
+    precision = np.full(groups.max() + 1, 1e-2)
+    rows_as_one = np.full(n, 10.0)
+    noise = 0.01 * target.var(axis=0) + 1e-6
     for _ in range(ROUNDS):
-        weighted = sum(h[j] / (noise[j] * as_one[j]) for j in range(n))
-        covariance = np.linalg.inv(weighted + np.diag(precision[groups]))
-        x = covariance @ sum(g[j] / (noise[j] * as_one[j]) for j in range(n))
-        gamma = 1 - precision[groups] * np.diag(covariance)
+        variance = noise * rows_as_one
+        information = sum(hessian[j] / variance[j] for j in range(n))
+        covariance = np.linalg.inv(information + np.diag(precision[groups]))
+        x = covariance @ sum(gradient[j] / variance[j] for j in range(n))
+        determined = 1 - precision[groups] * np.diag(covariance)
         for k in range(len(precision)):
-            own = groups == k
-            precision[k] = np.clip(max(gamma[own].sum(), 0.1) / max((x[own] ** 2).sum(), 1e-12), 1e-6, 1e8)
+            members = groups == k
+            number = max(determined[members].sum(), 0.1)
+            size = max((x[members] ** 2).sum(), 1e-12)
+            precision[k] = np.clip(number / size, 1e-6, 1e8)
         for j in range(n):
-            left = c[j] - 2 * x @ g[j] + x @ h[j] @ x
-            free = samples - np.trace(covariance @ h[j]) / as_one[j]
-            noise[j] = max(left / max(free, samples * 0.05), 1e-8)
-            error = rest[:, j] - b[j] @ x
-            rho = np.clip(np.corrcoef(error[1:], error[:-1])[0, 1], 0, 0.99)
-            as_one[j] = min((1 + rho) / (1 - rho), MAX_ROWS_AS_ONE)
+            residual_squares = squares[j] - 2 * x @ gradient[j] + x @ hessian[j] @ x
+            freedom = samples - np.trace(covariance @ hessian[j]) / rows_as_one[j]
+            noise[j] = max(residual_squares / max(freedom, samples * 0.05), 1e-8)
+            rows_as_one[j] = _correlated_rows(target[:, j] - scaled[j] @ x)
     return mean + scale * x
 
 
-def chosen(urdf: Path, joints: Sequence[str] = ()) -> pin.Model:
+def _correlated_rows(residual: np.ndarray) -> float:
+    """Return how many rows count as one, by the lag-one correlation ρ of residuals (N,): (1 + ρ) / (1 - ρ)."""
+    correlation = np.corrcoef(residual[1:], residual[:-1])[0, 1]
+    rho = np.clip(correlation, 0, 0.99)
+    return min((1 + rho) / (1 - rho), MAX_ROWS_AS_ONE)
+
+
+def recorded_model(urdf: Path, joints: Sequence[str] = ()) -> pin.Model:
     """Return the model of a description, of these joints alone where any are named."""
     model = pin.buildModelFromUrdf(str(urdf))
     if not joints:
@@ -93,16 +149,19 @@ def predict(
         payload: mass [kg] and com [m] in the tip's frame, of the body carried in the tests.
         joints: that were recorded, where the description has others.
     """
-    model = chosen(urdf, joints)
-    logs, unseen = [Log(model, x, cutoff) for x in train], [Log(model, x, cutoff, payload) for x in test]
+    model = recorded_model(urdf, joints)
+    logs = [Log(model, path, cutoff) for path in train]
+    unseen = [Log(model, path, cutoff, payload) for path in test]
+    rows = np.concatenate([log.rows for log in logs])
+    tau = np.concatenate([log.tau for log in logs])
     n = model.nv
-    scale = np.r_[np.tile(SCALES, n), np.ones(n), np.ones(n), np.full(n, 0.3), np.ones(n)]
-    groups = np.r_[np.tile([0, 1, 1, 1, 2, 2, 2, 2, 2, 2], n), np.repeat([3, 4, 5, 6], n)]
-    rows, tau = (np.concatenate([getattr(log, key) for log in logs]) for key in ("rows", "tau"))
-    result = {}
-    for name, share in (("zero", 0.0), ("cad", 1.0)):
-        mean = np.zeros(len(scale))
-        mean[: 10 * n] = share * np.concatenate([inertia.toDynamicParameters() for inertia in model.inertias[1:]])
-        found = _evidence(rows, tau, mean, scale, groups)
-        result[name] = [(log.t, log.rows @ found + log.carried) for log in unseen]
-    return result
+    scale = np.concatenate([np.tile(BODY_SCALES, n), np.repeat(DRIVE_SCALES, n)])
+    groups = np.concatenate([np.tile(BODY_GROUPS, n), np.repeat(DRIVE_GROUPS, n)])
+    described = [inertia.toDynamicParameters() for inertia in model.inertias[1:]]
+    means = {"zero": np.zeros(len(scale)), "cad": np.zeros(len(scale))}
+    means["cad"][: 10 * n] = np.concatenate(described)
+    predictions = {}
+    for name, mean in means.items():
+        values = _evidence(rows, tau, mean, scale, groups)
+        predictions[name] = [(log.t, log.rows @ values + log.payload_torque) for log in unseen]
+    return predictions

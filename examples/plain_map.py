@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
-from planted_arms import Arm, pinocchio_model
+from planted_arms import Arm, pinocchio_model, set_joint
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
@@ -44,8 +44,9 @@ class Targets:
 
     def take(self, rows: np.ndarray) -> "Targets":
         """Return some of the postures."""
-        orientations = None if self.orientations is None else self.orientations[rows]
-        return Targets(self.positions[rows], orientations)
+        if self.orientations is None:
+            return Targets(self.positions[rows])
+        return Targets(self.positions[rows], self.orientations[rows])
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,7 @@ class Chain:
                 data = joint.createData()
                 for row, value in enumerate(q[:, k]):
                     configuration = pin.neutral(model)
-                    entry = [np.cos(value), np.sin(value)] if joint.nq == 2 else [value]
-                    configuration[joint.idx_q : joint.idx_q + joint.nq] = entry
+                    set_joint(configuration, joint, value)
                     joint.calc(data, configuration)
                     result[k, row] = data.M.homogeneous
             return result
@@ -152,49 +152,65 @@ class Problem:
         turns = np.swapaxes(self.measured.orientations, 1, 2) @ frames[0, :, :3, :3]
         return shifts, Rotation.from_matrix(turns).as_rotvec()
 
-    def scale(self) -> np.ndarray:
+    def row_weights(self) -> np.ndarray:
         """Return what errors of a row are multiplied by, (m, 1)."""
-        count = len(self.measured.positions)
-        return np.ones((count, 1)) if self.weights is None else np.sqrt(self.weights)[:, None]
+        if self.weights is None:
+            return np.ones((len(self.measured.positions), 1))
+        return np.sqrt(self.weights)[:, None]
 
     def residuals(self, values: np.ndarray) -> np.ndarray:
+        """Return weighted errors over σ, of positions, orientations and prior."""
         shifts, turns = self.errors(self.at(values))
         flat = shifts.reshape(len(shifts), -1)
-        seen = [flat * self.scale() / self.sigma[0], turns * self.scale() / self.sigma[1]]
-        return np.concatenate([part.ravel() for part in seen] + [values / self.prior.ravel()])
+        weight = self.row_weights()
+        by_position = flat * weight / self.sigma[0]
+        by_turn = turns * weight / self.sigma[1]
+        by_prior = values / self.prior.ravel()
+        return np.concatenate([by_position.ravel(), by_turn.ravel(), by_prior])
 
     def jacobian(self, values: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the residuals by the free twists."""
         cell = self.at(values)
         frames = cell.frames(self.motions)
         ends = frames[1 + cell.joints :]
-        count, targets = len(self.measured.positions), len(ends)
-        by_position = np.zeros((count, targets, 3, len(self.free), 6))
+        count = len(self.measured.positions)
+        by_position = np.zeros((count, len(ends), 3, len(self.free), 6))
         by_turn = np.zeros((count, 3, len(self.free), 6))
         for column, link in enumerate(self.free):
-            rotation, point = frames[link, :, :3, :3], frames[link, :, :3, 3]
             twisting = pin.Jexp6(cell.twists[link])
             for number, end in enumerate(ends):
-                if link > cell.joints and link != 1 + cell.joints + number:
-                    continue  # another target's twist
-                lever = end[:, :3, 3] - point
-                across = np.cross(np.swapaxes(rotation, 1, 2), lever[:, None])  # rows: (R e_i) x lever
-                body = np.concatenate([rotation, np.swapaxes(across, 1, 2)], axis=2)
-                by_position[:, number, :, column] = body @ twisting
+                another_targets_twist = link > cell.joints and link != 1 + cell.joints + number
+                if not another_targets_twist:
+                    by_position[:, number, :, column] = point_derivative(frames[link], end[:, :3, 3]) @ twisting
+            rotation = frames[link, :, :3, :3]
             turned = np.swapaxes(ends[0, :, :3, :3], 1, 2) @ rotation
             by_turn[:, :, column] = np.concatenate([np.zeros_like(turned), turned], axis=2) @ twisting
-        scale = self.scale()[:, :, None]
+        weight = self.row_weights()[:, :, None]
         width = 6 * len(self.free)
-        parts = [(by_position.reshape(count, -1, width) * scale / self.sigma[0]).reshape(-1, width)]
+        parts = [by_position.reshape(count, -1, width) * weight / self.sigma[0]]
         if self.measured.orientations is not None:
-            parts.append((by_turn.reshape(count, 3, width) * scale / self.sigma[1]).reshape(-1, width))
+            parts.append(by_turn.reshape(count, 3, width) * weight / self.sigma[1])
         parts.append(np.diag(1.0 / self.prior.ravel()))
-        return np.concatenate(parts)
+        return np.concatenate([part.reshape(-1, width) for part in parts])
 
     def solve(self) -> tuple[Cell, OptimizeResult]:
         """Return the cell at the minimum, started from its twists."""
         start = self.cell.twists[self.free].ravel()
-        found = least_squares(self.residuals, start, self.jacobian, x_scale=self.prior.ravel())
-        return self.at(found.x), found
+        result = least_squares(self.residuals, start, self.jacobian, x_scale=self.prior.ravel())
+        return self.at(result.x), result
+
+
+def point_derivative(frame: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Return the derivative (m, 3, 6) of points (m, 3) [m] by a twist behind frames (m, 4, 4)."""
+    rotation = frame[:, :3, :3]
+    lever = point - frame[:, :3, 3]
+    across = np.cross(np.swapaxes(rotation, 1, 2), lever[:, None])  # rows: (R e_i) x lever
+    return np.concatenate([rotation, np.swapaxes(across, 1, 2)], axis=2)
+
+
+def frame_prior(free: np.ndarray) -> np.ndarray:
+    """Return the σ (free, 6) of twists that are practically free [m, rad]."""
+    return np.tile(np.repeat(FRAME_PRIOR, 3), (len(free), 1))
 
 
 def placed(chain: Chain, q: np.ndarray, measured: Targets, seed: int = 0) -> Cell:
@@ -202,38 +218,54 @@ def placed(chain: Chain, q: np.ndarray, measured: Targets, seed: int = 0) -> Cel
     rng = np.random.default_rng(seed)
     rows = rng.permutation(len(q))[:GUESS_ROWS]
     motions = chain.motions(q[rows])
-    few = measured.take(rows)
-    count, targets = len(chain.origins), few.positions.shape[1]
-    bare = Cell(chain, np.eye(4), np.tile(np.eye(4), (targets, 1, 1)), np.zeros((1 + count + targets, 6)))
-    tips = bare.frames(motions)[1 + count]
-    frames_free = np.r_[0, np.arange(1 + count, 1 + count + targets)]
-    prior = np.tile(np.repeat(FRAME_PRIOR, 3), (len(frames_free), 1))
+    sample = measured.take(rows)
+    joints = len(chain.origins)
+    targets = sample.positions.shape[1]
+    twists = np.zeros((1 + joints + targets, 6))
+    nominal = Cell(chain, np.eye(4), np.tile(np.eye(4), (targets, 1, 1)), twists)
+    tips = nominal.frames(motions)[1 + joints]
+    free = np.r_[0, np.arange(1 + joints, 1 + joints + targets)]
 
-    best, lowest = bare, np.inf
-    for rotation in (closed_form(tips, few.positions[:, 0]), *Rotation.random(RANDOM_STARTS, rng).as_matrix()):
-        station = np.eye(4)
-        station[:3, :3] = rotation
-        station[:3, 3] = few.positions[:, 0].mean(axis=0) - rotation @ tips[:, :3, 3].mean(axis=0)
-        ends = np.tile(np.eye(4), (targets, 1, 1))
-        if few.orientations is not None:
-            turned = np.swapaxes(rotation @ tips[:, :3, :3], 1, 2) @ few.orientations
-            ends[0, :3, :3] = Rotation.from_matrix(turned).mean().as_matrix()
-        start = replace(bare, station=station, targets=ends)
-        cell, result = Problem(start, motions, few, frames_free, prior, (1.0, 1.0 / LEVER)).solve()
-        if result.cost < lowest:
-            best, lowest = cell, result.cost
+    best = nominal
+    lowest_cost = np.inf
+    rotations = [closed_form(tips, sample.positions[:, 0]), *Rotation.random(RANDOM_STARTS, rng).as_matrix()]
+    for rotation in rotations:
+        start = guess(nominal, rotation, tips, sample)
+        cell, result = Problem(start, motions, sample, free, frame_prior(free), (1.0, 1.0 / LEVER)).solve()
+        if result.cost < lowest_cost:
+            best = cell
+            lowest_cost = result.cost
     return with_frames(best, q, measured)
+
+
+def guess(nominal: Cell, rotation: np.ndarray, tips: np.ndarray, measured: Targets) -> Cell:
+    """Return a cell with station and targets guessed from a rotation (3, 3) of the station.
+
+    Args:
+        nominal: the cell with both at the identity.
+        rotation: of the station.
+        tips: (m, 4, 4) poses of the tip in the base frame.
+        measured: of the same postures.
+    """
+    station = np.eye(4)
+    station[:3, :3] = rotation
+    station[:3, 3] = measured.positions[:, 0].mean(axis=0) - rotation @ tips[:, :3, 3].mean(axis=0)
+    targets = nominal.targets.copy()
+    if measured.orientations is not None:
+        turned = np.swapaxes(rotation @ tips[:, :3, :3], 1, 2) @ measured.orientations
+        targets[0, :3, :3] = Rotation.from_matrix(turned).mean().as_matrix()
+    return replace(nominal, station=station, targets=targets)
 
 
 def closed_form(tips: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the station's rotation (3, 3) from A y_i + b - R_i t = a_i, linear in A = Sᵀ, b and the target t."""
-    count = len(tips)
-    left = np.zeros((count, 3, 15))
+    matrix = np.zeros((len(tips), 3, 15))
     for axis in range(3):
-        left[:, axis, 3 * axis : 3 * axis + 3] = points
-        left[:, axis, 9 + axis] = 1.0
-    left[:, :, 12:] = -tips[:, :3, :3]
-    solution = np.linalg.lstsq(left.reshape(-1, 15), tips[:, :3, 3].ravel(), rcond=None)[0]
+        matrix[:, axis, 3 * axis : 3 * axis + 3] = points
+        matrix[:, axis, 9 + axis] = 1.0
+    matrix[:, :, 12:] = -tips[:, :3, :3]
+    solution = np.linalg.lstsq(matrix.reshape(-1, 15), tips[:, :3, 3].ravel(), rcond=None)[0]
+    # the nearest rotation
     u, _, vt = np.linalg.svd(solution[:9].reshape(3, 3))
     return (u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt).T
 
@@ -242,8 +274,8 @@ def with_frames(cell: Cell, q: np.ndarray, measured: Targets) -> Cell:
     """Return a cell whose station and targets are fitted anew, its joint origins as they are."""
     links = np.arange(len(cell.twists))
     free = links[(links == 0) | (links > cell.joints)]
-    prior = np.tile(np.repeat(FRAME_PRIOR, 3), (len(free), 1))
-    return Problem(cell, cell.chain.motions(q), measured, free, prior, (1.0, 1.0 / LEVER)).solve()[0]
+    problem = Problem(cell, cell.chain.motions(q), measured, free, frame_prior(free), (1.0, 1.0 / LEVER))
+    return problem.solve()[0]
 
 
 def fit(
@@ -264,27 +296,38 @@ def fit(
         robust: rows are weighted by Cauchy's function of their largest error.
     """
     free = np.arange(len(cell.twists))
-    prior = np.tile(np.repeat(FRAME_PRIOR, 3), (len(free), 1))
+    prior = frame_prior(free)
     prior[1 : 1 + cell.joints] = np.repeat((position_prior, angle_prior), 3)
     problem = Problem(cell, cell.chain.motions(q), measured, free, prior)
     shifts, turns = problem.errors(cell)
     sigma = (rms(shifts), rms(turns) if turns.size else 1.0)
     for _ in range(ROUNDS):
         problem = replace(problem, sigma=sigma)
-        problem_cell, result = problem.solve()
-        problem = replace(problem, cell=problem_cell)
-        seen = len(result.fun) - free.size * 6
-        jacobian = result.jac
-        informed = np.linalg.solve(jacobian.T @ jacobian, jacobian[:seen].T @ jacobian[:seen])
-        share = max(1.0 - np.trace(informed) / seen, 0.2)  # of the residuals' degrees of freedom
-        shifts, turns = problem.errors(problem.cell)
-        scale = problem.scale()
-        counted = np.sqrt((scale**2).mean() * share)
-        sigma = (rms(shifts.reshape(len(q), -1) * scale) / counted, rms(turns * scale) / counted if turns.size else 1.0)
+        fitted, result = problem.solve()
+        problem = replace(problem, cell=fitted)
+        shifts, turns = problem.errors(fitted)
+        weight = problem.row_weights()
+        freedom = np.sqrt((weight**2).mean() * residual_freedom(result, priors=free.size * 6))
+        sigma_position = rms(shifts.reshape(len(q), -1) * weight) / freedom
+        sigma_turn = rms(turns * weight) / freedom if turns.size else 1.0
+        sigma = (sigma_position, sigma_turn)
         if robust:
-            largest = np.abs(shifts).max(axis=(1, 2)) / sigma[0]
+            largest = np.abs(shifts).max(axis=(1, 2)) / sigma_position
             problem = replace(problem, weights=1.0 / (1.0 + (largest / CAUCHY) ** 2))
     return problem.cell
+
+
+def residual_freedom(result: OptimizeResult, priors: int) -> float:
+    """Return the share of the measured residuals' degrees of freedom that parameters leave, at least 0.2.
+
+    Args:
+        result: of the fit.
+        priors: number of the prior's rows, which are the last.
+    """
+    measured = len(result.fun) - priors
+    jacobian = result.jac
+    resolution = np.linalg.solve(jacobian.T @ jacobian, jacobian[:measured].T @ jacobian[:measured])
+    return max(1.0 - np.trace(resolution) / measured, 0.2)
 
 
 def rms(values: np.ndarray) -> float:

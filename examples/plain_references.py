@@ -18,7 +18,7 @@ import os
 import tempfile
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
@@ -65,8 +65,9 @@ class Recording:
         names = [name.strip() for name in header.split(",")]
         table = np.array([row.split(",") for row in rows])
 
-        def columns(wanted: Sequence[str]) -> np.ndarray:
-            return table[:, [names.index(name) for name in wanted]].astype(float)
+        def columns(chosen: Sequence[str]) -> np.ndarray:
+            indices = [names.index(name) for name in chosen]
+            return table[:, indices].astype(float)
 
         positions = np.stack([columns(target) for target in self.targets], axis=1)
         orientations = None
@@ -123,7 +124,8 @@ MOTOMAN = ("q_E_external", "q_S", "q_L", "q_U", "q_R", "q_B", "q_T")
 TIAGO = ("torso_lift_joint", *(f"arm_{number}_joint" for number in range(1, 8)))
 
 UR5 = Recording("ur5_gts3800/model.urdf", ("ur5_gts3800/grid_800.csv",), numbered("q", 6), MEASURED)
-IIWA, IIWA_FOLDER = numbered("q", 7), "kuka_iiwa7"
+IIWA = numbered("q", 7)
+IIWA_FOLDER = "kuka_iiwa7"
 IIWA_ROBOT = f"{IIWA_FOLDER}/model.urdf"
 IIWA_TRAIN = Recording(IIWA_ROBOT, (f"{IIWA_FOLDER}/train_positions.csv",), IIWA, XYZ)
 IIWA_TEST = Recording(IIWA_ROBOT, (f"{IIWA_FOLDER}/test_positions.csv",), IIWA, XYZ)
@@ -179,8 +181,10 @@ def split(row: Row, draw: int) -> tuple[str, list[str], str, list[str]]:
     if row.unseen is not None:
         return header, lines, *row.unseen.lines()
     order = np.random.default_rng(draw).permutation(len(lines))
-    count = row.poses if row.poses else round(len(lines) * (1.0 - row.share))
-    return header, [lines[k] for k in order[:count]], header, [lines[k] for k in order[count:]]
+    count = row.poses or round(len(lines) * (1.0 - row.share))
+    fitted = [lines[k] for k in order[:count]]
+    held_out = [lines[k] for k in order[count:]]
+    return header, fitted, header, held_out
 
 
 def judge(cell: Cell, q: np.ndarray, measured: Targets, another_day: bool) -> float:
@@ -199,8 +203,8 @@ def run(row: Row, draw: int, plain_only: bool = False) -> Result:
 
     robot = DATA / row.fitted.robot
     text = robot.read_text(encoding="utf-8")
-    given = calib.load(robot).chain  # its ends alone
-    nominal = plain_map.placed(Chain.of(Arm(text, given.base, given.tip)), q, measured)
+    ends = calib.load(robot).chain  # of which base and tip alone are used
+    nominal = plain_map.placed(Chain.of(Arm(text, ends.base, ends.tip)), q, measured)
     plain = plain_map.fit(nominal, q, measured, robust=row.fitted.robust)
     result = Result(
         row.name,
@@ -213,23 +217,22 @@ def run(row: Row, draw: int, plain_only: bool = False) -> Result:
     if plain_only:
         return replace(result, seconds=time.perf_counter() - start)
 
-    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+    with tempfile.TemporaryDirectory() as temporary, warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        fitted_file, unseen_file = Path(folder, "fitted.csv"), Path(folder, "unseen.csv")
-        fitted_file.write_text("\n".join([header, *lines, ""]), encoding="utf-8")
-        unseen_file.write_text("\n".join([unseen_header, *unseen_lines, ""]), encoding="utf-8")
+        folder = Path(temporary)
+        fitted_file = write_rows(folder / "fitted.csv", header, lines)
+        unseen_file = write_rows(folder / "unseen.csv", unseen_header, unseen_lines)
         settings = calib.FitSettings(refit_frames=row.another_day)
         try:
             fit = calib.fit_geometry(robot, fitted_file, settings, validate=unseen_file)
-            calib.export(fit, Path(folder, "exported"), urdf=robot)
+            calib.export(fit, folder / "exported", urdf=robot)
         except Exception as error:  # an error is a result, too
-            words = " ".join(str(error).split())[:120]
-            return replace(result, verdict=f"{type(error).__name__}: {words}", seconds=time.perf_counter() - start)
-        exported = Path(folder, "exported/robot.urdf").read_text(encoding="utf-8")
+            message = " ".join(str(error).split())
+            verdict = f"{type(error).__name__}: {message[:120]}"
+            return replace(result, verdict=verdict, seconds=time.perf_counter() - start)
+        exported = (folder / "exported/robot.urdf").read_text(encoding="utf-8")
 
-    rigid = fit.selection.rigid.cell  # with the frames that belong to the URDF
-    arm = Arm(exported, rigid.chain.base, rigid.chain.tip)
-    delivered = Cell(Chain.of(arm), rigid.stations[0], rigid.tools, np.zeros_like(nominal.twists))
+    delivered = delivered_cell(fit, exported)
     (record,) = fit.to_dict()["validation"].values()
     return replace(
         result,
@@ -238,6 +241,20 @@ def run(row: Row, draw: int, plain_only: bool = False) -> Result:
         verdict=fit.verdict.level,
         seconds=time.perf_counter() - start,
     )
+
+
+def write_rows(path: Path, header: str, lines: Sequence[str]) -> Path:
+    """Write a file of measured poses; return its path."""
+    path.write_text("\n".join([header, *lines, ""]), encoding="utf-8")
+    return path
+
+
+def delivered_cell(fit: calib.GeometryFit, exported: str) -> Cell:
+    """Return the exported URDF as Pinocchio reads it, with the frames that belong to the rigid geometry."""
+    rigid = fit.selection.rigid.cell
+    chain = Chain.of(Arm(exported, rigid.chain.base, rigid.chain.tip))
+    twists = np.zeros((1 + len(chain.origins) + len(rigid.tools), 6))
+    return Cell(chain, rigid.stations[0], rigid.tools, twists)
 
 
 def progress(result: Result) -> str:
@@ -253,20 +270,39 @@ def print_table(results: Sequence[Result]) -> None:
     columns = ("nominal", "plain", "urdf", "corrections")
     titles = "".join(f"{title:>16}" for title in columns)
     print(f"\n{'rms on held-out rows [mm]':28} draws fitted{titles}   URDF / plain: largest, above {WORSE}")
-    for name in dict.fromkeys(result.row for result in results):
+    names = dict.fromkeys(result.row for result in results)
+    for name in names:
         draws = [result for result in results if result.row == name]
         line = f"{name:28} {len(draws):5} {draws[0].fitted:6}"
         for column in columns:
-            values = np.array([getattr(result, column) for result in draws])
-            values = values[np.isfinite(values)]
-            cell = f"{np.median(values):.3f} ({values.max():.3f})" if len(values) else "none"
-            line += f"{cell:>16}"
-        ratios = np.array([result.urdf / result.plain for result in draws])
-        ratios = ratios[np.isfinite(ratios)]
+            line += f"{median_and_largest(finite(getattr(result, column) for result in draws)):>16}"
+        ratios = finite(result.urdf / result.plain for result in draws)
         if len(ratios):
             line += f"   {ratios.max():.3f}, {np.sum(ratios > WORSE)} of {len(ratios)}"
         print(line)
     print("median (largest) over the draws")
+
+
+def finite(values: Iterable[float]) -> np.ndarray:
+    """Return the values that are finite."""
+    array = np.array(list(values))
+    return array[np.isfinite(array)]
+
+
+def median_and_largest(values: np.ndarray) -> str:
+    """Return the median and the largest value as a cell."""
+    if not len(values):
+        return "none"
+    return f"{np.median(values):.3f} ({values.max():.3f})"
+
+
+def rows_named(texts: Sequence[str]) -> list[Row]:
+    """Return the rows whose names contain one of the texts."""
+
+    def matches(row: Row) -> bool:
+        return any(text.lower() in row.name.lower() for text in texts)
+
+    return [row for row in ROWS if matches(row)]
 
 
 def main() -> None:
@@ -278,17 +314,22 @@ def main() -> None:
     parser.add_argument("--csv", type=Path, help="file for the errors of each split")
     parser.add_argument("--list", action="store_true", help="print the rows and stop")
     options = parser.parse_args()
-    rows = [row for row in ROWS if any(words.lower() in row.name.lower() for words in options.only)]
+    rows = rows_named(options.only)
     if options.list:
         print("\n".join(row.name for row in rows))
         return
 
-    tasks = [(row, draw) for row in rows for draw in range(min(row.draws, options.draws))]
+    task_rows: list[Row] = []
+    task_draws: list[int] = []
+    for row in rows:
+        draws = range(min(row.draws, options.draws))
+        task_rows += [row] * len(draws)
+        task_draws += draws
     results: list[Result] = []
     with ProcessPoolExecutor(options.jobs) as pool:
-        for result in pool.map(partial(run, plain_only=options.plain), *zip(*tasks)):
+        for result in pool.map(partial(run, plain_only=options.plain), task_rows, task_draws):
             results.append(result)
-            print(f"{len(results):3}/{len(tasks)} {progress(result)}", flush=True)
+            print(f"{len(results):3}/{len(task_rows)} {progress(result)}", flush=True)
     print_table(results)
     if options.csv:
         with options.csv.open("w", newline="", encoding="utf-8") as file:

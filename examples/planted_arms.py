@@ -27,12 +27,15 @@ class Arm:
     @property
     def path(self) -> list[ET.Element]:
         """Return the joints between base and tip, from the base on."""
-        above = {attribute(joint, "child", "link"): joint for joint in ET.fromstring(self.text).findall("joint")}
+        joint_above = {}
+        for joint in ET.fromstring(self.text).findall("joint"):
+            joint_above[attribute(joint, "child", "link")] = joint
         joints = []
         link = self.tip
-        while link != self.base and link in above:
-            joints.append(above[link])
-            link = attribute(above[link], "parent", "link")
+        while link != self.base and link in joint_above:
+            joint = joint_above[link]
+            joints.append(joint)
+            link = attribute(joint, "parent", "link")
         return joints[::-1]
 
     @property
@@ -46,15 +49,8 @@ class Arm:
 
     def postures(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Draw joint values (count, n) [rad or m] within the limits; of continuous joints within half a turn."""
-        lower, upper = [], []
-        for joint in self.movable:
-            if joint.get("type") == "continuous":
-                lower.append(-np.pi)
-                upper.append(np.pi)
-            else:
-                lower.append(float(attribute(joint, "limit", "lower", "0")))
-                upper.append(float(attribute(joint, "limit", "upper", "0")))
-        return rng.uniform(lower, upper, (count, len(lower)))
+        ranges = np.reshape([limits(joint) for joint in self.movable], (-1, 2))
+        return rng.uniform(ranges[:, 0], ranges[:, 1], (count, len(ranges)))
 
     def with_errors(self, rng: np.random.Generator) -> "Arm":
         """Return the arm whose joint origins are moved along and about their axes."""
@@ -80,6 +76,13 @@ def attribute(joint: ET.Element, tag: str, name: str, default: str = "") -> str:
     return default if element is None else element.get(name, default)
 
 
+def limits(joint: ET.Element) -> tuple[float, float]:
+    """Return the limits of a joint [rad or m]; of a continuous one half a turn."""
+    if joint.get("type") == "continuous":
+        return -np.pi, np.pi
+    return float(attribute(joint, "limit", "lower", "0")), float(attribute(joint, "limit", "upper", "0"))
+
+
 def move_origin(joint: ET.Element, shift: np.ndarray, turn: np.ndarray) -> None:
     """Move a joint's origin by a translation [m] in the parent's frame and a rotation vector [rad] in its frame."""
     origin = joint.find("origin")
@@ -88,10 +91,23 @@ def move_origin(joint: ET.Element, shift: np.ndarray, turn: np.ndarray) -> None:
     xyz = np.array(origin.get("xyz", "0 0 0").split(), dtype=float)
     rpy = np.array(origin.get("rpy", "0 0 0").split(), dtype=float)
     turned = Rotation.from_euler("xyz", rpy) * Rotation.from_rotvec(turn)
-    origin.set("xyz", " ".join(map(repr, (xyz + shift).tolist())))
+    origin.set("xyz", numbers(xyz + shift))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # pitch of a quarter turn: one of its many triples will do
-        origin.set("rpy", " ".join(map(repr, turned.as_euler("xyz").tolist())))
+        origin.set("rpy", numbers(turned.as_euler("xyz")))
+
+
+def numbers(values: np.ndarray) -> str:
+    """Return values as an attribute, all their digits."""
+    return " ".join(repr(value) for value in values.tolist())
+
+
+def set_joint(configuration: np.ndarray, joint: pin.JointModel, value: float) -> None:
+    """Set a joint's value [rad or m] in a configuration of Pinocchio, which has cosine and sine of continuous ones."""
+    entry = [value]
+    if joint.nq == 2:
+        entry = [np.cos(value), np.sin(value)]
+    configuration[joint.idx_q : joint.idx_q + joint.nq] = entry
 
 
 def pinocchio_model(arm: Arm) -> pin.Model:
@@ -112,9 +128,7 @@ def pinocchio_poses(arm: Arm, q: np.ndarray) -> np.ndarray:
     for k, values in enumerate(q):
         configuration = pin.neutral(model)
         for joint, value in zip(joints, values, strict=True):
-            continuous = joint.nq == 2
-            entry = [np.cos(value), np.sin(value)] if continuous else [value]
-            configuration[joint.idx_q : joint.idx_q + joint.nq] = entry
+            set_joint(configuration, joint, value)
         pin.framesForwardKinematics(model, data, configuration)
         poses[k] = data.oMf[base].actInv(data.oMf[tip]).homogeneous
     return poses

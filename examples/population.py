@@ -21,7 +21,6 @@ import csv
 import tempfile
 import warnings
 import zlib
-from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields
@@ -70,13 +69,17 @@ def rms_mm(errors: np.ndarray) -> float:
 
 def write_measured(path: Path, arm: Arm, q: np.ndarray, points: np.ndarray) -> None:
     """Write joint values (m, n) and points (m, 3) [m] as an instrument's file."""
-    units = ["m" if joint.get("type") == "prismatic" else "rad" for joint in arm.movable]
-    header = [f"{name} [{unit}]" for name, unit in zip(arm.names, units, strict=True)]
+    header = []
+    for joint in arm.movable:
+        unit = "m" if joint.get("type") == "prismatic" else "rad"
+        header.append(f"{joint.get('name', '')} [{unit}]")
     with path.open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow([*header, "x [mm]", "y [mm]", "z [mm]"])
         for values, point in zip(q, points, strict=True):
-            table.writerow([f"{value:.9f}" for value in values] + [f"{1e3 * value:.6f}" for value in point])
+            joints = [f"{value:.9f}" for value in values]
+            position_mm = [f"{1e3 * value:.6f}" for value in point]
+            table.writerow(joints + position_mm)
 
 
 def calibrate(source: Path, conditions: Conditions, folder: Path) -> Row:
@@ -101,16 +104,18 @@ def calibrate(source: Path, conditions: Conditions, folder: Path) -> Row:
     # frames that belong to the rigid geometry, which is the one in the URDF
     unseen = nominal.postures(UNSEEN, rng)
     true_points = station.apply(truth.positions(unseen, target)) + stand
+    rigid = fit.selection.rigid.cell
+    before = fit.selection.nominal.cell
     errors = []
-    rigid, before = fit.selection.rigid.cell, fit.selection.nominal.cell
     for robot, cell, tip in (
         (text, before, chain.tip),
         (exported, rigid, rigid.chain.tip),
         (exported, rigid, nominal.tip),
     ):
-        pose = cell.stations[0]
+        T_station_base = cell.stations[0]
         in_base = Arm(robot, cell.chain.base, tip).positions(unseen, cell.tools[0][:3, 3])
-        errors.append(rms_mm(in_base @ pose[:3, :3].T + pose[:3, 3] - true_points))
+        in_station = in_base @ T_station_base[:3, :3].T + T_station_base[:3, 3]
+        errors.append(rms_mm(in_station - true_points))
 
     level = fit.verdict.level
     group = classified(level, *errors[1:], limit=1e3 * NOISE_LEVEL * conditions.noise)
@@ -135,15 +140,18 @@ def calibrate_safely(source: Path, conditions: Conditions) -> Row:
         try:
             return calibrate(source, conditions, Path(folder))
         except Exception as error:
-            words = " ".join(str(error).split())
-            return Row(source.stem, "error", remark=f"{type(error).__name__}: {words[:200]}")
+            message = " ".join(str(error).split())
+            return Row(source.stem, "error", remark=f"{type(error).__name__}: {message[:200]}")
 
 
 def descriptions(paths: Sequence[Path]) -> list[Path]:
     """Return the URDF files of folders and files."""
     files: list[Path] = []
     for path in paths:
-        files += sorted(path.glob("*.urdf")) if path.is_dir() else [path]
+        if path.is_dir():
+            files += sorted(path.glob("*.urdf"))
+        else:
+            files.append(path)
     return files
 
 
@@ -157,17 +165,19 @@ def line(row: Row) -> str:
 
 def print_table(rows: Sequence[Row]) -> None:
     """Print how many arms are in each class, with median and largest errors."""
-    counted = Counter(row.group for row in rows)
     print(f"\n{'class':12} arms  exported: median, max [mm]   in tool0: median, max [mm]")
     for group in CLASSES:
-        errors = np.array([(row.exported_mm, row.in_tool0_mm) for row in rows if row.group == group])
+        members = [row for row in rows if row.group == group]
         figures = ""
-        if counted[group] and group != "error":
-            middle, largest = np.median(errors, axis=0), errors.max(axis=0)
-            figures = f"{middle[0]:16.4f} {largest[0]:9.4f} {middle[1]:18.4f} {largest[1]:9.4f}"
-        print(f"{group:12} {counted[group]:4} {figures}")
-    within = [row for row in rows if row.group != "error"]
-    print(f"fit ends where the target hangs: {sum(row.tip == row.target_link for row in within)} of {len(within)}")
+        if members and group != "error":
+            exported = np.array([row.exported_mm for row in members])
+            in_tool0 = np.array([row.in_tool0_mm for row in members])
+            figures = f"{np.median(exported):16.4f} {exported.max():9.4f} "
+            figures += f"{np.median(in_tool0):18.4f} {in_tool0.max():9.4f}"
+        print(f"{group:12} {len(members):4} {figures}")
+    fitted = [row for row in rows if row.group != "error"]
+    at_target = [row for row in fitted if row.tip == row.target_link]
+    print(f"fit ends where the target hangs: {len(at_target)} of {len(fitted)}")
 
 
 def main() -> None:

@@ -16,13 +16,15 @@ from scipy.signal import lfilter
 import calib
 from calib.apps.cell_demo import demo
 from calib.data.poses.pose_lists import read_poses
+from calib.data.recordings.recording import Recording
 from calib.data.schema import Joints
 from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.pseudo_inertia import ball
 from calib.files import write_numbers
+from calib.identification.closed_loop.controllers import Reference
 from calib.identification.prior import rods
-from calib.parallel.mechanism.closure import closed
+from calib.parallel.mechanism.closure import ClosedRobot, closed
 from calib.parallel.mechanism.geometric_fit import changed, loop_parameters
 from calib.parallel.mechanism.parallel_model import PlatformRegressor, make_parallel_model
 from calib.parallel.robots import find
@@ -31,13 +33,18 @@ from calib.simulation import camera_cell, cell, virtual_arm, virtual_cells
 from calib.simulation.cell import write_log, write_measured
 from calib.simulation.known_robots import random_fourier, truth
 
-NEAR = np.array([0.3, -1.2, 1.6, -1.1, -1.4, 0.5])  # where the UR5 works [rad]
-TAUGHT = NEAR + np.random.default_rng(3).uniform(-0.4, 0.4, (50, 6))
+WORKING_POSTURE = np.array([0.3, -1.2, 1.6, -1.1, -1.4, 0.5])  # where the UR5 works [rad]
+TAUGHT = WORKING_POSTURE + np.random.default_rng(3).uniform(-0.4, 0.4, (50, 6))  # joints at its targets [rad]
+GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])  # of a UR10e [N m/A] (De Luca, in Mamedov & Mikhel 2020)
+TOOL = ball(2.8, 0.06, np.array([0.01, 0.02, 0.07]))  # the true tool: 2.8 kg, 7 cm before the flange
+PLATE_MASS = 5.37  # of the DualV's payload [kg]
 
 
 def enter(script: str) -> None:
     """Change to the folder given on the command line; by default one named after the script's number."""
-    folder = Path(sys.argv[1] if len(sys.argv) > 1 else f"example-{Path(script).name[:2]}")
+    folder = Path(f"example-{Path(script).name[:2]}")
+    if len(sys.argv) > 1:
+        folder = Path(sys.argv[1])
     folder.mkdir(parents=True, exist_ok=True)
     os.chdir(folder)
 
@@ -55,29 +62,35 @@ def measure(path: str, poses: int = 80) -> None:
 
 def teach(path: str) -> None:
     """Write target positions [m] in the instrument's frame, and joint values [rad] near their solutions."""
-    exact = cell.SimulatedInstrument(position_sigma=0.0, orientation_sigma=0.0, encoder_sigma=0.0)
-    seen = cell.measure(replace(ur5(), instrument=exact), TAUGHT)
-    write_measured(replace(seen, sigma=None, sigma_rotation=None), path, degrees=False)
+    exact = calib.SimulatedInstrument(position_sigma=0.0, orientation_sigma=0.0, encoder_sigma=0.0)
+    targets = cell.measure(replace(ur5(), instrument=exact), TAUGHT)
+    write_measured(replace(targets, sigma=None, sigma_rotation=None), path, degrees=False)
 
 
-def missed(q: np.ndarray) -> float:
-    """Return the distance of the real tool from the taught places at joint values q (50, 6) [rad]: rms [mm]."""
-    off = cell.true_poses(ur5(), q)[:, :3, 3] - cell.true_poses(ur5(), TAUGHT)[:, :3, 3]
-    return float(1e3 * np.sqrt(np.mean(np.sum(off**2, axis=1))))
+def target_error(q: np.ndarray) -> float:
+    """Return the distance of the real tool from the targets at joint values q (50, 6) [rad]: rms [mm]."""
+    reached = cell.true_poses(ur5(), q)[:, :3, 3]
+    targets = cell.true_poses(ur5(), TAUGHT)[:, :3, 3]
+    squared_distances = np.sum((reached - targets) ** 2, axis=1)
+    return float(1e3 * np.sqrt(np.mean(squared_distances)))
 
 
 def record(path: str, motion: int) -> None:
     """Log a motion of the TX40, 10 s at 500 Hz: positions [deg] and torques [N m]."""
     arm = virtual_arm.moving_arm(virtual_cells.virtual_cell("tx40", 0), "tx40", 0)
+    limits = (arm.chain.lower, arm.chain.upper)
+    write_log(virtual_arm.record(arm, random_motion(arm, limits, seed=motion), motion), path)
+
+
+def random_motion(arm: virtual_arm.MovingArm, limits: tuple[np.ndarray, np.ndarray], seed: int) -> Reference:
+    """Return a random motion of 10 s at 500 Hz within position limits (n,) and half the speeds."""
     speeds = 0.5 * np.array([joint.velocity for joint in arm.chain.joints])
-    limits = arm.chain.lower, arm.chain.upper
-    reference = random_fourier(*limits, speeds, 10.0, 500.0, acceleration=15.0, seed=motion)
-    write_log(virtual_arm.record(arm, reference, motion), path)
+    return random_fourier(*limits, speeds, 10.0, 500.0, acceleration=15.0, seed=seed)
 
 
 def tracker(plan: str, path: str, robot: str = "tx40") -> None:
     """Measure planned poses with a laser tracker: joints [deg] and the reflector's position [mm], a row per pose."""
-    instrument = cell.SimulatedInstrument("laser tracker", position_sigma=15e-6, orientation_sigma=None)
+    instrument = calib.SimulatedInstrument("laser tracker", position_sigma=15e-6, orientation_sigma=None)
     arm = virtual_cells.virtual_cell(robot, 0, instrument)
     q = read_poses(Path(plan), Joints.of(arm.nominal.joint_names))
     write_measured(cell.measure(arm, q, seed=1), path)
@@ -95,30 +108,34 @@ def stream(log: str, points: str, robot: str = "tx40") -> None:
 
     The tracker's clock is 0.137 s ahead. Its noise, 15 µm, is correlated over some 0.06 s; its beam breaks at times.
     """
-    arm, rng, rate = virtual_cells.virtual_cell(robot, 0), np.random.default_rng(1), 1000.0
-    speeds = np.full(arm.nominal.n, 0.15)
-    motion = random_fourier(arm.nominal.lower, arm.nominal.upper, speeds, 240.0, rate, harmonics=12, seed=2)
-    joints = np.degrees(motion.q[::8] + rng.normal(0.0, 1e-5, motion.q[::8].shape))
-    write_numbers(
-        log, ["t [s]", *(f"{name} [deg]" for name in arm.nominal.joint_names)], np.column_stack([motion.t[::8], joints])
-    )
+    arm = virtual_cells.virtual_cell(robot, 0)
+    nominal = arm.nominal
+    rng = np.random.default_rng(1)
+    rate = 1000.0
+    speeds = np.full(nominal.n, 0.15)
+    motion = random_fourier(nominal.lower, nominal.upper, speeds, 240.0, rate, harmonics=12, seed=2)
+
+    t = motion.t[::8]
+    q = motion.q[::8]
+    encoders = q + rng.normal(0.0, 1e-5, q.shape)
+    header = ["t [s]", *(f"{name} [deg]" for name in nominal.joint_names)]
+    write_numbers(log, header, np.column_stack([t, np.degrees(encoders)]))
+
     memory = np.exp(-1.0 / (0.03 * rate))
-    noise = lfilter([15e-6 * np.sqrt(1.0 - memory**2)], [1.0, -memory], rng.normal(size=(len(motion.t), 3)), axis=0)
-    seen = 1e3 * (cell.true_poses(arm, motion.q)[:, :3, 3] + noise)
-    seen[rng.uniform(size=len(seen)) < 0.01] = 0.0
-    write_numbers(
-        points, ["t [s]", "x [mm]", "y [mm]", "z [mm]"], np.column_stack([motion.t + 0.137, seen])[1000:-2000]
-    )
+    white = rng.normal(size=(len(motion.t), 3))
+    noise = lfilter([15e-6 * np.sqrt(1.0 - memory**2)], [1.0, -memory], white, axis=0)
+    positions = 1e3 * (cell.true_poses(arm, motion.q)[:, :3, 3] + noise)
+    broken_beam = rng.uniform(size=len(positions)) < 0.01
+    positions[broken_beam] = 0.0
+    readings = np.column_stack([motion.t + 0.137, positions])
+    write_numbers(points, ["t [s]", "x [mm]", "y [mm]", "z [mm]"], readings[1000:-2000])
 
 
 def photos(folder: str, count: str = "30") -> None:
     """Take images of a board on the table with a camera in the hand of a UR5, and write its joints beside them."""
-    eye = camera_cell.seen_by_camera(ur5())
-    camera_cell.take_pictures(eye, camera_cell.views(eye, int(count), 1), Path(folder), seed=1)
-
-
-GAINS = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])  # of a UR10e [N m/A] (De Luca, in Mamedov & Mikhel 2020)
-TOOL = ball(2.8, 0.06, np.array([0.01, 0.02, 0.07]))  # the true tool: 2.8 kg, 7 cm before the flange
+    camera = camera_cell.seen_by_camera(ur5())
+    postures = camera_cell.views(camera, int(count), 1)
+    camera_cell.take_pictures(camera, postures, Path(folder), seed=1)
 
 
 def moving(robot: str, load: bool = False) -> virtual_arm.MovingArm:
@@ -126,15 +143,17 @@ def moving(robot: str, load: bool = False) -> virtual_arm.MovingArm:
 
     The load is the tool; of the LWR4+ that of Kolyubin, Shiriaev and Jubien (2019), 3.28 kg beside axis 7.
     """
-    place = virtual_cells.virtual_cell(robot, 0)
-    if place.nominal.inertias is None:
-        masses = rods(place.nominal, IdentificationModel(bodies_of(place.nominal), ()), total=30.0)
-        place = replace(place, nominal=replace(place.nominal, inertias=masses))
-    arm = virtual_arm.moving_arm(place, robot, 0)
+    arm_cell = virtual_cells.virtual_cell(robot, 0)
+    nominal = arm_cell.nominal
+    if nominal.inertias is None:
+        masses = rods(nominal, IdentificationModel(bodies_of(nominal), ()), total=30.0)
+        arm_cell = replace(arm_cell, nominal=replace(nominal, inertias=masses))
+    arm = virtual_arm.moving_arm(arm_cell, robot, 0)
     if not load:
         return arm
-    body = truth(robot)["payload"]["inertia"] if robot == "lwr4plus" else TOOL
-    return virtual_arm.carrying(arm, body)
+    if robot == "lwr4plus":
+        return virtual_arm.carrying(arm, truth(robot)["payload"]["inertia"])
+    return virtual_arm.carrying(arm, TOOL)
 
 
 def log(path: str, robot: str, motion: str, what: str = "torque", load: str = "") -> None:
@@ -145,34 +164,49 @@ def log(path: str, robot: str, motion: str, what: str = "torque", load: str = ""
         what: motor torques (torque), torques of joint sensors (link), both, or motor currents (current).
         load: "load": with the load of `moving`.
     """
-    arm, seed = moving(robot, load == "load"), sum(map(ord, path))
+    arm = moving(robot, load == "load")
     if Path(motion).is_dir():
-        design = coefficients.read(Path(motion))
-        t = np.arange(round(design.period * design.rate) + 1) / design.rate
-        reference = virtual_arm.play(t, *design.orders(t), 2)
+        reference = played_design(Path(motion))
     else:
-        speeds = 0.5 * np.array([joint.velocity for joint in arm.chain.joints])
-        limits = np.maximum(arm.chain.lower, -2.5), np.minimum(arm.chain.upper, 2.5)
-        reference = random_fourier(*limits, speeds, 10.0, 500.0, acceleration=15.0, seed=int(motion))
-    seen = virtual_arm.record(arm, reference, seed)
-    if what == "link":
-        seen = replace(seen, effort=seen.tau_link)
-    elif what == "current":
-        seen = replace(seen, effort=seen.effort / GAINS)
-    file = write_log(seen if what == "both" else replace(seen, tau_link=None), path)
-    if what == "current":
-        head, rows = file.read_text().split("\n", 1)
-        file.write_text(head.replace("tau_", "current_").replace("[Nm]", "[A]") + "\n" + rows)
+        limits = (np.maximum(arm.chain.lower, -2.5), np.minimum(arm.chain.upper, 2.5))
+        reference = random_motion(arm, limits, seed=int(motion))
+    noise_seed = sum(map(ord, path))
+    recording = virtual_arm.record(arm, reference, noise_seed)
+    match what:
+        case "both":
+            write_log(recording, path)
+        case "link":
+            write_log(replace(recording, effort=recording.tau_link, tau_link=None), path)
+        case "current":
+            write_currents(recording, path)
+        case _:
+            write_log(replace(recording, tau_link=None), path)
+
+
+def played_design(folder: Path) -> Reference:
+    """Return the motion of a design's folder, played twice."""
+    design = coefficients.read(folder)
+    t = np.arange(round(design.period * design.rate) + 1) / design.rate
+    return virtual_arm.play(t, *design.orders(t), 2)
+
+
+def write_currents(recording: Recording, path: str) -> None:
+    """Write a log with motor currents [A] in place of torques."""
+    currents = recording.effort / GAINS
+    file = write_log(replace(recording, effort=currents, tau_link=None), path)
+    header, rows = file.read_text().split("\n", 1)
+    header = header.replace("tau_", "current_").replace("[Nm]", "[A]")
+    file.write_text(header + "\n" + rows)
 
 
 def degrade(log: str, path: str, noise: str = "1") -> None:
     """Copy a log and add white noise [mrad] to its positions, as a bad encoder would: the torques stay as they are."""
-    head, rows = Path(log).read_text(encoding="utf-8").split("\n", 1)
-    names = head.split(",")
+    header, rows = Path(log).read_text(encoding="utf-8").split("\n", 1)
+    names = header.split(",")
     values = np.loadtxt(rows.splitlines(), delimiter=",")
-    positions = [name.startswith("q_") for name in names]
-    sigma = np.degrees(1e-3 * float(noise))
-    values[:, positions] += sigma * np.random.default_rng(0).normal(size=(len(values), sum(positions)))
+    positions = [k for k, name in enumerate(names) if name.startswith("q_")]
+    white = np.random.default_rng(0).normal(size=(len(values), len(positions)))
+    values[:, positions] += np.degrees(1e-3 * float(noise)) * white
     write_numbers(path, names, values)
 
 
@@ -181,30 +215,51 @@ def platform(folder: str) -> None:
 
     The true legs are 1 mm and 1 mrad (1 sigma) off their nominal; the torques are the model's, with noise.
     """
-    known, place, rng = find("dualv").mechanism, Path(folder), np.random.default_rng(0)
-    motors = known.robot.joint_names
-    parameters = loop_parameters(known)
-    true = closed(changed(known.robot, parameters, 1e-3 * rng.normal(size=len(parameters))))
-    x = 0.9 * rng.uniform(known.robot.lower, known.robot.upper, (60, 3))
-    q = true.place(x).q[:, known.robot.actuated] + 1e-5 * rng.normal(size=(60, 4))
-    head = [*(f"{name} [deg]" for name in motors), "x [mm]", "y [mm]", "rz [deg]"]
-    write_numbers(place / "measured.csv", head, np.column_stack([np.degrees(q), 1e3 * x[:, :2], np.degrees(x[:, 2])]))
+    nominal = find("dualv").mechanism
+    rng = np.random.default_rng(0)
+    parameters = loop_parameters(nominal)
+    errors = 1e-3 * rng.normal(size=len(parameters))
+    true = closed(changed(nominal.robot, parameters, errors))
+    _measure_platform(true, nominal, Path(folder, "measured.csv"), rng)
 
     model = make_parallel_model(true, ["Fv Fc"], v0=0.05, payloads=["plate"])
-    values = np.concatenate([model.known_parameters(), np.tile([0.05, 0.3], 4)])
-    values[model.names.index("Mplate")] = 5.37
-    t, order = np.arange(1000) / 1000.0, 2 * np.pi * np.array([1.5, 2.5, 4.0, 5.5])[:, None, None]
-    for name, carried in (("empty", ()), ("load", ("plate",)), ("other", ("plate",))):
-        angle = order * t[:, None] + rng.uniform(0, 6, (4, 1, 3))
-        size = np.array([0.02, 0.02, 0.12])
-        plan = PlatformRegressor(model, np.arange(model.p), values, carried)
-        motion = plan.motion(*((size * part).sum(axis=0) for part in (
-            np.sin(angle), order * np.cos(angle), -(order**2) * np.sin(angle)
-        )))  # fmt: skip
-        q = motion.posture.q[:, true.robot.actuated] + 1e-5 * rng.normal(size=(len(t), 4))
-        tau = plan.torques(motion) + 0.5 * rng.normal(size=q.shape)
-        head = ["t [s]", *(f"{name}_q [deg]" for name in motors), *(f"{name}_tau [Nm]" for name in motors)]
-        write_numbers(place / f"{name}.csv", head, np.column_stack([t, np.degrees(q), tau]))
+    friction = np.tile([0.05, 0.3], 4)
+    values = np.concatenate([model.known_parameters(), friction])
+    values[model.names.index("Mplate")] = PLATE_MASS
+    for name, payloads in (("empty", ()), ("load", ("plate",)), ("other", ("plate",))):
+        regressor = PlatformRegressor(model, np.arange(model.p), values, payloads)
+        _log_platform(regressor, true, Path(folder, f"{name}.csv"), rng)
+
+
+def _measure_platform(true: ClosedRobot, nominal: ClosedRobot, path: Path, rng: np.random.Generator) -> None:
+    """Write 60 platform poses with encoder readings: motors [deg], x, y [mm] and turn [deg]."""
+    x = 0.9 * rng.uniform(nominal.robot.lower, nominal.robot.upper, (60, 3))
+    q = true.place(x).q[:, nominal.robot.actuated]
+    encoders = q + 1e-5 * rng.normal(size=q.shape)
+    header = [f"{name} [deg]" for name in nominal.robot.joint_names]
+    header += ["x [mm]", "y [mm]", "rz [deg]"]
+    table = np.column_stack([np.degrees(encoders), 1e3 * x[:, :2], np.degrees(x[:, 2])])
+    write_numbers(path, header, table)
+
+
+def _log_platform(regressor: PlatformRegressor, true: ClosedRobot, path: Path, rng: np.random.Generator) -> None:
+    """Write 1 s of a platform's motion at 1 kHz: motors' positions [deg] and torques [N m]."""
+    t = np.arange(1000) / 1000.0
+    # four sines along x and y [m], and about z [rad]
+    frequency = 2 * np.pi * np.array([1.5, 2.5, 4.0, 5.5])[:, None, None]
+    amplitude = np.array([0.02, 0.02, 0.12])
+    angle = frequency * t[:, None] + rng.uniform(0, 6, (4, 1, 3))
+    x = (amplitude * np.sin(angle)).sum(axis=0)
+    velocity = (amplitude * (frequency * np.cos(angle))).sum(axis=0)
+    acceleration = (amplitude * (-(frequency**2) * np.sin(angle))).sum(axis=0)
+    motion = regressor.motion(x, velocity, acceleration)
+    q = motion.posture.q[:, true.robot.actuated]
+    encoders = q + 1e-5 * rng.normal(size=q.shape)
+    tau = regressor.torques(motion) + 0.5 * rng.normal(size=q.shape)
+    header = ["t [s]"]
+    header += [f"{name}_q [deg]" for name in true.robot.joint_names]
+    header += [f"{name}_tau [Nm]" for name in true.robot.joint_names]
+    write_numbers(path, header, np.column_stack([t, np.degrees(encoders), tau]))
 
 
 def bring(session: str) -> None:

@@ -20,20 +20,22 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.optimize import fminbound
 
+import calib
 from calib.data.signals.motion import Motion
-from calib.errors import CalibError
+from calib.dynamics.base import Base
 from calib.estimation.linear import settled_std, wls
 from calib.estimation.whiteness import inflation
 from calib.identification.closed_loop import instrumental_variables as instruments
 from calib.identification.identify import Identification, identify
 from calib.identification.identify_options import IdentifyOptions, parse_options
-from calib.identification.rows import Case, observe
+from calib.identification.rows import Case, ObservationRows, observe
 from calib.procedure.dynamic_stage import inputs as recordings
 from calib.records import frozen
 from calib.trajectories.basis import SampledMotion
@@ -59,36 +61,40 @@ class Row:
     options: dict[str, Any]
 
 
-TWELVE, FOURTEEN = "ur-20_02_10-30sec_12harm.npz", "ur-20_02_19_14harm50sec.npz"
+UR10E_12 = "ur-20_02_10-30sec_12harm.npz"
+UR10E_14 = "ur-20_02_19_14harm50sec.npz"
 PANDA = "traj1_first60pct.npz"
 ROWS = (
     Row("Panda", "franka_panda_inria", f"{PANDA}@1.2:9.387", f"{PANDA}@9.387:11.9", 2.0 / 0.15, 5, SENSOR),
-    Row("UR10e, 30 s", "ur10e_innopolis", f"{TWELVE}@7:36.8", FOURTEEN, 30.3, 12, UR10E),
-    Row("UR10e, 30 s", "ur10e_innopolis", f"{TWELVE}@7:36.8", FOURTEEN, 30.3, 60, UR10E),
-    Row("UR10e, 50 s", "ur10e_innopolis", f"{FOURTEEN}@2.2:51.9", TWELVE, 50.3, 14, UR10E),
-    Row("UR10e, 50 s", "ur10e_innopolis", f"{FOURTEEN}@2.2:51.9", TWELVE, 50.3, 60, UR10E),
+    Row("UR10e, 30 s", "ur10e_innopolis", f"{UR10E_12}@7:36.8", UR10E_14, 30.3, 12, UR10E),
+    Row("UR10e, 30 s", "ur10e_innopolis", f"{UR10E_12}@7:36.8", UR10E_14, 30.3, 60, UR10E),
+    Row("UR10e, 50 s", "ur10e_innopolis", f"{UR10E_14}@2.2:51.9", UR10E_12, 50.3, 14, UR10E),
+    Row("UR10e, 50 s", "ur10e_innopolis", f"{UR10E_14}@2.2:51.9", UR10E_12, 50.3, 60, UR10E),
     Row("KR300, A", "kuka_kr300_tuk", "traj_A.npz", "traj_B.npz", 10.0, 20, {}),
     Row("KR300, B", "kuka_kr300_tuk", "traj_B.npz", "traj_A.npz", 10.0, 20, {}),
 )
+SAMPLES = 3000  # of a motion, about, by which its period is fitted
 
 
-def fitted(motion: Motion, period: float, harmonics: int) -> tuple[SampledMotion, float]:
+def nearest_series(motion: Motion, period: float, harmonics: int) -> tuple[SampledMotion, float]:
     """Return the Fourier series nearest to the positions of a motion, and its period [s], within 2 % of `period`."""
     times = motion.t - motion.t[0]
-    few = slice(None, None, max(1, len(times) // 3000))
+    all_samples = slice(None)
+    decimated = slice(None, None, max(1, len(times) // SAMPLES))
 
     def series(period: float, part: slice) -> SampledMotion:
         basis = fourier_family(harmonics, period, motion.n, rest=False).basis(times[part])
         return basis.motion(basis.nearest(motion.q[part]))
 
-    def left(period: float) -> float:
-        return float(np.sum((series(period, few).q - motion.q[few]) ** 2))
+    def squares(period: float) -> float:
+        residual = series(period, decimated).q - motion.q[decimated]
+        return float(np.sum(residual**2))
 
-    found = lowest(left, 0.98 * period, 1.02 * period)
-    return series(found, slice(None)), found
+    fitted_period = minimum(squares, 0.98 * period, 1.02 * period)
+    return series(fitted_period, all_samples), fitted_period
 
 
-def lowest(function: Callable[[float], float], low: float, high: float) -> float:
+def minimum(function: Callable[[float], float], low: float, high: float) -> float:
     """Return where a function of one number is lowest."""
     return float(fminbound(function, low, high, xtol=1e-6))  # type: ignore[arg-type]
 
@@ -99,87 +105,155 @@ def settings(row: Row, method: str = "wls", **more: Any) -> IdentifyOptions:
     return parse_options(plain | row.options | {"method": method} | more)
 
 
-def error(found: Identification, values: np.ndarray, case: Case) -> float:
+def error(identification: Identification, values: np.ndarray, case: Case) -> float:
     """Return the torque error 100 ‖y - W x‖ / ‖y‖ of a case in the identification band [%]."""
-    rows = observe(found.dynamics.model, found.base.kept, case, case.motion.decimator)
-    left = np.linalg.norm((rows.target - rows.matrix @ values)[rows.present])
-    return float(100.0 * left / np.linalg.norm(rows.target[rows.present]))
+    rows = observed(identification, case)
+    residual = rows.target - rows.matrix @ values
+    return float(100.0 * np.linalg.norm(residual[rows.present]) / np.linalg.norm(rows.target[rows.present]))
 
 
-def with_series(plain: Identification, case: Case, series: SampledMotion) -> tuple[np.ndarray, str]:
+def error_cell(identification: Identification, values: np.ndarray | None, case: Case) -> str:
+    """Return the error of an estimate as a cell; a dash where there is none."""
+    if values is None:
+        return "–"
+    return f"{error(identification, values, case):.2f} %"
+
+
+def observed(identification: Identification, case: Case) -> ObservationRows:
+    """Return the filtered rows of a case for the base parameters of an identification."""
+    return observe(identification.dynamics.model, identification.base.kept, case, case.motion.decimator)
+
+
+def instrumented(base: Base, measured: ObservationRows, series: ObservationRows) -> instruments.Instruments:
+    """Return the problem y = W x of measured rows with the rows of a series as instruments Z."""
+    problem = instruments.unseen(base.names, base.units, measured.target.shape[1])
+    for row, present in enumerate(measured.present.T):
+        z = series.matrix[present, row]
+        w = measured.matrix[present, row]
+        y = measured.target[present, row]
+        problem = instruments.instrument(z, w, y, row, before=problem)
+    return problem
+
+
+def series_estimate(identification: Identification, case: Case, series: SampledMotion) -> tuple[np.ndarray, str]:
     """Return the IV estimate (b,) with the series as instruments, and its tests as cells of the table."""
-    moved = replace(case, motion=replace(case.motion, q=series.q, v=series.v, a=series.a))
-    own, z = (observe(plain.dynamics.model, plain.base.kept, one, case.motion.decimator) for one in (case, moved))
-    problem = instruments.unseen(plain.base.names, plain.base.units, own.target.shape[1])
-    for row, used in enumerate(own.present.T):
-        problem = instruments.instrument(
-            z.matrix[used, row], own.matrix[used, row], own.target[used, row], row, before=problem
-        )
+    series_motion = replace(case.motion, q=series.q, v=series.v, a=series.a)
+    measured = observed(identification, case)
+    problem = instrumented(identification.base, measured, observed(identification, replace(case, motion=series_motion)))
     data = problem.least_squares()
-    least = wls(data, settled_std(data, 1e-3))
-    residual = own.target - own.matrix @ instruments.iv(problem, least.group_std).estimate.values
+    least_squares = wls(data, settled_std(data, 1e-3))
+    # residuals are correlated in time: their inflation τ widens σ and tests
+    first = instruments.iv(problem, least_squares.group_std).estimate
+    residual = measured.target - measured.matrix @ first.values
     tau = max(1.0, float(np.mean([inflation(column) for column in residual.T])))
-    found = instruments.iv(problem, least.group_std, tau).estimate
-    shift = np.abs(least.estimate.values - found.values) / found.sigma
-    strength = instruments.strength(problem, least.group_std)
-    test = instruments.exogeneity(problem, least.group_std, tau)
-    return found.values, f"{strength.cragg_donald:.2g} | {test.p:.2f} | {shift.max():.2f} σ"
+    iv = instruments.iv(problem, least_squares.group_std, tau).estimate
+    shift = np.abs(least_squares.estimate.values - iv.values) / iv.sigma
+    strength = instruments.strength(problem, least_squares.group_std)
+    test = instruments.exogeneity(problem, least_squares.group_std, tau)
+    return iv.values, f"{strength.cragg_donald:.2g} | {test.p:.2f} | {shift.max():.2f} σ"
 
 
 def estimate(row: Row, robot: Any, case: Case, method: str, **more: Any) -> np.ndarray | None:
     """Return the estimate (b,) of a method; None where it failed, with the reason on the console."""
     try:
         return identify(robot, [case], settings(row, method, **more).settings).fitted.estimate.values
-    except CalibError as problem:
+    except calib.CalibError as problem:
         print(f"{row.name}: {method}: {problem}", file=sys.stderr)
         return None
 
 
+def span(values: np.ndarray, digits: int) -> str:
+    """Return the smallest and the largest value as a cell."""
+    return f"{values.min():.{digits}g}–{values.max():.{digits}g}"
+
+
+@dataclass(frozen=True, eq=False)
+class SharedResults:
+    """What the rows of a recording have in common.
+
+    Attributes:
+        robot: as `identify` takes it.
+        case: the recording to learn from.
+        unseen: another motion.
+        plain: the identification by least squares.
+        consistent: the estimate (b,) under physical constraints; None where it failed.
+    """
+
+    robot: Any
+    case: Case
+    unseen: Case
+    plain: Identification
+    consistent: np.ndarray | None
+
+
+@lru_cache(maxsize=1)
+def shared_results(train: str) -> SharedResults:
+    """Return what all rows of a recording have in common."""
+    row = next(row for row in ROWS if row.train == train)
+    folder = DATA / row.folder
+    train_files = [folder / row.train]
+    unseen_files = [folder / row.unseen]
+    inputs = recordings.gather(folder / "model.urdf", train_files, unseen_files, options=settings(row))
+    (case,) = inputs.cases
+    (unseen,) = inputs.unseen
+    plain = identify(inputs.robot, [case], inputs.options.settings)
+    return SharedResults(inputs.robot, case, unseen, plain, estimate(row, inputs.robot, case, "pc-wls"))
+
+
 def study(row: Row) -> str:
     """Return a row of the table."""
-    folder = DATA / row.folder
-    paths = [folder / row.train], [folder / row.unseen]
-    given = recordings.gather(folder / "model.urdf", *paths, options=settings(row))
-    robot, (case,), (other,) = given.robot, given.cases, given.unseen
-    plain = identify(robot, [case], given.options.settings)
-    series, period = fitted(case.motion, row.period, row.harmonics)
-    motion, away = case.motion, 1e3 * (case.motion.q - series.q).std(axis=0)
+    shared = shared_results(row.train)
+    plain = shared.plain
+    case = shared.case
+    motion = case.motion
+    series, period = nearest_series(motion, row.period, row.harmonics)
+    distance = 1e3 * (motion.q - series.q).std(axis=0)
     noise = 1e3 * motion.cutoffs.noise
-    in_a = 100.0 * motion.cutoffs.acceleration_noise(motion.cutoff, motion.rate) / motion.a.std(axis=0)
-    by_series, tests = with_series(plain, case, series)
-    asked = replace(case, motion=replace(case.motion, q_ref=frozen(series.q)))
-    estimates = [plain.fitted.estimate.values, estimate(row, robot, case, "pc-wls"), by_series]
-    estimates += [estimate(row, robot, asked, method, loop=PD) for method in LOOP_METHODS]
-    cells = ["–" if one is None else f"{error(plain, one, other):.2f} %" for one in estimates]
-    return (
-        f"| {row.name} | {row.harmonics} of {period:.2f} s | {away.min():.2g}–{away.max():.2g} | "
-        f"{noise.min():.1g}–{noise.max():.1g} | {in_a.max():.2g} % | {tests} | {' | '.join(cells)} |"
-    )
+    acceleration_noise = motion.cutoffs.acceleration_noise(motion.cutoff, motion.rate)
+    noise_share = 100.0 * acceleration_noise / motion.a.std(axis=0)
+    series_values, tests = series_estimate(plain, case, series)
+    estimates = [plain.fitted.estimate.values, shared.consistent, series_values]
+    # the series as reference of a simulated loop
+    with_reference = replace(case, motion=replace(motion, q_ref=frozen(series.q)))
+    estimates += [estimate(row, shared.robot, with_reference, method, loop=PD) for method in LOOP_METHODS]
+    cells = [
+        row.name,
+        f"{row.harmonics} of {period:.2f} s",
+        span(distance, 2),
+        span(noise, 1),
+        f"{noise_share.max():.2g} %",
+        tests,
+    ]
+    cells += [error_cell(plain, values, shared.unseen) for values in estimates]
+    return f"| {' | '.join(cells)} |"
 
 
-def published(path: Path) -> str:
+def published_distance(path: Path) -> str:
     """Return how far the Panda's fitted series is from the one that its authors published, at the fitted period.
 
     Args:
         path: gen_params.txt, (14, 5): cosines a and sines b of the velocities, of 0.15 π rad/s and its multiples.
     """
-    row, few = ROWS[0], slice(None, None, 10)
+    row = ROWS[0]
+    decimated = slice(None, None, 10)
     folder = DATA / row.folder
-    given = recordings.gather(folder / "model.urdf", [folder / row.train], options=settings(row))
-    motion = given.cases[0].motion
-    series, period = fitted(motion, row.period, row.harmonics)
+    inputs = recordings.gather(folder / "model.urdf", [folder / row.train], options=settings(row))
+    motion = inputs.cases[0].motion
+    series, period = nearest_series(motion, row.period, row.harmonics)
     k = np.arange(1, row.harmonics + 1)
     a, b = np.split(np.loadtxt(path) / (0.15 * np.pi * k), 2)
 
-    def away(late: float) -> np.ndarray:
-        angle = np.outer(motion.t[few] - late, 2.0 * np.pi / period * k)
-        rest = np.sin(angle) @ a.T - np.cos(angle) @ b.T - series.q[few]
-        return 1e3 * rest.std(axis=0)
+    def distance(delay: float) -> np.ndarray:
+        angle = np.outer(motion.t[decimated] - delay, 2.0 * np.pi / period * k)
+        difference = np.sin(angle) @ a.T - np.cos(angle) @ b.T - series.q[decimated]
+        return 1e3 * difference.std(axis=0)
 
-    late = lowest(lambda late: float(np.sum(away(late) ** 2)), 0.4, 0.6)
-    return (
-        f"published series {late:.4f} s late: {away(late).min():.2g} to {away(late).max():.2g} mrad from the fitted one"
-    )
+    def squares(delay: float) -> float:
+        return float(np.sum(distance(delay) ** 2))
+
+    delay = minimum(squares, 0.4, 0.6)
+    low, high = distance(delay).min(), distance(delay).max()
+    return f"published series {delay:.4f} s late: {low:.2g} to {high:.2g} mrad from the fitted one"
 
 
 HEAD = (
@@ -196,13 +270,13 @@ def main() -> None:
         type=Path,
         help="matlab/data/Exciting_Traj/Trajectory_1/gen_params.txt of FrankaEmikaPandaDynModel",
     )
-    given = parser.parse_args()
+    options = parser.parse_args()
     print(HEAD)
     for row in ROWS:
-        if not given.robots or any(row.name.startswith(one) for one in given.robots):
+        if not options.robots or row.name.startswith(tuple(options.robots)):
             print(study(row), flush=True)
-    if given.published:
-        print(published(given.published))
+    if options.published:
+        print(published_distance(options.published))
 
 
 if __name__ == "__main__":

@@ -34,8 +34,8 @@ def test_page_shows_what_it_prints(study: tuple[str, Path]) -> None:
     """The tutorial's slow block is this command, and shows what it prints."""
     (block,) = [block for block in blocks.read(PAGE.read_text(encoding="utf-8")) if "geometry.py" in block.code]
     assert block.code.split() == ["python", "examples/lwr4plus/geometry.py", "--quick", "--out", "geometry"]
-    assert len(block.shown) == 2
-    assert blocks.compare(block.shown, study[0].splitlines(), block.tolerance)[1] == ""
+    assert len(block.expected) == 2
+    assert blocks.compare(block.expected, study[0].splitlines(), block.tolerance)[1] == ""
 
 
 def test_parameters_and_poses_are_the_papers(metrics: dict) -> None:

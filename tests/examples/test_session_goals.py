@@ -15,7 +15,7 @@ def test_readme_states_fresh_results(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     import session_goals
 
-    _, table, _ = session_goals.README.read_text(encoding="utf-8").split(session_goals.END)
+    _, table, _ = session_goals.README.read_text(encoding="utf-8").split(session_goals.MARK)
     told, fresh = (
         [float(one) for one in re.findall(r"[\d.]+", text)]
         for text in (table.strip().splitlines()[2], session_goals.row(tmp_path, 0))

@@ -44,7 +44,7 @@ def test_both_halves_pass_with_short_console(tmp_path: Path, capsys: pytest.Capt
     assert max(map(len, told)) <= MAX_WIDTH and not blank
     assert all(Path(line.split(maxsplit=1)[1]).exists() for line in files)
     assert 0.3 < errors(out)["nominal"] < 3.0 and 0.05 < errors(out)["urdf_alone"] < 0.3  # as real arms: see the cell
-    session, drawn = open_session(out), demo_picture.drawn()
+    session, drawn = open_session(out), demo_picture.picture_figures()
     assert {state.kind for state in steps.states(session)} == {steps.DONE}
     fresh = demo_picture.figures(session)
     assert {name: drawn[name] for name in BOUNDS} == {
