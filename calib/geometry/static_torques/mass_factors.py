@@ -1,11 +1,11 @@
 """Masses of an arm as unknowns of its fit, where poses under several stated loads tell them from the compliance.
 
-Gravity turns an element by c (m_load(q) + Σ_i exp(f_i) m_i(q, Δ_i)): c is its compliance, m_load the moment of the
-stated load, m_i that of body i as described. f_i is the logarithm of the factor of its mass, Δ_i the shift of its
-centre of mass. Their prior is normal: all bodies have one factor in common, as descriptions of another arm of the
-family or without motors do, and each has one of its own. The estimate is the most probable one, by Gauss–Newton steps
-in which the parameters of the fit move along. Under a single load c and the masses are one product, and the prior
-remains.
+Gravity turns an element by c (m_load(q) + Σ_i m_i(q, f_i, Δ_i)): c is its compliance, m_load the moment
+of the stated load, m_i that of body i as described. f_i is the logarithm of the factor of its mass, Δ_i the change of
+its first moments over its described mass. Their prior is normal: all bodies have one factor in common, as descriptions
+of another arm of the family or without motors do, and each has one of its own. The estimate is the most probable one,
+by Gauss–Newton steps in which the parameters of the fit move along. Under a single load c and the masses are one
+product, and the prior remains.
 """
 
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ MIN_SIGMAS = 3.0
 
 @dataclass(frozen=True, eq=False)
 class MassFactors:
-    """Unknown masses of an arm of n bodies: logarithms of their factors (n), then shifts of their centres (3 n) [m].
+    """Unknown masses of an arm of n bodies: logarithms of factors (n), then first moments per described mass (3 n) [m].
 
     Attributes:
         chain: the nominal arm, with described masses or those of a usual arm.
@@ -80,9 +80,10 @@ class MassFactors:
 
     def _masses(self, values: np.ndarray) -> np.ndarray:
         n = self.chain.n
-        result = np.array(self.chain.inertias)
-        result[:, 6:9] += result[:, 9:] * values[n:].reshape(n, 3)
-        return result * np.exp(values[:n, None])
+        described = np.asarray(self.chain.inertias)
+        result = described * np.exp(values[:n, None])
+        result[:, 6:9] += described[:, 9:] * values[n:].reshape(n, 3)
+        return result
 
     def change_from(self, earlier: "MassFactors") -> float:
         """Return the largest change of the unknowns since an earlier step, in standard deviations of the posterior."""

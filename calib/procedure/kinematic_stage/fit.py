@@ -45,7 +45,7 @@ Progress = Callable[[str], None]
 # nominal errors fall by this factor when each file gets a station of its own: the instrument was moved (our choice)
 MOVED = 3.0
 # largest number of selections until the masses under several loads have converged (our choice)
-MASS_ROUNDS = 6
+MASS_ROUNDS = 8
 # smallest cross-validated error with corrections over that without, if errors of joints are random (our choice)
 MIN_RANDOM = 0.8
 # losses that let a few gross rows draw a fit
