@@ -41,7 +41,7 @@ def test_best_first_row_as_by_a_fit_for_each(variant):
             block = take(block, random.permutation(40))
     nominal = install(arm, [block])
     for shift in SHIFTS:
-        first = np.unique(block.rows)[: -MIN_SHIFTED - abs(shift)]
+        first = np.unique(block.rows)[: 1 - MIN_SHIFTED - abs(shift)]
         errors = [least_error(nominal, [_shifted(block, int(row), shift)])[0] for row in first]
         best = int(np.argmin(errors))
         last = best
@@ -57,7 +57,7 @@ def test_a_slip_is_named_at_its_row_and_no_good_row_is_called_unseen(name, seed)
     random = np.random.default_rng(seed)
     arm, block = measured(50, name, seed)
     nominal = install(arm, [block])
-    slip = int(random.integers(12, 38))
+    slip = int(random.choice([random.integers(3, 38), 46]))
     source = np.where(np.arange(50) < slip, np.arange(50), np.arange(50) - 1)
     first = int(block.rows[slip])
     stored_twice = replace(block, position=block.position[source])

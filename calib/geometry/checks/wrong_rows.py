@@ -26,8 +26,8 @@ from calib.transforms import from_quaternion
 # shifts in rows between measurements and joint values that are tried, as by a lost point or a header line
 SHIFTS = (1, -1, 2, -2)
 # smallest number of shifted rows (our choice)
-MIN_SHIFTED = 8
-# smallest ratio of the errors without and with a shift at a repeated reading (our choice)
+MIN_SHIFTED = 3
+# smallest ratio of the errors without a repeated reading, and with a shift there (our choice)
 MIN_SLIP = 3.0
 # smallest share of the shifted rows whose joint values are available, not held out (our choice)
 MIN_PAIRED = 0.5
@@ -148,10 +148,10 @@ def slips(nominal: Installation, block: Positions, row: int) -> bool:
         block: measured positions.
         row: number of the second row with the same reading.
     """
-    numbers = np.unique(block.rows)[: -MIN_SHIFTED - 1]
-    if nominal.known.terms or row not in numbers:
+    if nominal.known.terms or row not in _first_rows(block, -1):
         return False
-    before = float(least_error(nominal, [block])[0])
+    without = take(block, np.flatnonzero((block.rows != row) & (block.rows != row - 1)))
+    before = float(least_error(nominal, [without])[0])
     after = float(least_error(nominal, [_shifted(block, row, -1)])[0])
     return before > MIN_SLIP**2 * after
 
@@ -172,7 +172,7 @@ def _best_first(nominal: Installation, block: Positions, shift: int) -> int | No
         block: measured positions.
         shift: number of rows by which the joint values are shifted down; negative for up.
     """
-    numbers = np.unique(block.rows)[: -MIN_SHIFTED - abs(shift)]
+    numbers = _first_rows(block, shift)
     if len(numbers) < MIN_SHIFTED or len(_shifted(block, 0, shift)) < MIN_PAIRED * len(block):
         return None
 
@@ -182,6 +182,12 @@ def _best_first(nominal: Installation, block: Positions, shift: int) -> int | No
     around = numbers[np.abs(numbers - best) < max(len(numbers) // MAX_CUTS, 1)]
     best = int(around[np.argmin(errors.at(around))])
     return _last_as_good(errors.at(numbers[numbers >= best]), numbers[numbers >= best], len(block))
+
+
+def _first_rows(block: Positions, shift: int) -> np.ndarray:
+    """Return the row numbers from which on a shift would concern at least `MIN_SHIFTED` rows with joint values."""
+    numbers = np.unique(block.rows)
+    return numbers[: max(len(numbers) - MIN_SHIFTED - abs(shift) + 1, 0)]
 
 
 def _last_as_good(squares: np.ndarray, numbers: np.ndarray, count: int) -> int:
