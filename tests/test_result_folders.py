@@ -105,3 +105,36 @@ def test_an_error_names_the_folder_asked_for(tmp_path: Path) -> None:
     with pytest.raises(CalibError) as caught:
         write_staged(tmp_path / "out", (METRICS,), write)
     assert str(caught.value) == f"cannot write {tmp_path / 'out' / 'a.csv'}"
+
+
+WRITING = """
+import time
+from pathlib import Path
+
+from calib import cli
+from calib.folders import write_staged
+
+
+def fill(folder):
+    (folder / "estimate.csv").write_text("half")
+    print("writing", flush=True)
+    time.sleep(60.0)
+
+
+cli._spread = list
+cli.command_tree = lambda: lambda **arguments: write_staged(Path("out"), (), fill)
+cli.main()
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows ends a process without a signal")
+def test_a_terminated_command_leaves_no_staged_folder(tmp_path: Path) -> None:
+    command = subprocess.Popen(
+        [sys.executable, "-c", WRITING, "fit"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert command.stdout is not None and command.stdout.readline() == "writing\n"
+    assert [path.suffix for path in tmp_path.iterdir()] == [".part"]
+    command.terminate()
+    _, errors = command.communicate(timeout=30)
+    assert command.returncode == 143 and "no incomplete files were left" in errors
+    assert list(tmp_path.iterdir()) == []

@@ -2,7 +2,7 @@
 
 Exit codes: 0 done (the verdict is pass or marginal), 1 done but the verdict is fail, 2 wrong input or usage, 3 not
 identifiable or not converged, 4 an internal error (a file contains what is needed for its correction, see
-`calib.bug_reports`), 130 interrupted.
+`calib.bug_reports`), 130 interrupted, 143 terminated (SIGTERM).
 """
 
 import codecs
@@ -38,8 +38,10 @@ BEGIN = "Begin with calib demo; at a robot with calib new CELL, then calib next 
 INTERRUPTED = "interrupted; no incomplete files were left"
 # These commands keep what they have done; every other one starts over.
 RESUMED = ("next", "redo", "demo", "study")
-# Exit code of an interrupted command, and of one whose output nobody reads, as a shell says of SIGPIPE.
+# Exit code of an interrupted command, of a terminated one, and of one whose output nobody reads, as a shell says of
+# SIGINT, SIGTERM and SIGPIPE.
 INTERRUPTED_CODE = 130
+TERMINATED_CODE = 143
 BROKEN_PIPE_CODE = 141
 
 app = typer.Typer(
@@ -81,6 +83,7 @@ def main(arguments: list[str] | None = None) -> None:
     gc.set_threshold(*GARBAGE)
     if owns_process:
         limit_process()
+        signal.signal(signal.SIGTERM, _terminate)
     # What numpy and others say to programmers helps nobody at a cell.
     if not os.environ.get("CALIB_DEBUG"):
         warnings.filterwarnings("ignore")
@@ -96,6 +99,12 @@ def main(arguments: list[str] | None = None) -> None:
     if owns_process:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.exit(code)
+
+
+def _terminate(number: int, frame: object) -> None:
+    """End the command as by an error, so that temporary files and worker processes go; a second signal is ignored."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    raise SystemExit(TERMINATED_CODE)
 
 
 @lru_cache(maxsize=1)
@@ -131,7 +140,9 @@ def run(arguments: list[str] | None = None) -> int:
         return 2
     except (KeyboardInterrupt, typer.Abort):
         return _interrupted(arguments)
-    except SystemExit as stop:  # Typer's: completion is done, or whoever read the output has gone
+    except SystemExit as stop:  # terminated, or Typer's: completion is done, or the output's reader has gone
+        if stop.code == TERMINATED_CODE:
+            return _interrupted(arguments, TERMINATED_CODE)
         return BROKEN_PIPE_CODE if stop.code else 0
     except Exception as error:
         if os.environ.get("CALIB_DEBUG"):
@@ -188,10 +199,10 @@ def _spread(arguments: list[str]) -> list[str]:
     return result
 
 
-def _interrupted(arguments: list[str]) -> int:
+def _interrupted(arguments: list[str], code: int = INTERRUPTED_CODE) -> int:
     resumes = bool(set(RESUMED) & set(arguments[:2]))
     outcome = "goes on from here" if resumes else "starts over"
-    return _complain(f"{INTERRUPTED}; the same command {outcome}", INTERRUPTED_CODE)
+    return _complain(f"{INTERRUPTED}; the same command {outcome}", code)
 
 
 def _complain(message: str, code: int) -> int:

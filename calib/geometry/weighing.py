@@ -90,6 +90,17 @@ class GeometricFit:
         """Return the whitened rows at the solution, reduced by QR decomposition, without the prior."""
         return reduced(lambda: _rows(self.cell, self.free, self.blocks, self.pieces))
 
+    def whitened_rows(self, cell: Installation, blocks: list[Block], free: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return residuals (N,) of any installation, and their Jacobian (N, f), with the weights of this fit.
+
+        Args:
+            cell: the installation, with the stations and tools of this fit.
+            blocks: the fitted measurements, prepared for it.
+            free: (f,) indices of the parameters of the Jacobian's columns.
+        """
+        rows = list(_rows(cell, free, blocks, self.pieces))
+        return np.concatenate([residual for residual, _ in rows]), np.concatenate([matrix for _, matrix in rows])
+
     @property
     def base(self) -> np.ndarray:
         """Indices (b,) of the base parameters in the full vector; all fitted ones where the caller chose the

@@ -7,7 +7,8 @@ import pytest
 from planted import cell, perturb
 
 from calib.data.poses.measurements import Positions, take
-from calib.geometry.checks.wrong_rows import MIN_SHIFTED, SHIFTS, _best_first, _CutErrors, _shifted, least_error
+from calib.geometry.checks.readings import without_unseen
+from calib.geometry.checks.wrong_rows import MIN_SHIFTED, SHIFTS, TIED, _best_first, _CutErrors, _shifted, least_error
 from calib.geometry.first_guess import install
 from calib.geometry.installation import see
 from calib.robot.calibrated import evaluate
@@ -15,18 +16,18 @@ from calib.robot.chain import random_joints
 from calib.robot.library import load
 
 
-def measured(count):
+def measured(count, name="ur5", seed=1):
     """Return an arm, and positions of a target in another arm's cell."""
-    arm = load("ur5")
-    truth = cell(perturb(arm, 1, 0.5e-3, 1e-3), 1)
-    q = random_joints(arm, count, np.random.default_rng(1))
+    arm = load(name)
+    truth = cell(perturb(arm, seed, 0.5e-3, 1e-3), seed)
+    q = random_joints(arm, count, np.random.default_rng(seed))
     seen = see(truth, q, 0, np.zeros(count, dtype=int), evaluate(truth.deflection, q, None))
     return arm, Positions(q, arm.joint_names, seen.point.T, file="measured.csv")
 
 
 @pytest.mark.parametrize("variant", ["whole", "shifted", "held out", "two tools", "other order"])
 def test_best_first_row_as_by_a_fit_for_each(variant):
-    """The row from which a shift explains most is the same as by a fit for every row."""
+    """The last row from which on a shift explains as much as the best one is the same as by a fit for every row."""
     random = np.random.default_rng(0)
     arm, block = measured(40)
     match variant:
@@ -40,9 +41,42 @@ def test_best_first_row_as_by_a_fit_for_each(variant):
             block = take(block, random.permutation(40))
     nominal = install(arm, [block])
     for shift in SHIFTS:
-        first = np.unique(block.rows)[: -MIN_SHIFTED - abs(shift)]
+        first = np.unique(block.rows)[: 1 - MIN_SHIFTED - abs(shift)]
         errors = [least_error(nominal, [_shifted(block, int(row), shift)])[0] for row in first]
-        assert _best_first(nominal, block, shift) == first[np.argmin(errors)]
+        best = int(np.argmin(errors))
+        last = best
+        while last + 1 < len(first) and len(block) * errors[last + 1] < (len(block) + TIED) * errors[best]:
+            last += 1
+        assert _best_first(nominal, block, shift) == first[last]
+
+
+@pytest.mark.parametrize("name", ["ur5", "tx40", "lwr4plus", "ur10"])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_slip_is_named_at_its_row_and_no_good_row_is_called_unseen(name, seed):
+    """A reading or a joint row was stored twice: the first wrong row is named, exactly or taken anew with noise."""
+    random = np.random.default_rng(seed)
+    arm, block = measured(50, name, seed)
+    nominal = install(arm, [block])
+    slip = int(random.choice([random.integers(3, 38), 46]))
+    source = np.where(np.arange(50) < slip, np.arange(50), np.arange(50) - 1)
+    first = int(block.rows[slip])
+    stored_twice = replace(block, position=block.position[source])
+    read_twice = replace(stored_twice, position=stored_twice.position + 1e-5 * random.normal(size=(50, 3)))
+    joints_twice = replace(block, q=block.q[source])
+    for slipped, shift in ((stored_twice, -1), (read_twice, -1), (joints_twice, 1)):
+        assert _best_first(nominal, slipped, shift) == first
+    visible, findings = without_unseen(arm, stored_twice)
+    assert len(visible) == 50 and not findings
+
+
+@pytest.mark.parametrize("name", ["ur5", "lwr4plus"])
+def test_a_repeated_reading_of_a_lost_target_is_still_left_out(name):
+    arm, block = measured(50, name)
+    position = np.array(block.position)
+    position[21] = position[20]
+    visible, findings = without_unseen(arm, replace(block, position=position))
+    assert len(visible) == 48
+    assert [finding.code for finding in findings] == ["reading-repeated"]
 
 
 def test_no_rows_have_no_error():

@@ -1,7 +1,8 @@
 """Search for invalid readings: one value repeated at several postures, or the readings of one target in another.
 
 A value is repeated where, for example, the instrument lost the target or wrote a placeholder. Such readings count as
-not seen: `without_unseen` leaves them out of a fit.
+not seen: `without_unseen` leaves them out of a fit. Where all later rows are paired with wrong joint values, the
+reading was stored twice instead, and stays.
 """
 
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ import numpy as np
 
 from calib.data.poses.measurements import Block, PoseMeasurements, Positions, take
 from calib.errors import CalibError, Finding, finding
+from calib.geometry.checks.wrong_rows import slips
 from calib.geometry.first_guess import install
 from calib.geometry.installation import Installation
 from calib.geometry.observation import positions, prepare
@@ -78,9 +80,9 @@ def repeated_readings(nominal: Installation, blocks: Sequence[PoseMeasurements])
             copies = _copies(block)
             copied = {entry.second for entry in copies}
             findings += map(partial(_says_copies, block), copies)
-            findings += [
-                _says_repeated(block, entry) for entry in _repeated(nominal, block) if entry.tool not in copied
-            ]
+            for entry in _repeated(nominal, block):
+                if entry.tool not in copied:
+                    findings.append(_says_repeated(block, entry))
     return findings
 
 
@@ -210,6 +212,8 @@ def _distance_change(block: Positions, tool: int, neighbour: int, rows: Sequence
 def _repeated(nominal: Installation, block: Positions) -> list[Repeated]:
     """Return the readings that stay constant while the joints move the target, and single readings of zeros.
 
+    A reading that was stored twice, behind which all rows are shifted, is left out.
+
     Args:
         nominal: the nominal arm, with stations and tools placed.
         block: measured positions.
@@ -228,12 +232,27 @@ def _repeated(nominal: Installation, block: Positions) -> list[Repeated]:
         for number in numbers[counts > 1]:
             index = rows[readings[rows] == number]
             distance = float(np.linalg.norm(np.ptp(predicted[index], axis=0)))
-            if distance >= MIN_APART:
-                result.append(Repeated(tool, tuple(index.tolist()), distance))
+            entry = Repeated(tool, tuple(index.tolist()), distance)
+            if distance >= MIN_APART and not _slips(nominal, block, entry):
+                result.append(entry)
         zeros = rows[is_zero[rows]]
         if len(zeros) == 1 and off[zeros[0]] > max(MIN_OFF, MIN_TIMES_OFF * float(np.median(off[rows]))):
             result.append(Repeated(tool, tuple(zeros.tolist()), float(off[zeros[0]])))
     return result
+
+
+def _slips(nominal: Installation, block: Positions, repeated: Repeated) -> bool:
+    """Return whether all rows behind a reading that two successive rows repeat are paired with wrong joint values.
+
+    Both rows then hold a good reading, and the search for shifted rows names the second one.
+
+    Args:
+        nominal: the nominal arm.
+        block: measured positions.
+        repeated: the rows with the same reading.
+    """
+    rows = block.rows[list(repeated.index)]
+    return len(rows) == 2 and rows[1] == rows[0] + 1 and slips(nominal, block, int(rows[1]))
 
 
 def _says_copies(block: Positions, copies: Copies) -> Finding:

@@ -26,13 +26,17 @@ from calib.transforms import from_quaternion
 # shifts in rows between measurements and joint values that are tried, as by a lost point or a header line
 SHIFTS = (1, -1, 2, -2)
 # smallest number of shifted rows (our choice)
-MIN_SHIFTED = 8
+MIN_SHIFTED = 3
+# smallest ratio of the errors without a repeated reading, and with a shift there (our choice)
+MIN_SLIP = 3.0
 # smallest share of the shifted rows whose joint values are available, not held out (our choice)
 MIN_PAIRED = 0.5
 # number of first rows of a shift that are tried at once, before the rows between the best ones (our choice)
 MAX_CUTS = 120
 # smallest number of rows in which two targets are searched (our choice)
 MIN_MIXED = 24
+# squared error of a row, over the mean, up to which it is none of other rows (our choice)
+TIED = 9.0
 # largest number of iterations of the assignment of rows to targets; a few are needed
 MAX_ROUNDS = 50
 # size of a combination of columns, relative to the largest, below which it is rounding: some 1e6 roundings of double
@@ -136,6 +140,22 @@ def _shifts(nominal: Installation, block: Positions) -> Iterator[tuple[int, int]
             yield shift, first
 
 
+def slips(nominal: Installation, block: Positions, row: int) -> bool:
+    """Return whether readings from a row on, which repeats the one before, belong to the joint values one row up.
+
+    Args:
+        nominal: the nominal arm.
+        block: measured positions.
+        row: number of the second row with the same reading.
+    """
+    if nominal.known.terms or row not in _first_rows(block, -1):
+        return False
+    without = take(block, np.flatnonzero((block.rows != row) & (block.rows != row - 1)))
+    before = float(least_error(nominal, [without])[0])
+    after = float(least_error(nominal, [_shifted(block, row, -1)])[0])
+    return before > MIN_SLIP**2 * after
+
+
 def _by_row(poses: np.ndarray, block: Positions) -> np.ndarray:
     """Return poses (m, 4, 4) of a block's rows by their numbers in the file; NaN for absent numbers."""
     first = int(block.rows.min())
@@ -152,7 +172,7 @@ def _best_first(nominal: Installation, block: Positions, shift: int) -> int | No
         block: measured positions.
         shift: number of rows by which the joint values are shifted down; negative for up.
     """
-    numbers = np.unique(block.rows)[: -MIN_SHIFTED - abs(shift)]
+    numbers = _first_rows(block, shift)
     if len(numbers) < MIN_SHIFTED or len(_shifted(block, 0, shift)) < MIN_PAIRED * len(block):
         return None
 
@@ -160,7 +180,29 @@ def _best_first(nominal: Installation, block: Positions, shift: int) -> int | No
     coarse = numbers[evenly(len(numbers), MAX_CUTS)]
     best = coarse[np.argmin(errors.at(coarse))]
     around = numbers[np.abs(numbers - best) < max(len(numbers) // MAX_CUTS, 1)]
-    return int(around[np.argmin(errors.at(around))])
+    best = int(around[np.argmin(errors.at(around))])
+    return _last_as_good(errors.at(numbers[numbers >= best]), numbers[numbers >= best], len(block))
+
+
+def _first_rows(block: Positions, shift: int) -> np.ndarray:
+    """Return the row numbers from which on a shift would concern at least `MIN_SHIFTED` rows with joint values."""
+    numbers = np.unique(block.rows)
+    return numbers[: max(len(numbers) - MIN_SHIFTED - abs(shift) + 1, 0)]
+
+
+def _last_as_good(squares: np.ndarray, numbers: np.ndarray, count: int) -> int:
+    """Return the last of successive rows from which on a shift explains the positions as well as from the first one.
+
+    Where a row is repeated, or lost, the rows beside it fit with both joint values: as few rows as possible are
+    accused.
+
+    Args:
+        squares: (k,) mean squared errors [m²] with the shift from each row on.
+        numbers: (k,) their row numbers, the best one first.
+        count: number of rows.
+    """
+    as_good = count * squares < (count + TIED) * squares[0]
+    return int(numbers[np.argmin(as_good) - 1 if not as_good.all() else -1])
 
 
 @dataclass(frozen=True, eq=False)

@@ -53,17 +53,27 @@ def load_variance(
     distance = np.min(np.abs(block.load[:, 3:] - np.array(masses or (0.0,))), axis=1)
     if distance.max() < SAME_LOAD or len(chain.driven) != chain.n:
         return None
-    moments = _moments_of_load(chain, block)
-    walked = sweep(chain, block.q)
-    target = walked.position + np.einsum("cdm,c->dm", walked.rotation, cell.tools[0][:3, 3])
-    motions = element_jacobian(chain, walked, target, np.arange(len(chain.elements)))[:, :3]
     compliance, doubtful = _compliance(cell)
-    per_element = motions * moments[:, None] * compliance[:, None, None]
+    per_element = load_motions(cell, block) * compliance[:, None, None]
     if doubtful:
         variance = np.sum(per_element**2, axis=(0, 1))
     else:
         variance = mass_doubt**2 * np.sum(np.sum(per_element, axis=0) ** 2, axis=0)
     return np.where(distance < SAME_LOAD, 0.0, variance)
+
+
+def load_motions(cell: Installation, block: PoseMeasurements) -> np.ndarray:
+    """Return the motion (K, 3, m) [m per rad/(N m)] of the target by a block's load, per compliance of each element.
+
+    Args:
+        cell: the installation.
+        block: the rows, with their load.
+    """
+    chain = cell.chain
+    walked = sweep(chain, block.q)
+    target = walked.position + np.einsum("cdm,c->dm", walked.rotation, cell.tools[0][:3, 3])
+    motions = element_jacobian(chain, walked, target, np.arange(len(chain.elements)))[:, :3]
+    return motions * _moments_of_load(chain, block)[:, None]
 
 
 def _moments_of_load(chain: Chain, block: PoseMeasurements) -> np.ndarray:

@@ -123,18 +123,22 @@ def _findings_of_load(block: PoseMeasurements, gravity: GravityFit) -> list[Find
     return findings
 
 
-def torques_used(deflection: Deflection, gravity: GravityFit | None, source: str) -> list[Finding]:
+def torques_used(
+    deflection: Deflection, gravity: GravityFit | None, source: str, by_loads: bool = False
+) -> list[Finding]:
     """Return a finding on the source of the torques that drive the compliance; none without compliance by torques.
 
     Args:
         deflection: the fitted corrections.
         gravity: the fitted gravity; None without measured torques.
         source: `MEASURED` or `MODELLED`.
+        by_loads: whether the deflection under several stated loads told the masses.
     """
     if not deflection.by_torque:
         return []
     if gravity is None:
-        return [finding("torques-used", source="of the described masses", sigma=None, joint=None, worst=None)]
+        origin = "of masses that the stated loads tell" if by_loads else "of the described masses"
+        return [finding("torques-used", source=origin, sigma=None, joint=None, worst=None)]
     texts = {
         MEASURED: "as measured, elsewhere of masses fitted to these",
         MODELLED: "of masses fitted to the measured ones",

@@ -16,7 +16,7 @@ from calib.geometry.repeatability import ARMS, RepeatedPoses, repeated_poses
 from calib.geometry.static_torques.load_errors import load_masses
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.image_findings import reprojection
-from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
+from calib.procedure.kinematic_stage.inputs import Unseen, pose_count, pose_of_row
 from calib.procedure.kinematic_stage.metrics import ComparedRows, PoseIntervalCoverage
 
 # Columns of unseen rows: the standard deviation that the fit expects of the calibrated arm's position error there, all
@@ -24,6 +24,8 @@ from calib.procedure.kinematic_stage.metrics import ComparedRows, PoseIntervalCo
 INTERVAL = ("sigma [mm]", "interval95 [mm]", "extrapolated")
 # measured numbers per fitted parameter of a placement, below which errors prove nothing (our choice)
 MARGIN = 3
+# number of poses below which errors decide no verdict: the rms of 8 poses is known to a fifth (our choice)
+MIN_UNSEEN = 8
 # kind of a block -> what its position errors are, where it measures no position
 MEASURED = {"sockets": "socket scatter", "plane": "plane distance"}
 # kinds of blocks that have no position errors
@@ -95,6 +97,7 @@ class Comparison:
             meaningless.
         placed_by: number of measured values, and number of placement parameters fitted to them, if there are too few
             values to judge by the errors (`MARGIN`); otherwise None.
+        few: number of poses, if these are fewer than a verdict needs (`MIN_UNSEEN`); otherwise None.
         intervals: errors of the calibrated arm with their predicted intervals; None without an error model of the fit.
         plain: errors of the plain reference, with frames fitted to the same rows; None on fitted rows, and without a
             plain reference.
@@ -113,8 +116,14 @@ class Comparison:
     reprojection: tuple[float, float] | None = None
     settled: bool = True
     placed_by: tuple[int, int] | None = None
+    few: int | None = None
     intervals: Intervals | None = None
     plain: Errors | None = None
+
+    @property
+    def decides(self) -> bool:
+        """Whether a verdict may follow from these rows."""
+        return self.proves and self.few is None
 
     @property
     def of_urdf(self) -> Comparison:
@@ -264,9 +273,14 @@ def compare_unseen(
         if unseen.own_frames:
             plain = placed_on(plain, block, settings).cell
         plain_errors = errors(plain, [block])
+    few = None
+    poses = int(pose_of_row(block).max(initial=-1)) + 1
+    if poses < MIN_UNSEEN:
+        few = poses
     return replace(
         comparison,
         settled=settled,
+        few=few,
         placed_by=placed_by,
         intervals=intervals,
         shares_frames=not (unseen.own_frames or unseen.held_out),

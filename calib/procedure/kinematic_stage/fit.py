@@ -25,6 +25,7 @@ from calib.geometry.model_choice.stated_compliance import contradictions
 from calib.geometry.observability import unidentified
 from calib.geometry.observation import fixed_parameters, stated_prior
 from calib.geometry.static_torques.load_errors import DESCRIBED, WEIGHED
+from calib.geometry.static_torques.mass_factors import SETTLED, MassFactors, several_loads
 from calib.geometry.static_torques.sources import MODELLED, torques_used
 from calib.geometry.weighing import GeometricFit, Settings, calibrated_chain
 from calib.procedure.findings import Verdict, level_of, sentence, settle
@@ -43,6 +44,8 @@ Progress = Callable[[str], None]
 
 # nominal errors fall by this factor when each file gets a station of its own: the instrument was moved (our choice)
 MOVED = 3.0
+# largest number of selections until the masses under several loads have converged (our choice)
+MASS_ROUNDS = 8
 # smallest cross-validated error with corrections over that without, if errors of joints are random (our choice)
 MIN_RANDOM = 0.8
 # losses that let a few gross rows draw a fit
@@ -186,6 +189,16 @@ def run(
         if of_modelled[1].cross_validated < (1.0 - MIN_GAIN) * selection.cross_validated:
             inputs = modelled
             climb, selection = of_modelled
+    mass_doubt = DESCRIBED if inputs.gravity is None else WEIGHED
+    mass_factors: MassFactors | None = None
+    if _masses_unknown(inputs) and model not in RIGID_MODELS:
+        progress("weighing the arm by its loads")
+        factors, loaded, of_loads = _weighed(inputs, options, settings, weighing)
+        if factors is not None and of_loads[1].cross_validated < (1.0 + MIN_GAIN) * selection.cross_validated:
+            inputs = loaded
+            climb, selection = of_loads
+            mass_doubt = factors.doubt
+            mass_factors = factors
     nominal = selection.nominal.cell
     _check_convergence(selection, inputs, options)
 
@@ -200,7 +213,10 @@ def run(
     if not changes:
         for block in inputs.fit:
             notes += parted_set_up(inputs.chain, block)
-    notes += torques_used(selection.fit.cell.deflection, inputs.gravity, inputs.torques)
+    if mass_factors is not None:
+        notes += mass_factors.findings()
+    by_loads = mass_factors is not None
+    notes += torques_used(selection.fit.cell.deflection, inputs.gravity, inputs.torques, by_loads)
     if inputs.compliance is not None:
         notes += contradictions(selection.fit, selection.rigid, inputs.compliance)
     if prediction is not None:
@@ -215,7 +231,6 @@ def run(
     findings = replace(findings, joint_range=measured_range)
 
     progress("estimating the expected errors")
-    mass_doubt = DESCRIBED if inputs.gravity is None else WEIGHED
     expected = learn_errors(selection, inputs.fit, settings.seed, mass_doubt)
     if expected is not None:
         findings = replace(findings, discrepancy=expected.discrepancy)
@@ -263,6 +278,42 @@ def _selected(
         compliance=inputs.compliance,
     )
     return climb, climb(settings.model or options.model, settings=weighing)
+
+
+def _masses_unknown(inputs: Inputs) -> bool:
+    """Return whether poses under several stated loads may tell the arm's masses, which nothing else has told."""
+    told = inputs.gravity is not None or inputs.masses is not None or inputs.compliance is not None
+    earlier = inputs.earlier is not None and inputs.earlier.corrections is not None
+    serial = len(inputs.chain.driven) == inputs.chain.n
+    return serial and not told and not earlier and several_loads(inputs.fit)
+
+
+def _weighed(
+    inputs: Inputs, options: FitOptions, settings: FitSettings, weighing: Settings
+) -> tuple[MassFactors | None, Inputs, tuple[Callable[..., ModelSelection], ModelSelection]]:
+    """Return the masses that the loads tell, the inputs with their torques, and the model selected on these.
+
+    The masses are None where no compliance by torques is selected.
+
+    Args:
+        inputs: robot and measurements.
+        options: content of the fit options file.
+        settings: model, folds and seed.
+        weighing: settings of the loss function.
+    """
+    factors = MassFactors.before(inputs.chain)
+    for _ in range(MASS_ROUNDS):
+        loaded = inputs.with_masses(factors.masses)
+        selected = _selected(loaded, options, settings, weighing, _silent)
+        fit = selected[1].fit
+        if not fit.cell.deflection.by_torque or not fit.solution.status.good:
+            return None, inputs, selected
+        following = factors.step(fit, loaded.fit)
+        reached = replace(following, values=factors.values)
+        if following.change_from(factors) < SETTLED:
+            break
+        factors = following
+    return reached, loaded, selected
 
 
 def _rigid_misfit(

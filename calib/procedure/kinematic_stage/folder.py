@@ -128,6 +128,13 @@ class FitFolder:
         rigid = calibrated.read(self.path).chain
         return Arms(nominal, calibrated_cell, rigid, expected, plain_reference(nominal, inputs))
 
+    def driven(self, inputs: Inputs) -> Inputs:
+        """Return inputs whose compliance is driven by the torques that the fit used: measured, or of its masses."""
+        reference = calibrated.read(self.path).deflection.reference
+        if inputs.gravity is None and reference is not None and reference.inertias is not None:
+            return inputs.with_masses(reference.inertias)
+        return inputs.driven_by(self.findings().torques)
+
     def learnt_joints(self, joints: Sequence[Joint]) -> np.ndarray | None:
         """Return the joint values (m, n) [rad or m] of the fitted rows; None without a file of residuals."""
         if not self.residuals.is_file():

@@ -108,6 +108,15 @@ class Inputs:
             unseen[name] = replace(rows, block=driven(rows.block, gravity, source))
         return replace(self, fit=fitted, unseen=unseen, torques=source)
 
+    def with_masses(self, masses: np.ndarray) -> "Inputs":
+        """Return the inputs whose compliance is driven by the gravity of other masses (n, 10), and the stated loads."""
+        weighed = replace(self.chain, inertias=masses)
+        fitted = tuple(with_stated_load(weighed, block) for block in self.fit)
+        unseen = {}
+        for name, rows in self.unseen.items():
+            unseen[name] = replace(rows, block=with_stated_load(weighed, rows.block))
+        return replace(self, fit=fitted, unseen=unseen, masses=masses)
+
     @property
     def weighed(self) -> Chain:
         """The nominal arm with the masses from which gravity torques are computed."""
@@ -531,7 +540,7 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
     """
     if share == 0.0:
         return block, None
-    pose = _pose_of_row(block)
+    pose = pose_of_row(block)
     count = int(pose.max()) + 1
     held_count = round(share * count)
     order = np.random.default_rng(seed).permutation(count)
@@ -543,7 +552,7 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
     return take(block, np.flatnonzero(~held_out)), take(block, np.flatnonzero(held_out))
 
 
-def _pose_of_row(block: PoseMeasurements) -> np.ndarray:
+def pose_of_row(block: PoseMeasurements) -> np.ndarray:
     """Return the index (m,) of the pose, or measured pair of poses, for each row of a block.
 
     Cycles of a repeated pose have the same index.

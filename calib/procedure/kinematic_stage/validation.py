@@ -22,7 +22,7 @@ from calib.geometry.static_torques.load_check import suspected_load
 from calib.geometry.static_torques.sources import load_changes
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import NOT_JUDGED, Verdict, catalogue, level_of, limit, lines_of, sentence
-from calib.procedure.kinematic_stage.comparison import MARGIN, Comparison, compare, compare_unseen
+from calib.procedure.kinematic_stage.comparison import MARGIN, MIN_UNSEEN, Comparison, compare, compare_unseen
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings, ValidationMetrics
 from calib.procedure.kinematic_stage.plausibility import FLOOR, TOO_GOOD
@@ -92,8 +92,9 @@ def judge(
     6. ``rigid-misfit`` or ``gross-rows`` of the fit, ``refuted``, ``no-transfer``, ``intervals-too-narrow``,
        ``small-gain``, ``many-outliers``; without any of them: pass.
 
-    Two kinds of findings count in every group: the other findings on the fit
-    (`calib.procedure.kinematic_stage.plausibility`), and ``gross-unseen-rows``, which replaces ``refuted``.
+    Three kinds of findings count in every group: the other findings on the fit
+    (`calib.procedure.kinematic_stage.plausibility`), ``gross-unseen-rows``, which replaces ``refuted``, and
+    ``few-unseen-poses``: fewer than `MIN_UNSEEN` poses of a file decide nothing, but may contradict a pass.
 
     Args:
         fit: errors of both arms on the fitted rows.
@@ -104,7 +105,8 @@ def judge(
         cross_validated: cross-validated error of the deliverable [m]; None if not computed.
         arm: name of the deliverable if there are several; otherwise empty.
     """
-    unseen = {name: comparison for name, comparison in validation.items() if comparison.proves}
+    unseen = {name: comparison for name, comparison in validation.items() if comparison.decides}
+    few = list(_few(fit, validation, cross_validated))
     nominal_rms = fit.errors[0].rms
     fitted_rms = fit.errors[1].rms
     frames_only = findings.model == requested_model == "frames"
@@ -117,7 +119,10 @@ def judge(
     if findings.nominal_cross_validated is not None:
         nominal_rms = findings.nominal_cross_validated
     if not proofs and cross_validated is not None:
-        proofs = [_Proof(nominal_rms, cross_validated, "by cross-validation only")]
+        where = "by cross-validation only"
+        if few and all(level_of(note) == "note" for note in few):
+            where += f" ({few[0].values['poses']} unseen poses are too few)"
+        proofs = [_Proof(nominal_rms, cross_validated, where)]
     if not proofs and frames_only:
         # so few parameters leave the errors on the fitted poses as they are
         proofs = [_Proof(nominal_rms, fitted_rms, "on the fitted poses")]
@@ -126,7 +131,7 @@ def judge(
     gross: list[Finding] = []
     for proof in proofs:
         gross += filter(level_of, _gross(proof, findings.reach))
-    common = [*gross, *(noticed for noticed in findings.noticed if noticed.code not in RIGID)]
+    common = [*gross, *few, *(noticed for noticed in findings.noticed if noticed.code not in RIGID)]
 
     # The first group of rules that says something decides.
     groups: list[Iterable[Finding]] = [_far_off(proofs, {"the fitted poses": fit, **unseen}, tolerance, findings.reach)]
@@ -151,10 +156,26 @@ def judge(
     if gross:
         cross_validated = None
     doubts = _doubts(worst, fitted_rms, cross_validated, unseen, findings)
-    verdict = Verdict.of(_figures(worst, arm), [*gross, *findings.noticed, *doubts])
+    verdict = Verdict.of(_figures(worst, arm), [*gross, *few, *findings.noticed, *doubts])
     if verdict.level == "pass":
         return Verdict("pass", _figures(worst, arm, tolerance))
     return verdict
+
+
+def _few(fit: Comparison, validation: Mapping[str, Comparison], cross_validated: float | None) -> Iterator[Finding]:
+    """Yield a finding on each validation file with too few poses for a verdict.
+
+    Args:
+        fit: errors of both arms on the fitted rows.
+        validation: name of a validation file -> errors of both arms.
+        cross_validated: cross-validated error [m]; None if not computed.
+    """
+    promised = max(fit.errors[1].rms if cross_validated is None else cross_validated, TINY)
+    for name, rows in validation.items():
+        if rows.proves and rows.few is not None:
+            rms = rows.errors[1].rms
+            values = {"where": name, "poses": rows.few, "least": MIN_UNSEEN, "rms": rms, "times": rms / promised}
+            yield finding("few-unseen-poses", **values)
 
 
 def _frames_verdict(
@@ -448,6 +469,11 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
         noticed += filter(level_of, _references(name, rows, deliverable, frames_only))
     noticed += findings.noticed
     noticed += inputs.noticed
+    if deliverable == "urdf" and fitted.alone is not None:
+        of_urdf = {name: rows.of_urdf for name, rows in validation.items()}
+        noticed += _few(fitted.of_urdf, of_urdf, findings.rigid_cross_validated)
+    else:
+        noticed += _few(fitted, validation, findings.cross_validated)
     noticed += load_changes(inputs.fit, [rows.block for rows in inputs.unseen.values()])
     copies = _copies(inputs)
     if copies:
@@ -534,7 +560,7 @@ def _worst_rms(validation: Mapping[str, Comparison], findings: Findings, deliver
         findings: findings on the fit with the cross-validated errors.
         deliverable: ``urdf`` or ``corrections``.
     """
-    comparisons = [rows for rows in validation.values() if rows.proves]
+    comparisons = [rows for rows in validation.values() if rows.decides]
     cross_validated = findings.cross_validated
     if deliverable == "urdf":
         comparisons = [rows.of_urdf for rows in comparisons]

@@ -460,7 +460,7 @@ def validate(session: Session, say: Say) -> list[Note]:
 
     say("comparing on unseen poses")
     findings = session.fit.findings()
-    gathered = _gathered(session, unseen).driven_by(findings.torques)
+    gathered = session.fit.driven(_gathered(session, unseen))
     options, fit_settings = _options_of(session), _fit_settings(session)
     weighing = fitting.weighing_settings(options, fit_settings)
     fit_settings = replace(fit_settings, model=fit_settings.model or options.model)

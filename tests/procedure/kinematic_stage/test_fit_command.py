@@ -473,3 +473,16 @@ def test_self_explaining_file_proves_nothing(cell, calib) -> None:
         _, out, err = calib("fit", "ur5", file, "--model", "offsets", "--validate", few, "--refit-frames", "--out", "o")
         assert ("few.csv is not scored: base and tool placement use 9" in out) is not scored, err
         assert ("on few.csv, unseen" in out) is scored
+
+
+def test_few_unseen_poses_are_said_and_decide_nothing(cell, calib) -> None:
+    """Seven poses are named on the console, in the verdict and on the certificate; eight decide it."""
+    file, other = cell.write("a.csv", cell.measure(60)), cell.measure(8, 1)
+    for count in (7, 8):
+        validated = cell.write(f"v{count}.csv", other[:count])
+        _, out, err = calib("fit", "ur5", file, "--model", "geometry", "--validate", validated, "--out", f"o{count}")
+        said = f"v{count}.csv: {count} unseen poses, too few (below 8)"
+        page = Path(f"o{count}/report.html").read_text()
+        assert (said in out) is (said in page) is (count == 7), err
+        assert (f"by cross-validation only ({count} unseen poses are too few)" in out) is (count == 7)
+        assert (f"on v{count}.csv, unseen" in out) is (count == 8)

@@ -25,6 +25,11 @@ def rows(nominal, calibrated, proves=True, turned=None, alone=None, shares_frame
     )  # fmt: skip
 
 
+def few_rows(nominal, calibrated) -> Comparison:
+    """Return a comparison with errors of these sizes [mm] on too few poses."""
+    return replace(rows(nominal, calibrated), few=7)
+
+
 def with_row_off(nominal, calibrated, nominal_off, calibrated_off) -> Comparison:
     """Return the comparison with other errors [mm] of row 7."""
     found = rows(nominal, calibrated)
@@ -59,6 +64,12 @@ SCALE = finding("lengths-grew", factor=1.01, sigma=1e-4, explained=0.9, off=0.01
         ({}, {"cross_validated": None}, "marginal", "no-unseen-poses"),
         ({}, {"cross_validated": 2e-3}, "fail", "worse-than-nominal"),
         ({"a": rows(1.0, 0.01, proves=False)}, {"cross_validated": None}, "marginal", "no-unseen-poses"),
+        # few poses decide nothing, not even beside others that do, but withhold a pass that they contradict
+        ({"a": few_rows(1.0, 0.01)}, {"cross_validated": None}, "marginal", "no-unseen-poses"),
+        ({"a": few_rows(1.0, 0.1)}, {}, "pass", ""),
+        ({"a": few_rows(1.0, 2.0)}, {}, "marginal", "few-unseen-poses"),
+        ({"a": few_rows(1.0, 2.0), "b": rows(1.0, 0.1)}, {}, "marginal", "few-unseen-poses"),
+        ({"a": few_rows(1.0, 0.1), "b": rows(1.0, 1.1)}, {}, "fail", "worse-than-nominal"),
         ({"a": rows(1.0, 0.99)}, {"reach": 1.0}, "fail", "no-better-model"),
         # only frames were asked for: the tolerance decides, without one nothing does
         ({"a": rows(1.0, 1.0)}, ASKED, "not judged", ""),

@@ -1,0 +1,195 @@
+"""Masses of an arm as unknowns of its fit, where poses under several stated loads tell them from the compliance.
+
+Gravity turns an element by c (m_load(q) + Σ_i m_i(q, f_i, Δ_i)): c is its compliance, m_load the moment
+of the stated load, m_i that of body i as described. f_i is the logarithm of the factor of its mass, Δ_i the change of
+its first moments over its described mass. Their prior is normal: all bodies have one factor in common, as descriptions
+of another arm of the family or without motors do, and each has one of its own. The estimate is the most probable one,
+by Gauss–Newton steps in which the parameters of the fit move along. Under a single load c and the masses are one
+product, and the prior remains.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data.poses.measurements import PoseMeasurements
+from calib.errors import Finding, finding
+from calib.geometry.installation import Installation
+from calib.geometry.observation import layout, prepare
+from calib.geometry.static_torques.gravity_fit import carried_load, reference_masses
+from calib.geometry.static_torques.load_errors import load_masses, load_motions
+from calib.geometry.static_torques.sources import with_stated_load
+from calib.geometry.weighing import GeometricFit
+from calib.robot.calibrated import BY_TORQUE
+from calib.robot.chain import Chain
+
+# prior standard deviation of the logarithm of the factor that all masses have in common, and of each body's
+# (our choice): of a description, and of a usual arm
+DESCRIBED_FACTOR, USUAL_FACTOR = (0.5, 0.3), (1.0, 0.5)
+# the same of a centre of mass, as a share of the arm's length (our choice)
+CENTRE_SHARE = 0.05
+# [kg/m²] mass of a usual arm over the square of its length (our choice)
+USUAL_MASS = 40.0
+# largest change of a logarithm in one step, and change in standard deviations below which the steps end (our choice)
+MAX_STEP, SETTLED = 1.0, 0.1
+# step of the differences by which the residuals' derivatives are computed, in standard deviations of the prior
+DIFFERENCE = 0.02
+# standard deviations of the common factor from which on it is stated
+MIN_SIGMAS = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class MassFactors:
+    """Unknown masses of an arm of n bodies: logarithms of factors (n), then first moments per described mass (3 n) [m].
+
+    Attributes:
+        chain: the nominal arm, with described masses or those of a usual arm.
+        values, prior: (4 n,) most probable unknowns so far, and (4 n, 4 n) covariance of their prior.
+        covariance: (4 n, 4 n) posterior covariance; the prior before the first step.
+        doubt: standard deviation of a load's deflection due to the masses, as a share of it.
+        described: whether the masses are those of the description.
+    """
+
+    chain: Chain
+    values: np.ndarray
+    prior: np.ndarray
+    covariance: np.ndarray
+    doubt: float
+    described: bool = True
+
+    @classmethod
+    def before(cls, chain: Chain) -> "MassFactors":
+        """Return the unknowns of a nominal arm before any measurement."""
+        masses = reference_masses(chain)
+        common, single = DESCRIBED_FACTOR
+        described = chain.inertias is not None and chain.inertias[:, 9].sum() > 0.0
+        if not described:
+            common, single = USUAL_FACTOR
+            masses *= USUAL_MASS * chain.stretched_length() ** 2 / masses[:, 9].sum()
+        n = chain.n
+        prior = np.diag(np.full(4 * n, (CENTRE_SHARE * chain.stretched_length()) ** 2))
+        prior[:n, :n] = common**2 + single**2 * np.eye(n)
+        doubt = float(np.hypot(common, single))
+        return cls(replace(chain, inertias=masses), np.zeros(4 * n), prior, prior, doubt, bool(described))
+
+    @property
+    def masses(self) -> np.ndarray:
+        """Most probable standard parameters (n, 10); their gravity torques are right, single parameters are not."""
+        return self._masses(self.values)
+
+    def _masses(self, values: np.ndarray) -> np.ndarray:
+        n = self.chain.n
+        described = np.asarray(self.chain.inertias)
+        result = described * np.exp(values[:n, None])
+        result[:, 6:9] += described[:, 9:] * values[n:].reshape(n, 3)
+        return result
+
+    def change_from(self, earlier: "MassFactors") -> float:
+        """Return the largest change of the unknowns since an earlier step, in standard deviations of the posterior."""
+        return float(np.max(np.abs(self.values - earlier.values) / np.sqrt(np.diag(self.covariance))))
+
+    def blocks(self, measured: Sequence[PoseMeasurements], masses: np.ndarray) -> list[PoseMeasurements]:
+        """Return blocks with the torques of other masses."""
+        chain = replace(self.chain, inertias=masses)
+        return [with_stated_load(chain, block) for block in measured]
+
+    def step(self, fit: GeometricFit, measured: Sequence[PoseMeasurements]) -> "MassFactors":
+        """Return the unknowns after one Gauss–Newton step.
+
+        Args:
+            fit: a fit with compliance by torques of the present masses.
+            measured: the fitted blocks, with the torques of these masses.
+        """
+        residual, by_masses, by_fit = self._derivatives(fit, measured)
+        slope = -fit.estimate.covariance @ by_fit.T @ by_masses
+        precision = np.linalg.inv(self.prior)
+        information = by_masses.T @ by_masses + by_masses.T @ by_fit @ slope + precision
+        covariance = np.linalg.inv(0.5 * (information + information.T))
+        change = covariance @ (by_masses.T @ residual - precision @ self.values)
+        n = self.chain.n
+        change *= min(1.0, MAX_STEP / float(np.max(np.abs(change[:n]))))
+        doubt = self._doubt(fit, measured, slope, covariance)
+        return replace(self, values=self.values + change, covariance=covariance, doubt=doubt)
+
+    def _derivatives(
+        self, fit: GeometricFit, measured: Sequence[PoseMeasurements]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return whitened residuals (N,), and their derivatives by the unknowns (N, 4 n) and by the fit's parameters.
+
+        Args:
+            fit, measured: arguments of `step`.
+        """
+        noise = fit.estimate.residual_std
+        residual, by_fit = fit.whitened_rows(fit.cell, fit.blocks, fit.free)
+        columns = []
+        for number, variance in enumerate(np.diag(self.prior)):
+            difference = DIFFERENCE * np.sqrt(variance)
+            values = self.values.copy()
+            values[number] += difference
+            masses = self._masses(values)
+            cell = _of_masses(fit.cell, masses)
+            blocks = prepare(cell, self.blocks(measured, masses))
+            changed, _ = fit.whitened_rows(cell, blocks, fit.free[:0])
+            columns.append((residual - changed) / difference)
+        return residual / noise, np.stack(columns, axis=1) / noise, by_fit / noise
+
+    def _doubt(
+        self, fit: GeometricFit, measured: Sequence[PoseMeasurements], slope: np.ndarray, covariance: np.ndarray
+    ) -> float:
+        """Return the standard deviation of the deflection by a load at the fitted poses, as a share of it.
+
+        Args:
+            fit, measured: arguments of `step`.
+            slope: (f, 4 n) change of the fit's parameters per unknown.
+            covariance: (4 n, 4 n) posterior covariance of the unknowns.
+        """
+        cell = fit.cell
+        chain = cell.chain
+        elements = {name: number for number, name in enumerate(chain.names)}
+        numbers = layout(cell).index("deflection").tolist()
+        compliance = np.zeros(len(chain.elements))
+        slopes = np.zeros((len(chain.elements), len(self.values)))
+        for position, parameter in enumerate(fit.free.tolist()):
+            if parameter not in numbers:
+                continue
+            number = numbers.index(parameter)
+            term = cell.deflection.terms[number]
+            if term.basis in BY_TORQUE:
+                compliance[elements[term.element]] += np.asarray(cell.deflection.coefficients)[number]
+                slopes[elements[term.element]] += slope[position]
+        total, doubtful = 0.0, 0.0
+        for block in measured:
+            load = np.tile(carried_load(chain, np.array([[1.0, 0.0, 0.0, 0.0]])), (len(block), 1))
+            motions = load_motions(cell, replace(block, load=load))
+            total += float(np.sum(np.einsum("k,kim->im", compliance, motions) ** 2))
+            by_unknown = np.einsum("ku,kim->uim", slopes, motions).reshape(len(self.values), -1)
+            doubtful += float(np.sum((covariance @ by_unknown) * by_unknown))
+        return float(np.sqrt(doubtful / max(total, 1e-300)))
+
+    def findings(self) -> list[Finding]:
+        """Return a finding if the masses together differ from those of the description."""
+        if not self.described:
+            return []
+        described = np.asarray(self.chain.inertias)[:, 9]
+        masses = self.masses[:, 9]
+        factor = float(masses.sum() / described.sum())
+        shares = masses / masses.sum()
+        n = self.chain.n
+        sigma = float(np.sqrt(shares @ self.covariance[:n, :n] @ shares))
+        if abs(np.log(factor)) < MIN_SIGMAS * sigma:
+            return []
+        return [finding("masses-scaled", factor=factor, sigma=factor * sigma)]
+
+
+def several_loads(measured: Sequence[PoseMeasurements]) -> bool:
+    """Return whether poses were measured under several stated loads."""
+    return any(block.payload is not None for block in measured) and len(load_masses(measured)) > 1
+
+
+def _of_masses(cell: Installation, masses: np.ndarray) -> Installation:
+    """Return an installation whose compliance is driven by other masses (n, 10)."""
+    reference = cell.deflection.reference
+    assert reference is not None
+    deflection = replace(cell.deflection, reference=replace(reference, inertias=masses))
+    return replace(cell, deflection=deflection)

@@ -1,0 +1,91 @@
+"""Compliance from poses under two stated loads, without torques, with wrong or no masses; the arm is Pinocchio's."""
+
+import re
+
+import numpy as np
+import pytest
+from loaded_arm import HEAD, GivingArm, urdf
+
+import calib
+from calib.geometry.static_torques.load_errors import DESCRIBED
+from calib.procedure.kinematic_stage.folder import FitFolder
+from calib.procedure.kinematic_stage.inputs import gather
+
+COLUMNS = [*HEAD[:10], "payload [kg]"]
+# noise of a position, all axes [m]
+NOISE = np.sqrt(3.0) * 1e-4
+
+
+def description(factor: float, own: float = 0.0) -> str:
+    """Return the arm with all masses times a factor, and each times one of its own; without masses for factor 0."""
+    random = np.random.default_rng(7)
+    if not factor:
+        return urdf()
+    return re.sub(
+        r'mass value="([\d.]+)"',
+        lambda mass: f'mass value="{float(mass[1]) * factor * np.exp(own * random.normal()):.6g}"',
+        urdf(True),
+    )
+
+
+def fitted(path, factor, own=0.0, seed=3, loads=(0.0, 2.5)):
+    """Return a fit to poses under loads, validated with 5 kg."""
+    arm = GivingArm(seed=seed)
+    (path / "arm.urdf").write_text(description(factor, own))
+    tables = {"fit": np.concatenate([loaded(arm, 60, number, load) for number, load in enumerate(loads)])}
+    tables["unseen"] = loaded(arm, 80, 9, 5.0)
+    for name, table in tables.items():
+        arm.write(path / f"{name}.csv", table, COLUMNS)
+    return calib.fit_geometry(path / "arm.urdf", path / "fit.csv", validate=path / "unseen.csv")
+
+
+def loaded(arm, count, seed, load):
+    """Return rows of positions alone, and of the load that the tip carries."""
+    table = arm.table(count, seed, load, (0.0, 0.0, 0.0))[:, :10]
+    return np.column_stack([table, np.full(count, load)])
+
+
+def codes(fit):
+    return {finding.code: finding.values for finding in fit.assessment.noticed}
+
+
+def test_masses_described_2_5_times_too_large_are_seen_and_the_unseen_load_is_predicted(tmp_path):
+    """With the described masses the error was twice the noise, and nothing was said."""
+    fit = fitted(tmp_path, 2.5)
+    (rows,) = fit.validation.values()
+    assert rows.errors[1].rms < 1.3 * NOISE
+    assert rows.intervals.covered >= 0.9
+    assert np.median(rows.intervals.radius) < 4.0 * NOISE
+    scaled = codes(fit)["masses-scaled"]
+    assert abs(scaled["factor"] - 1.0 / 2.5) < 3.0 * scaled["sigma"]
+    assert codes(fit)["torques-used"]["source"] == "of masses that the stated loads tell"
+    folder = FitFolder(fit.save(tmp_path / "saved", plots=False))
+    assert folder.findings().discrepancy.mass_doubt == fit.expected.discrepancy.mass_doubt
+    driven = folder.driven(gather(tmp_path / "arm.urdf", [tmp_path / "fit.csv"]))
+    assert np.allclose(driven.fit[0].torque, fit.inputs.fit[0].torque)
+
+
+def test_right_masses_are_kept(tmp_path):
+    fit = fitted(tmp_path, 1.0)
+    (rows,) = fit.validation.values()
+    assert rows.errors[1].rms < 1.3 * NOISE
+    assert "masses-scaled" not in codes(fit)
+
+
+def test_under_one_load_the_doubt_of_the_masses_remains(tmp_path):
+    """One load tells the product of compliance and masses alone: the interval is that of the prior."""
+    fit = fitted(tmp_path, 1.4, loads=(2.5,))
+    assert fit.expected.discrepancy.mass_doubt == DESCRIBED
+    assert "masses-scaled" not in codes(fit)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("factor", "own"), [(2.5, 0.0), (0.4, 0.0), (1.0, 0.3), (2.5, 0.3), (0.0, 0.0)])
+def test_an_unseen_load_is_predicted_for_any_described_masses(tmp_path, factor, own, seed):
+    """Of one factor, one of each body, or none described: 5 kg are predicted from 0 and 2.5 kg, and intervals hold."""
+    fit = fitted(tmp_path, factor, own, seed)
+    (rows,) = fit.validation.values()
+    assert rows.errors[1].rms < 1.5 * NOISE
+    assert rows.intervals.covered >= 0.9
+    assert fit.expected.discrepancy.mass_doubt < 0.1
