@@ -5,10 +5,13 @@ reason, where the folder is absent.
 """
 
 import gc
+import os
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import compiling
 import loaded as processes
 import produced
 import pytest
@@ -65,6 +68,13 @@ def _one_blas_thread() -> Iterator[None]:
     """Limit BLAS for tests that call what stands behind the API, as the API does."""
     with one_blas_thread():
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _kernels_are_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Two workers that want a kernel at the same time would both compile it, for up to ten seconds."""
+    if "PYTEST_XDIST_WORKER" in os.environ and sys.platform != "win32":
+        compiling.take_turns(tmp_path_factory.getbasetemp().parent / "compiling.lock")
 
 
 def pytest_collection_finish() -> None:
