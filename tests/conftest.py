@@ -15,6 +15,7 @@ import compiling
 import loaded as processes
 import produced
 import pytest
+import typesetting
 from hypothesis import HealthCheck, settings
 from recordings import DATA
 
@@ -68,6 +69,12 @@ def _one_blas_thread() -> Iterator[None]:
     """Limit BLAS for tests that call what stands behind the API, as the API does."""
     with one_blas_thread():
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _certificates_are_typeset_once() -> None:
+    """Tests that read a PDF ask for `typesetting.each_typeset`."""
+    typesetting.spare()
 
 
 @pytest.fixture(scope="session", autouse=True)
