@@ -25,7 +25,7 @@ PLANT = known_robots.plant("tx40", coupled=True)
 MODEL = known_robots.model(PLANT)
 BASE = bases.find(MODEL)
 INERTIA = np.array(known_robots.truth("tx40")["drives"]["Ia"])
-SECONDS = 2.0  # of motion [s]
+SECONDS = 4.0  # of motion [s]
 ASKED = {
     "three bounds that bind": {"bounds": {"Fv1": (8.3, np.inf), "ZZ1R": (1.4, np.inf), "Fc4": (-np.inf, 2.2)}},
     "inertias pulled below zero, M(q) > 0 in 50 postures": {

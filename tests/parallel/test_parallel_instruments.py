@@ -63,7 +63,7 @@ def away(found, name: str) -> np.ndarray:
 @pytest.mark.slow  # the simulation's kernel takes 14 s to compile
 def test_instruments_cure_bias_of_the_loop():
     """DualV, 0.7 mrad of noise in the loop: least squares is beyond 5 σ, with instruments 95 % of 28 are in 2 σ."""
-    recordings, robot = logs("dualv", 1000.0, 8.0, 7e-4, 3.0), find("dualv")
+    recordings, robot = logs("dualv", 1000.0, 8.0, 7e-4, 6.0), find("dualv")
     for method, beyond in (("wls", True), ("iv", False), ("didim", False)):
         found = identify_parallel(robot, recordings, options=options(method, 1000.0, 8.0, 60.0))
         errors = np.abs(away(found, "dualv"))
