@@ -5,13 +5,17 @@ reason, where the folder is absent.
 """
 
 import gc
+import os
 import signal
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+import compiling
 import loaded as processes
 import produced
 import pytest
+import typesetting
 from hypothesis import HealthCheck, settings
 from recordings import DATA
 
@@ -70,6 +74,19 @@ def _one_blas_thread() -> Iterator[None]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put long tests first: one that begins last keeps the other workers waiting."""
     items.sort(key=lambda item: item.get_closest_marker("long") is None)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _certificates_are_typeset_once() -> None:
+    """Tests that read a PDF ask for `typesetting.each_typeset`."""
+    typesetting.spare()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _kernels_are_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Two workers that want a kernel at the same time would both compile it, for up to ten seconds."""
+    if "PYTEST_XDIST_WORKER" in os.environ and sys.platform != "win32":
+        compiling.take_turns(tmp_path_factory.getbasetemp().parent / "compiling.lock")
 
 
 def pytest_collection_finish() -> None:

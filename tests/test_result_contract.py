@@ -101,6 +101,8 @@ def command(verb: str, folder: Path, files: Path, out: Path) -> list[str]:
     """Return the command line of a verb for a folder."""
     measured = files / ("parallel.csv" if "parallel" in folder.name else "measured.csv")
     waypoints = files / ("platform.csv" if "parallel" in folder.name else "waypoints.csv")
+    # rows that are held out spare the cross-validation, and one model the ladder
+    model = [] if "parallel" in folder.name else ["--model", "frames"]
     planned = [folder, "--waypoints", waypoints, "--limits", files / "limits.toml", "--out", out / "plan"]
     arguments: dict[str, list[str | Path]] = {
         "view": [folder, "--save", out / "a.rrd"],
@@ -121,7 +123,7 @@ def command(verb: str, folder: Path, files: Path, out: Path) -> list[str]:
         "identify": [folder, files / "a.npz", "--out", out / "model", "--no-plots"],
         "select": [folder, "-m", "12", "--candidates", "40", "--out", out / "poses.csv", "--no-plots"],
         "plan": planned,
-        "fit": [folder, measured, "--out", out / "fit", "--no-plots"],
+        "fit": [folder, measured, "--holdout", "0.25", *model, "--out", out / "fit", "--no-plots"],
     }
     if verb == "recall":
         arguments[verb] += ["--out", out / "recalled.csv"]

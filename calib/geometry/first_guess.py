@@ -194,7 +194,7 @@ def _by_displacements(arm: np.ndarray, measured: np.ndarray) -> Placements:
     for _ in range(PLACING_ROUNDS):
         position = arm[:, :3, 3] + arm[:, :3, :3] @ offset
         motions = np.concatenate([position - position.mean(axis=0), LEVER * arm_turns])
-        rotation = Rotation.align_vectors(measured_motions, motions)[0].as_matrix()
+        rotation = orthonormal(measured_motions.T @ motions)
         station, offset = _translations(arm, measured_position, rotation)
     return pose(rotation, station), pose((rotation @ arm_mean).T @ measured_mean, offset)
 
@@ -560,11 +560,12 @@ def _align(points: np.ndarray, measured: np.ndarray) -> np.ndarray:
     for _ in range(2):
         mean = points[trusted].mean(axis=0)
         measured_mean = measured[trusted].mean(axis=0)
-        alignment = Rotation.align_vectors(measured[trusted] - measured_mean, points[trusted] - mean)
-        matrix = alignment[0].as_matrix()
+        matrix = orthonormal((measured[trusted] - measured_mean).T @ (points[trusted] - mean))
         placement = pose(matrix, measured_mean - matrix @ mean)
         error = np.linalg.norm(measured - points @ matrix.T - placement[:3, 3], axis=1)
-        trusted = error <= max(np.quantile(error, TRUSTED_SHARE), 1e-12)
+        # the largest error below the quantile, which selects the same rows
+        last = int(TRUSTED_SHARE * (len(error) - 1))
+        trusted = error <= max(np.partition(error, last)[last], 1e-12)
         if trusted.sum() < MIN_TRUSTED:
             break
     return placement

@@ -65,9 +65,18 @@ def _likeliest_period(t: np.ndarray) -> float:
     median = float(np.median(np.diff(t)))
     compared = t[: max(len(t[:MAX_TRIED]) // VOTES, 1) * VOTES]
     runs = compared.reshape(-1, min(VOTES, len(compared)))
-    periods = median * (1.0 + np.linspace(-MAX_PERIOD_ERROR, MAX_PERIOD_ERROR, PERIODS))
-    agreement = [float(np.abs(_directions(runs, period).mean(axis=1)).mean()) for period in periods]
-    return float(periods[int(np.argmax(agreement))])
+    # the length of a run's mean direction does not depend on the run's origin
+    since_first = runs - runs[:, :1]
+    highest, lowest = 1.0 / (1.0 - MAX_PERIOD_ERROR), 1.0 / (1.0 + MAX_PERIOD_ERROR)
+    frequencies = np.linspace(lowest, highest, PERIODS) / median
+    # the phases for one frequency after the other: from each to the next they turn by the same angles
+    directions = _directions(since_first, 1.0 / frequencies[0])
+    turn = _directions(since_first, 1.0 / (frequencies[1] - frequencies[0]))
+    agreement = []
+    for _ in frequencies:
+        agreement.append(float(np.abs(directions.mean(axis=1)).mean()))
+        directions *= turn
+    return float(1.0 / frequencies[int(np.argmax(agreement))])
 
 
 def _rounded(t: np.ndarray, period: float, drift_samples: int) -> tuple[np.ndarray, float]:

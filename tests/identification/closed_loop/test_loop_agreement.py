@@ -29,6 +29,7 @@ def times(factor: float) -> dict:
     return {"kp": tuple(factor * np.array(LOOP.kp)), "kd": tuple(factor * np.array(LOOP.kd))}
 
 
+@pytest.mark.slow  # the kernel of cloe takes 14 s to compile
 def test_wrong_gains_are_named_with_factor():
     """Of cloe every parameter is off by it; what instruments say of least squares there is not said."""
     found, test = judged("cloe", 1e-5, 0.05, **times(2.0))
@@ -41,6 +42,7 @@ def test_wrong_gains_are_named_with_factor():
     assert read_record(LoopDisagreement, asdict(found)) == found
 
 
+@pytest.mark.slow  # as above
 def test_velocity_formed_otherwise_is_named():
     """Half a period of it is inertia: the residuals of positions hold nothing of it."""
     found, test = judged("cloe", 1e-5, 0.02, reference_velocity="difference")
@@ -72,8 +74,7 @@ def test_right_loop_is_not_remarked_upon(name: str, noise: tuple[float, float]):
         assert "loop-gains-off" not in [one.code for one in test.findings(is_estimate=False)]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["iv", "didim"])
+@pytest.mark.parametrize("name", ["iv", pytest.param("didim", marks=pytest.mark.slow)])
 def test_robust_estimates_get_a_note(name: str):
     """Estimates that bear another loop come with a note."""
     found, test = judged(name, 1e-5, 0.05, **times(0.5))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from pypdf import PdfReader
 from sessions import begin, copy_of, edit, go_on, kinds
+from typesetting import each_typeset
 from without_figures import run
 
 from calib import cli
@@ -60,7 +61,8 @@ def recorded_folder(waiting_folder: Path, tmp_path_factory: pytest.TempPathFacto
 def whole_folder(recorded_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("whole") / "cell"
     shutil.copytree(recorded_folder, folder)
-    assert go_on(open_session(folder), plots=True) is None
+    with each_typeset():
+        assert go_on(open_session(folder), plots=True) is None
     return folder
 
 
