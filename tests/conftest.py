@@ -15,7 +15,6 @@ import compiling
 import loaded as processes
 import produced
 import pytest
-import typesetting
 from hypothesis import HealthCheck, settings
 from recordings import DATA
 
@@ -74,12 +73,6 @@ def _one_blas_thread() -> Iterator[None]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put long tests first: one that begins last keeps the other workers waiting."""
     items.sort(key=lambda item: item.get_closest_marker("long") is None)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _certificates_are_typeset_once() -> None:
-    """Tests that read a PDF ask for `typesetting.each_typeset`."""
-    typesetting.spare()
 
 
 @pytest.fixture(scope="session", autouse=True)

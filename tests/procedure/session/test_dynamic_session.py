@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from pypdf import PdfReader
 from sessions import begin, copy_of, edit, go_on, kinds
-from typesetting import each_typeset
 from without_figures import run
 
 from calib import cli
@@ -61,8 +60,7 @@ def recorded_folder(waiting_folder: Path, tmp_path_factory: pytest.TempPathFacto
 def whole_folder(recorded_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("whole") / "cell"
     shutil.copytree(recorded_folder, folder)
-    with each_typeset():
-        assert go_on(open_session(folder), plots=True) is None
+    assert go_on(open_session(folder), plots=True) is None
     return folder
 
 

@@ -15,7 +15,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 from pypdf import PdfReader
 from sessions import edit, go_on
-from typesetting import each_typeset
 from without_figures import run
 
 from calib.errors import CalibError
@@ -92,8 +91,7 @@ def test_certificate_states_the_numbers(finished: Session) -> None:
     """The certificate states the numbers of the data on four pages."""
     edit(finished.path("session.toml"), 'robot_serial = ""', 'robot_serial = "SN 4711"')
     edit(finished.path("session.toml"), "tolerance_mm = 0.0", "tolerance_mm = 0.3")
-    with each_typeset():
-        assert go_on(finished, plots=True) is None
+    assert go_on(finished, plots=True) is None
     document = PdfReader(finished.path("certificate.pdf"))
     assert len(document.pages) <= 4
     text = " ".join(" ".join(one.extract_text() for one in document.pages).split())

@@ -3,7 +3,6 @@
 import io
 import os
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from html.parser import HTMLParser
 from io import StringIO
@@ -11,7 +10,6 @@ from io import StringIO
 import pytest
 from pypdf import PdfReader
 from rich.console import Console
-from typesetting import each_typeset
 
 from calib.procedure.answers import MAX_LETTERS, CertificateSection
 from calib.procedure.findings import PREDICTION_ONLY
@@ -34,12 +32,6 @@ from calib.procedure.report.page import KeyFigure, Picture, Pictures, ReportTabl
 HOSTILE = "[bold]<script>alert(1)</script> & \"quoted\" 'one'[/]"
 ROWS = [(HOSTILE,), ("nominal", "1.5"), ("calibrated", "0.25")]
 TABLE = ReportTable("Errors", ("arm", "rms"), ROWS, "how to read", frozenset({2}), (1,))
-
-
-@pytest.fixture(autouse=True)
-def _is_typeset() -> Iterator[None]:
-    with each_typeset():
-        yield
 
 
 class Reader(HTMLParser):
