@@ -350,9 +350,11 @@ class Trial:
 def report(motions: list[Motion], trials: list[Trial]) -> Metrics:
     """Return the metrics of all seeds."""
     first = trials[0]
+    truth = {name: float(first.truth[name]) for name in NINE}
+    counts = {"idim": first.idim.identification.base.b, "pim": first.pim.identification.base.b}
     return {
-        "truth": {name: float(first.truth[name]) for name in NINE},
-        "base_parameters": {"idim": first.idim.identification.base.b, "pim": first.pim.identification.base.b},
+        "truth": truth,
+        "base_parameters": counts,
         "inertial_base_parameters": first.inertial,
         "designs": [motion.reached for motion in motions],
         "runs": [trial.metrics() for trial in trials],

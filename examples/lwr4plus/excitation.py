@@ -466,13 +466,14 @@ def study(
     _, base = arm.observed
     columns = table_4(base)
     error = 100.0 * np.abs(arm.base_values[columns] / truth().base_values[columns] - 1.0)
+    estimate_error = {"median": float(np.median(error)), "largest": float(error.max())}
     metrics = {
         "seed": seed,
         "seeds": seeds,
         "columns": base.b,
         "period": PERIOD,
         "seconds": SECONDS,
-        "estimate_off_percent": {"median": float(np.median(error)), "largest": float(error.max())},
+        "estimate_off_percent": estimate_error,
         "motions": rows,
         "compared": {name: summary_of(runs, rows[REFERENCE]) for name, runs in rows.items()},
         "geometries": geometries(arm, motions, seed),
@@ -498,7 +499,9 @@ def summary_of(runs: list[Metrics], reference: list[Metrics]) -> Metrics:
         "peak": _spread([run["peak"] for run in runs]),
     }
     for key in FITS:
-        summary[key] = fit_summary([run[key] for run in runs], [run[key] for run in reference])
+        fits = [run[key] for run in runs]
+        reference_fits = [run[key] for run in reference]
+        summary[key] = fit_summary(fits, reference_fits)
     return summary
 
 
@@ -509,7 +512,9 @@ def fit_summary(fits: list[Metrics], reference: list[Metrics]) -> Metrics:
         fits: metrics of a motion's fits by seed.
         reference: metrics of the reference's fits by seed.
     """
-    summary: Metrics = {figure: _spread([fit[figure] for fit in fits]) for figure in FIGURES}
+    summary: Metrics = {}
+    for figure in FIGURES:
+        summary[figure] = _spread([fit[figure] for fit in fits])
     reference_rsd = np.median([fit["median_rsd"] for fit in reference])
     summary["ratio"] = _spread([fit["median_rsd"] / reference_rsd for fit in fits])
     for figure in ("size", "separation"):

@@ -196,9 +196,14 @@ def summary_of(rows: list[dict[str, dict[str, float]]]) -> dict[str, dict[str, f
     """Return medians over the paths, and the worst peak, of every model."""
     summary = {}
     for name, first in rows[0].items():
-        medians = {key: float(np.median([row[name][key] for row in rows])) for key in first}
-        summary[name] = medians | {"worst_peak": max(row[name]["peak"] for row in rows)}
+        plans = [row[name] for row in rows]
+        summary[name] = {key: _median(plans, key) for key in first}
+        summary[name]["worst_peak"] = max(plan["peak"] for plan in plans)
     return summary
+
+
+def _median(plans: list[dict[str, float]], key: str) -> float:
+    return float(np.median([plan[key] for plan in plans]))
 
 
 def run(paths: int, seed: int) -> dict[str, Any]:
