@@ -193,9 +193,9 @@ def compare(expected: list[str], printed: list[str], tolerance: float = TOLERANC
 
 def _same_words(line: str, printed: list[str]) -> str | None:
     """Return the first printed line that has the words of a line; None without one."""
-    words = _words(line)
+    expected_words = _words(line)
     for candidate in printed:
-        if _words(candidate) == words:
+        if _words(candidate) == expected_words:
             return candidate
     return None
 

@@ -9,7 +9,7 @@ import calib
 
 practice.enter(__file__)
 
-# a tracker sees one reflector at a time: three of them on the tool tell its orientation, too
+# a tracker sees one reflector at a time: three of them on the tool show its orientation, too
 reflectors = ((0.05, 0.0, 0.1), (-0.05, 0.0, 0.1), (0.0, 0.05, 0.15))
 settings = calib.SelectionSettings(kind="position", tools=reflectors, index="O1", candidates=500)
 plan = calib.select_poses("ur5", 20, settings)

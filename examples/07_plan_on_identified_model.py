@@ -17,8 +17,9 @@ Path("waypoints.csv").write_text("""q1,q2,q3,q4,q5,q6
 0.4,0.2,1.5,-0.5,0.2,-0.6
 """)
 
-makers = calib.plan_motion("tx40", "waypoints.csv")
+nominal_motion = calib.plan_motion("tx40", "waypoints.csv")
 model = calib.identify_dynamics("tx40", "training.csv", friction="standard")
 motion = calib.plan_motion("tx40", "waypoints.csv", model=model)
-print(f"on the maker's model: {makers.duration:.3f} s\non the identified model: {motion.duration:.3f} s")
+print(f"on the maker's model: {nominal_motion.duration:.3f} s")
+print(f"on the identified model: {motion.duration:.3f} s")
 motion.save("motion")  # motion.csv, trajectory.yaml for ROS 2, plots

@@ -178,7 +178,7 @@ def _errors(files: Prepared, predictions: list[Prediction], moving: bool = False
     """Return the relative errors [%] of predictions of a pair's test files: total, and joint by joint."""
     errors, sizes = squared_errors(files.test, predictions, moving)
     joints = 100.0 * np.sqrt(errors / sizes)
-    alike = ~np.isin(np.arange(len(errors)), files.apart)
+    alike = ~np.isin(np.arange(len(errors)), files.other_unit)
     total = 100.0 * np.sqrt(errors[alike].sum() / sizes[alike].sum())
     return {"total": float(total), "joints": joints.tolist()}
 
@@ -297,8 +297,8 @@ def results(pairs: list[Pair], folder: Path, jobs: int) -> Iterator[dict]:
 
 def write_between_marks(document: Path, lines: list[str]) -> None:
     """Replace what stands between the two marks of a document."""
-    text_before, _, rest = document.read_text().partition(MARK)
-    text_after = rest.partition(MARK)[2]
+    text_before, _, marked = document.read_text().partition(MARK)
+    text_after = marked.partition(MARK)[2]
     table = "\n".join(lines)
     document.write_text(f"{text_before}{MARK}\n{table}\n{MARK}{text_after}")
 

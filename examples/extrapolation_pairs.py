@@ -30,7 +30,7 @@ class Prepared:
         masses: whether the URDF has them.
         payload: carried in the test.
         joints: that were recorded, where the description has others.
-        apart: joints in another unit, which no total holds; from 0.
+        other_unit: joints in another unit, which no total holds; from 0.
     """
 
     robot: Path
@@ -40,7 +40,7 @@ class Prepared:
     masses: bool = False
     payload: dict | None = None
     joints: tuple[str, ...] = ()
-    apart: tuple[int, ...] = ()
+    other_unit: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ def _open(
         test_files = _write_parts(robot, parts[1], folder / "test")
         masses = "<mass" in urdf.read_text()
         if robot == "TIAGo":
-            return Prepared(urdf, train_files, test_files, options, masses, joints=TIAGO_JOINTS, apart=(0,))
+            return Prepared(urdf, train_files, test_files, options, masses, joints=TIAGO_JOINTS, other_unit=(0,))
         return Prepared(urdf, train_files, test_files, options, masses)
 
     return Pair(f"{robot}, {title}", across, prepare, quick)
@@ -292,7 +292,7 @@ class Simulated:
         family: of friction.
         train, test: motion, its seconds, and settings of it.
         rate: of the log [Hz].
-        coupled, stated: the last motor turns with the last two joints; the options say so.
+        coupled, coupling_stated: the last motor turns with the last two joints; the options say so.
         payload: the test is with one.
         cold: the training begins cold, the test is warm.
     """
@@ -307,7 +307,7 @@ class Simulated:
     behind: bool = False
     rate: float = 200.0
     coupled: bool = False
-    stated: bool = True
+    coupling_stated: bool = True
     payload: bool = False
     cold: bool = False
     quick: bool = False
@@ -343,7 +343,7 @@ class Simulated:
     def _options(self) -> str:
         """Return the text of the options file: coupling and payload, where they are stated."""
         options = ""
-        if self.coupled and self.stated:
+        if self.coupled and self.coupling_stated:
             options += WRIST
         if self.payload:
             options += f"[payload.tool]\nmass = {PAYLOAD['mass']}\ncom = {PAYLOAD['com']}\n"
@@ -455,7 +455,7 @@ SIMULATED_MOTORS = [
         rich(10),
         False,
         coupled=True,
-        stated=False,
+        coupling_stated=False,
         quick=True,
     ),
     Simulated(
@@ -466,7 +466,7 @@ SIMULATED_MOTORS = [
         FAST,
         True,
         coupled=True,
-        stated=False,
+        coupling_stated=False,
     ),
     Simulated("TX40, each joint alone → all", "tx40", "simple", (each_alone, 24.0, {}), rich(10), True, coupled=True),
     Simulated("TX40, one sinusoid → fast with payload", "tx40", "lugre", POOR, FAST, True, coupled=True, payload=True),

@@ -25,6 +25,7 @@ ENCODER_NOISE = 2e-5  # [rad]
 SENSED_FRICTION = 0.05  # share of the friction that sensors behind the gears see
 MASS_ERROR = 0.06  # of the description, relative, 1 sigma
 CENTRE_ERROR = 8e-3  # of the description's centres of mass, 1 sigma [m]
+MAX_JOINT = 2.8  # positions in use [rad]
 UPPER_TRIANGLE = np.triu_indices(3)  # XX XY XZ YY YZ ZZ of an inertia tensor
 WARM = 1e9  # seconds in motion after which friction has its warm level
 PAYLOAD = {"mass": 2.0, "com": [0.02, -0.03, 0.08]}
@@ -55,16 +56,20 @@ def _number(text: str | float) -> float:
 def arm(name: str) -> Arm:
     """Return an arm of the library; without known masses its bodies are rods."""
     rows = tomllib.loads((LIBRARY / f"{name}.toml").read_text())["joint"]
-    mdh = np.array([[_number(row.get(key, 0.0)) for key in ("alpha", "d", "theta", "r")] for row in rows])
-    lower = np.array([_number(row["lower"]) for row in rows])
-    upper = np.array([_number(row["upper"]) for row in rows])
-    velocity = np.array([_number(row["velocity"]) for row in rows])
-    effort = np.array([_number(row["effort"]) for row in rows])
+
+    def column(key: str) -> np.ndarray:
+        return np.array([_number(row[key]) for row in rows])
+
+    mdh = np.zeros((len(rows), 4))
+    for k, row in enumerate(rows):
+        mdh[k] = [_number(row.get(key, 0.0)) for key in ("alpha", "d", "theta", "r")]
     if "inertia" in rows[0]:
         inertias = np.array([row["inertia"] for row in rows])
     else:
         inertias = _rods(mdh)
-    return Arm(mdh, inertias, np.clip(lower, -2.8, 2.8), np.clip(upper, -2.8, 2.8), velocity, effort)
+    lower = np.clip(column("lower"), -MAX_JOINT, MAX_JOINT)
+    upper = np.clip(column("upper"), -MAX_JOINT, MAX_JOINT)
+    return Arm(mdh, inertias, lower, upper, column("velocity"), column("effort"))
 
 
 def _rods(mdh: np.ndarray) -> np.ndarray:
@@ -243,27 +248,35 @@ def friction(
 
     Args:
         family: one of `FAMILIES`.
+        robot: the arm, its limits.
+        t: (N,) instants [s].
+        q, v: (N, n) positions [rad] and velocities [rad/s].
+        rng: draws the arm's coefficients.
         cold: since when the arm has moved [s].
     """
     n = len(robot.mdh)
     coulomb = 0.06 * robot.effort * np.exp(0.3 * rng.standard_normal(n))
     viscous = 0.05 * robot.effort / robot.velocity * np.exp(0.3 * rng.standard_normal(n))
+    sign = np.tanh(v / 2e-3)
+    steady = coulomb * sign + viscous * v
     slow = np.exp(-(np.abs(v / 0.05) ** 0.7))  # Stribeck's exponent is neither 1 nor 2
-    steady = coulomb * np.tanh(v / 2e-3) + viscous * v
     match family:
         case "simple":
             return steady
         case "stribeck":
-            return coulomb * np.tanh(v / 2e-3) * (1 + 0.6 * slow) + viscous * np.sign(v) * np.abs(v) ** 0.6
+            viscous_torque = viscous * np.sign(v) * np.abs(v) ** 0.6
+            return coulomb * sign * (1 + 0.6 * slow) + viscous_torque
         case "lugre":
             return _lugre(v, coulomb * (1 + 0.5 * slow), coulomb / 3e-3) + viscous * v
         case "warming":
-            return (1 + 0.5 * np.exp(-(cold + t[:, None]) / 60.0)) * steady
+            cooling = np.exp(-(cold + t[:, None]) / 60.0)
+            return (1 + 0.5 * cooling) * steady
         case "asymmetric":
             return np.where(v > 0, 1.25, 0.8) * steady + 0.15 * coulomb * np.cos(q)
         case "position":
             phase = rng.uniform(0, 2 * np.pi, (2, n))
-            return (1 + 0.3 * np.sin(q + phase[0]) + 0.15 * np.sin(3 * q + phase[1])) * steady
+            ripple = 1 + 0.3 * np.sin(q + phase[0]) + 0.15 * np.sin(3 * q + phase[1])
+            return ripple * steady
     raise ValueError(f"'{family}' is none of {', '.join(FAMILIES)}")
 
 

@@ -33,7 +33,7 @@ from calib.robot.calibrated import as_calibrated
 from calib.simulation.known_robots import random_fourier
 from calib.simulation.truth import true_base
 from calib.simulation.unmodelled import TorqueErrors
-from calib.simulation.virtual_arm import MovingArm, moving_arm, record
+from calib.simulation.virtual_arm import UNMODELLED, MovingArm, moving_arm, record
 from calib.simulation.virtual_cells import virtual_cell
 
 DATA = Path(os.environ.get("CALIB_DATA", "../shared/data"))
@@ -197,14 +197,11 @@ def print_positions(chosen: Sequence[str] = ()) -> None:
 
 def joined(parts: Sequence[TorqueIntervals]) -> TorqueIntervals:
     """Return the intervals of several recordings as those of one."""
-    return TorqueIntervals(
-        index=np.concatenate([part.index for part in parts]),
-        sigma=np.concatenate([part.sigma for part in parts]),
-        contains=np.concatenate([part.contains for part in parts]),
-        valid=np.concatenate([part.valid for part in parts]),
-        standing=np.concatenate([part.standing for part in parts]),
-        extrapolated=np.concatenate([part.extrapolated for part in parts], axis=1),
-    )
+    by_sample = {}
+    for name in ("index", "sigma", "contains", "valid", "standing"):
+        by_sample[name] = np.concatenate([getattr(part, name) for part in parts])
+    extrapolated = np.concatenate([part.extrapolated for part in parts], axis=1)
+    return TorqueIntervals(**by_sample, extrapolated=extrapolated)
 
 
 def torque_row(name: str, split: str, model: calib.DynamicsModel) -> str:
@@ -299,7 +296,7 @@ def print_parameters(seeds: int = SEEDS) -> None:
     print("| simulated LWR4+ | identifications | within 1.96 σ | bodies | Ia | Fv | Fc | offsets |")
     print("|---|---|---|---|---|---|---|---|", flush=True)
     cell = virtual_cell("lwr4plus")
-    for name, unmodelled in (("model exact", TorqueErrors()), ("effects that no parameter holds", None)):
+    for name, unmodelled in (("model exact", TorqueErrors()), ("effects that no parameter holds", UNMODELLED)):
         arm = moving_arm(cell, "lwr4plus", unmodelled=unmodelled)
         inside = defaultdict(list)
         for seed in range(seeds):

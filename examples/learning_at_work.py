@@ -122,11 +122,11 @@ def reference_models(identification: Identification) -> dict[str, Dynamics]:
 
 def minimum_norm(w: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Return the least squares solution (p,) of w x = y of minimum norm, w (rows, p) with columns of unit norm."""
-    left, singular, right = np.linalg.svd(w, full_matrices=False)
+    u, singular, vt = np.linalg.svd(w, full_matrices=False)
     identifiable = singular > IDENTIFIABLE * singular[0]
     inverse = np.zeros_like(singular)
     inverse[identifiable] = 1.0 / singular[identifiable]
-    return right.T @ (left.T @ y * inverse)
+    return vt.T @ (u.T @ y * inverse)
 
 
 def ridge(w: np.ndarray, y: np.ndarray, samples: int) -> np.ndarray:
@@ -137,8 +137,8 @@ def ridge(w: np.ndarray, y: np.ndarray, samples: int) -> np.ndarray:
         y: (rows,).
         samples: number of samples that the rows stand for.
     """
-    left, singular, right = np.linalg.svd(w, full_matrices=False)
-    target = left.T @ y
+    u, singular, vt = np.linalg.svd(w, full_matrices=False)
+    target = u.T @ y
     squares = float(y @ y)
     best_evidence = -np.inf
     best_denominator = np.full_like(singular, np.inf)
@@ -150,7 +150,7 @@ def ridge(w: np.ndarray, y: np.ndarray, samples: int) -> np.ndarray:
         if evidence > best_evidence:
             best_evidence = evidence
             best_denominator = denominator
-    return right.T @ (singular * target / best_denominator)
+    return vt.T @ (singular * target / best_denominator)
 
 
 def mixed(identification: Identification, std: np.ndarray, norms: np.ndarray) -> np.ndarray:

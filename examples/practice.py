@@ -156,12 +156,12 @@ def moving(robot: str, load: bool = False) -> virtual_arm.MovingArm:
     return virtual_arm.carrying(arm, TOOL)
 
 
-def log(path: str, robot: str, motion: str, what: str = "torque", load: str = "") -> None:
+def log(path: str, robot: str, motion: str, quantity: str = "torque", load: str = "") -> None:
     """Log a motion of a robot: a design's folder, played twice, or the number of a random one of 10 s at 500 Hz.
 
     Args:
         path: CSV to write: time [s], positions [deg], and
-        what: motor torques (torque), torques of joint sensors (link), both, or motor currents (current).
+        quantity: motor torques (torque), torques of joint sensors (link), both, or motor currents (current).
         load: "load": with the load of `moving`.
     """
     arm = moving(robot, load == "load")
@@ -172,7 +172,7 @@ def log(path: str, robot: str, motion: str, what: str = "torque", load: str = ""
         reference = random_motion(arm, limits, seed=int(motion))
     noise_seed = sum(map(ord, path))
     recording = virtual_arm.record(arm, reference, noise_seed)
-    match what:
+    match quantity:
         case "both":
             write_log(recording, path)
         case "link":

@@ -99,10 +99,10 @@ def minimum(function: Callable[[float], float], low: float, high: float) -> floa
     return float(fminbound(function, low, high, xtol=1e-6))  # type: ignore[arg-type]
 
 
-def settings(row: Row, method: str = "wls", **more: Any) -> IdentifyOptions:
+def settings(row: Row, method: str = "wls", **keys: Any) -> IdentifyOptions:
     """Return the options of an identification: base parameters, standard friction, no prior."""
     plain = {"friction": "standard", "prior": "none", "essential": "none"}
-    return parse_options(plain | row.options | {"method": method} | more)
+    return parse_options(plain | row.options | {"method": method} | keys)
 
 
 def error(identification: Identification, values: np.ndarray, case: Case) -> float:
@@ -153,10 +153,10 @@ def series_estimate(identification: Identification, case: Case, series: SampledM
     return iv.values, f"{strength.cragg_donald:.2g} | {test.p:.2f} | {shift.max():.2f} σ"
 
 
-def estimate(row: Row, robot: Any, case: Case, method: str, **more: Any) -> np.ndarray | None:
+def estimate(row: Row, robot: Any, case: Case, method: str, **keys: Any) -> np.ndarray | None:
     """Return the estimate (b,) of a method; None where it failed, with the reason on the console."""
     try:
-        return identify(robot, [case], settings(row, method, **more).settings).fitted.estimate.values
+        return identify(robot, [case], settings(row, method, **keys).settings).fitted.estimate.values
     except calib.CalibError as problem:
         print(f"{row.name}: {method}: {problem}", file=sys.stderr)
         return None

@@ -44,15 +44,15 @@ def command(*arguments: object, folder: Path) -> str:
 
     It runs in this process: the start of a process would take longer than most of the commands.
     """
-    words = [str(argument) for argument in arguments]
+    command_line = [str(argument) for argument in arguments]
     with (folder / "commands.txt").open("a") as log:
-        print("calib", *words, file=log)
+        print("calib", *command_line, file=log)
     output = io.StringIO()
     errors = io.StringIO()
     with chdir(folder), redirect_stdout(output), redirect_stderr(errors):
-        code = cli.run(words)
+        code = cli.run(command_line)
     if code:
-        raise SystemExit(f"calib {' '.join(words)}\n{output.getvalue()}{errors.getvalue()}")
+        raise SystemExit(f"calib {' '.join(command_line)}\n{output.getvalue()}{errors.getvalue()}")
     return output.getvalue()
 
 

@@ -41,33 +41,39 @@ def waiting(begun: Event, go_on: Event) -> list[int]:
 
 def overlapping() -> list[list[int]]:
     """Return the threads of a call that begins later, ends later, and after the first has ended; then after both."""
-    begun, go_on, seen = [Event(), Event()], [Event(), Event()], list[list[int]]()
-    calls = [Thread(target=lambda k=k: seen.append(waiting(begun[k], go_on[k]))) for k in range(2)]
+    begun = [Event(), Event()]
+    go_on = [Event(), Event()]
+    counts: list[list[int]] = []
+
+    def count_in_call(k: int) -> None:
+        counts.append(waiting(begun[k], go_on[k]))
+
+    calls = [Thread(target=count_in_call, args=(k,)) for k in range(2)]
     for k in range(2):
         calls[k].start()
         begun[k].wait(30.0)
     for k in range(2):
         go_on[k].set()
         calls[k].join(30.0)
-        seen.append(threads())
-    return seen
+        counts.append(threads())
+    return counts
 
 
 def main() -> None:
     threadpool_limits(3)
-    found = {"before": threads(), "call": call(), "after": threads(), "nested": nested()}
+    counts = {"before": threads(), "call": call(), "after": threads(), "nested": nested()}
     with suppress(KeyboardInterrupt):
         call(fail=True)
-    found["after an exception"] = threads()
-    each = steps()
-    found["steps"] = [next(each), threads(), next(each)]
-    each.close()
-    found["after steps"] = threads()
-    found["overlapping"] = overlapping()
+    counts["after an exception"] = threads()
+    generator = steps()
+    counts["steps"] = [next(generator), threads(), next(generator)]
+    generator.close()
+    counts["after steps"] = threads()
+    counts["overlapping"] = overlapping()
     with threadpool_limits(2):
-        found["caller's limit"] = [call(), threads()]
-    found["at the end"] = threads()
-    print(json.dumps(found))
+        counts["caller's limit"] = [call(), threads()]
+    counts["at the end"] = threads()
+    print(json.dumps(counts))
 
 
 if __name__ == "__main__":

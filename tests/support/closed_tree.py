@@ -24,29 +24,36 @@ class ClosedTree:
     """
 
     def __init__(self, known: ClosedRobot, parameters: np.ndarray):
-        robot, rows = known.robot, list(np.reshape(parameters, (-1, 10)))
-        self.mechanism, self.model, tips, taken = known, pin.Model(), [], np.zeros(10)
+        robot = known.robot
+        rows = list(np.reshape(parameters, (-1, 10)))
+        self.mechanism = known
+        self.model = pin.Model()
         self.model.gravity = pin.Motion(np.array(robot.gravity), np.zeros(3))
+        tips = []
+        added_bodies = np.zeros(10)
         for leg in robot.legs:
-            bodies, parent = bodies_of(leg.chain), 0
+            bodies = bodies_of(leg.chain)
+            parent = 0
             for j in range(bodies.count):
                 kind = "P" if bodies.kinds[j] == PRISMATIC else "R"
                 joint = getattr(pin, f"JointModel{kind}{'XYZ'[bodies.axes[j]]}")()
-                place = pin.SE3(np.array(bodies.placements[j]))
-                parent = self.model.addJoint(parent, joint, place, f"{leg.name}.{j}")
+                placement = pin.SE3(np.array(bodies.placements[j]))
+                parent = self.model.addJoint(parent, joint, placement, f"{leg.name}.{j}")
                 row = rows.pop(0) if j < leg.bodies else SMALL
                 self.model.appendBodyToJoint(parent, to_inertia(row), pin.SE3.Identity())
             if leg.end == "rigid":
-                where = pin.SE3(leg.attachment @ np.linalg.inv(leg.chain.tail))
-                taken = taken + from_inertia(where.act(to_inertia(SMALL)))
+                attachment = pin.SE3(leg.attachment @ np.linalg.inv(leg.chain.tail))
+                added_bodies = added_bodies + from_inertia(attachment.act(to_inertia(SMALL)))
             tips.append(parent)
         platform = self.model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), "platform")
-        self.model.appendBodyToJoint(platform, to_inertia(np.sum(rows, axis=0) - taken), pin.SE3.Identity())
+        platform_body = to_inertia(np.sum(rows, axis=0) - added_bodies)
+        self.model.appendBodyToJoint(platform, platform_body, pin.SE3.Identity())
         self.contacts = pin.StdVec_RigidConstraintModel()
         for leg, tip in zip(robot.legs, tips):
             kind = pin.ContactType.CONTACT_6D if leg.end == "rigid" else pin.ContactType.CONTACT_3D
-            ends = pin.SE3(np.array(leg.chain.tail)), pin.SE3(np.array(leg.attachment))
-            self.contacts.append(pin.RigidConstraintModel(kind, self.model, tip, ends[0], platform, ends[1]))
+            tail = pin.SE3(np.array(leg.chain.tail))
+            attachment = pin.SE3(np.array(leg.attachment))
+            self.contacts.append(pin.RigidConstraintModel(kind, self.model, tip, tail, platform, attachment))
         self.data = self.model.createData()
 
     def accelerations(self, posture: Posture, v: np.ndarray, twist: np.ndarray, tau: np.ndarray) -> np.ndarray:
@@ -59,7 +66,7 @@ class ClosedTree:
         q = np.concatenate([posture.q[0], pin.SE3ToXYZQUAT(pose)])
         body = np.concatenate([pose.rotation.T @ twist[:3], pose.rotation.T @ twist[3:]])
         datas = pin.StdVec_RigidConstraintData()
-        datas.extend([one.createData() for one in self.contacts])
+        datas.extend([contact.createData() for contact in self.contacts])
         pin.initConstraintDynamics(self.model, self.data, self.contacts, datas)
         settings = pin.ProximalSettings(1e-14, 1e-10, 1000)
         velocity = np.concatenate([v, body])

@@ -20,11 +20,13 @@ class Cluster:
     """A scheduler; processes are killed when the block of `running` ends."""
 
     def __init__(self, folder: Path, failures: int) -> None:
-        self.folder, self.workers = folder, list[subprocess.Popen]()
-        paths = os.pathsep.join(sys.path)  # tests' own functions are found by the workers
-        self.environment = ENVIRONMENT | {
-            "PYTHONPATH": paths, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(failures),
-        }  # fmt: skip
+        self.folder = folder
+        self.workers: list[subprocess.Popen] = []
+        self.environment = {
+            **ENVIRONMENT,
+            "PYTHONPATH": os.pathsep.join(sys.path),  # tests' own functions are found by the workers
+            "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": str(failures),
+        }
         file = folder / "scheduler.json"
         self.scheduler = self._start("scheduler", "--scheduler-file", str(file), "--port", "0", "--idle-timeout", LIFE)
         for _ in range(600):
@@ -34,12 +36,12 @@ class Cluster:
         self.address = json.loads(file.read_text())["address"]
 
     def _start(self, role: str, *options: str) -> subprocess.Popen:
-        words = ["--host", "127.0.0.1", "--no-dashboard", *options]
+        module = f"distributed.cli.dask_{role}"
+        command = [sys.executable, "-m", module, "--host", "127.0.0.1", "--no-dashboard", *options]
         with (self.folder / f"{role}.log").open("a") as log:
             return subprocess.Popen(
-                [sys.executable, "-m", f"distributed.cli.dask_{role}", *words],
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=self.environment, cwd=self.folder,
-            )  # fmt: skip
+                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=self.environment, cwd=self.folder
+            )
 
     def add(self, count: int) -> None:
         """Start workers of one thread; where one dies, no nanny starts it again."""

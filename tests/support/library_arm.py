@@ -16,9 +16,10 @@ FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)  # [N m], total, Jubien et al. 2
 FV = (14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6)  # [N m s/rad]
 CHAIN = load("lwr4plus")
 LOWER, UPPER = CHAIN.sampling_limits()
-jacobian, point_jacobian = (
-    observation(targets_of(CHAIN, [(0.05, 0.02, 0.11)]), kind, (5e-5, 2e-4)) for kind in ("pose", "position")
-)
+TARGETS = targets_of(CHAIN, [(0.05, 0.02, 0.11)])
+SIGMAS = (5e-5, 2e-4)  # [m], [rad]
+jacobian = observation(TARGETS, "pose", SIGMAS)
+point_jacobian = observation(TARGETS, "position", SIGMAS)
 
 
 def random_poses(count: int, seed: int) -> np.ndarray:
@@ -29,9 +30,10 @@ def random_poses(count: int, seed: int) -> np.ndarray:
 def lwr(v0: float = 0.05) -> tuple[base.BaseModel, np.ndarray, Chain]:
     """Return the base model with 64 columns (43 inertial, Fv Fc off), its parameters, and the chain."""
     model = IdentificationModel(bodies_of(CHAIN), drives.standard(["Fv Fc off"] * 7, v0))
-    found = base.find(model)
-    values = np.concatenate([standard_parameters(CHAIN), np.column_stack([FV, FC, np.zeros(7)]).ravel()])
-    return base.BaseModel(model, found), found.transform @ values, CHAIN
+    split = base.find(model)
+    friction = np.column_stack([FV, FC, np.zeros(7)])
+    values = np.concatenate([standard_parameters(CHAIN), friction.ravel()])
+    return base.BaseModel(model, split), split.transform @ values, CHAIN
 
 
 def tool_points(chain: Chain, q: np.ndarray) -> np.ndarray:

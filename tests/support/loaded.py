@@ -35,5 +35,6 @@ def stages(folder: Path) -> dict[str, set[str]]:
     """Return the modules loaded at each stage of one process that works in a folder."""
     cell = perturbed_cell(load("ur5"), seed=1)
     write_measured(measure(cell, random_joints(cell.nominal, 40, 0), 1), folder / "measured.csv")
-    done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, cwd=folder)
-    return {stage: set(names) for stage, names in json.loads(done.stdout.splitlines()[-1]).items()}
+    process = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True, cwd=folder)
+    last_line = process.stdout.splitlines()[-1]
+    return {stage: set(names) for stage, names in json.loads(last_line).items()}

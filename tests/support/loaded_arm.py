@@ -11,10 +11,27 @@ import numpy as np
 import pinocchio as pin
 
 HEAD = [f"q{j}" for j in range(1, 8)] + ["x", "y", "z"] + [f"tau{j}" for j in range(1, 8)]
-LENGTHS = ((0.0, 0.0, 0.34), (0.0, 0.0, 0.0), (0.0, -0.4, 0.0), (0.0, 0.0, 0.0), (0.0, -0.4, 0.0), (0.0, 0.0, 0.0),
-           (0.0, -0.126, 0.0))  # fmt: skip
-TURNS = ((0.0, 0.0), (-1.5707963267948966, 0.0), (-1.5707963267948966, 3.141592653589793), (-1.5707963267948966, 0.0),
-         (-1.5707963267948966, 3.141592653589793), (-1.5707963267948966, 0.0), (1.5707963267948966, 0.0))  # fmt: skip
+QUARTER = 1.5707963267948966  # of a turn [rad]
+HALF = 3.141592653589793
+# origins of the joints: xyz [m], and roll and yaw [rad]
+LENGTHS = (
+    (0.0, 0.0, 0.34),
+    (0.0, 0.0, 0.0),
+    (0.0, -0.4, 0.0),
+    (0.0, 0.0, 0.0),
+    (0.0, -0.4, 0.0),
+    (0.0, 0.0, 0.0),
+    (0.0, -0.126, 0.0),
+)
+TURNS = (
+    (0.0, 0.0),
+    (-QUARTER, 0.0),
+    (-QUARTER, HALF),
+    (-QUARTER, 0.0),
+    (-QUARTER, HALF),
+    (-QUARTER, 0.0),
+    (QUARTER, 0.0),
+)
 MASSES = (3.5, 3.5, 4.1, 4.1, 2.3, 2.2, 1.8)
 
 
@@ -25,8 +42,11 @@ def urdf(masses: bool = False) -> str:
     for number, (xyz, turn) in enumerate(zip(LENGTHS, TURNS), 1):
         body = ""
         if masses:
-            body = (f'<inertial><origin xyz="0.002 {-0.02 * (number % 2)} 0.05"/><mass value="{MASSES[number - 1]}"/>'
-                    '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>')  # fmt: skip
+            centre = f"0.002 {-0.02 * (number % 2)} 0.05"
+            body = (
+                f'<inertial><origin xyz="{centre}"/><mass value="{MASSES[number - 1]}"/>'
+                '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"/></inertial>'
+            )
         lines.append(f'<link name="link{number}">{body}</link>')
         origin = " ".join(map(str, xyz))
         lines.append(

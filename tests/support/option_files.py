@@ -29,9 +29,13 @@ def documented(module: Any, start: str = "") -> dict[str, Any]:
 LIMITS = documented(limits) | {"target": {"height": [0.2, 1.5], "facing": [0, 0, 1]}}
 LIMITS["friction"] = {key: value[:6] for key, value in LIMITS["friction"].items()}
 TRAJECTORY = {
-    "robot": "ur5", "family": "fourier", "period": 20.0, "rate": 1000.0, "repeat": 5,
+    "robot": "ur5",
+    "family": "fourier",
+    "period": 20.0,
+    "rate": 1000.0,
+    "repeat": 5,
     "joint": [{"name": "a", "q0": 0.1, "a": [0.1], "b": [0.2]}],
-}  # fmt: skip
+}
 STEP = {"finished": "2026-01-01T00:00:00", "inputs": {"a.csv": "12"}, "outputs": {"b.csv": "34"}, "notes": []}
 MDH = documented(mdh, 'name = "myrobot"')
 ELEMENTS = documented(description)

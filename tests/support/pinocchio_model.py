@@ -22,14 +22,19 @@ def model(chain: Chain, parameters: np.ndarray | None = None) -> Any:
     Args:
         parameters: (n, 10) or (10 n,) standard parameters; default the chain's, or zero where it has none.
     """
-    bodies, result = bodies_of(chain), pin.Model()
+    bodies = bodies_of(chain)
     assert bodies.count == chain.n and np.all(np.abs(bodies.scales) == 1.0)
-    values = chain.inertias if parameters is None else parameters
-    values = np.zeros((chain.n, 10)) if values is None else np.reshape(values, (chain.n, 10))
+    if parameters is None:
+        parameters = chain.inertias
+    if parameters is None:
+        parameters = np.zeros((chain.n, 10))
+    values = np.reshape(parameters, (chain.n, 10))
+    result = pin.Model()
     result.gravity = pin.Motion(np.array(chain.gravity), np.zeros(3))
     for j, joint in enumerate(chain.joints):
-        bounds = (np.array([end]) for end in (joint.effort, joint.velocity, joint.lower, joint.upper))
-        index = result.addJoint(j, _joint(bodies, j), pin.SE3(np.array(bodies.placements[j])), joint.name, *bounds)
+        placement = pin.SE3(np.array(bodies.placements[j]))
+        limits = np.array([[joint.effort], [joint.velocity], [joint.lower], [joint.upper]])
+        index = result.addJoint(j, _joint(bodies, j), placement, joint.name, *limits)
         result.appendBodyToJoint(index, to_inertia(values[j]), pin.SE3.Identity())
     return result
 
@@ -48,27 +53,35 @@ def inverse_dynamics(chain: Chain, parameters: np.ndarray, q: np.ndarray, v: np.
     Bodies without mass are represented by difference: tau(chi) = tau(chi + κ φ) - tau(κ φ), φ a unit body.
     """
     values = np.reshape(parameters, (chain.n, 10))
-    unit = np.where((values[:, 9] == 0.0)[:, None], np.array([1.0, 0, 0, 1, 0, 1, 0, 0, 0, 1]), 0.0)
-    both = []
-    for made in (model(chain, values + unit), model(chain, unit)):
-        data = made.createData()
-        both.append(np.array([pin.rnea(made, data, *state).copy() for state in zip(q, v, a)]))
-    return both[0] - both[1] if unit.any() else both[0]
+    massless = values[:, 9] == 0.0
+    unit = np.zeros((chain.n, 10))
+    unit[massless] = [1.0, 0, 0, 1, 0, 1, 0, 0, 0, 1]
+    torques = _rnea(model(chain, values + unit), q, v, a)
+    if massless.any():
+        torques = torques - _rnea(model(chain, unit), q, v, a)
+    return torques
+
+
+def _rnea(robot: Any, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+    """Return the torques (N, n) of a Pinocchio model, sample by sample."""
+    data = robot.createData()
+    return np.array([pin.rnea(robot, data, *state).copy() for state in zip(q, v, a)])
 
 
 def regressor(chain: Chain, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the regressor (N, n, 10 n) by Pinocchio, sample by sample, columns in the field's order."""
-    made = model(chain, np.zeros((chain.n, 10)))
-    data = made.createData()
-    columns = np.array([pin.computeJointTorqueRegressor(made, data, *state).copy() for state in zip(q, v, a)])
-    return columns.reshape(len(q), chain.n, chain.n, 10)[..., np.argsort(PINOCCHIO_ORDER)].reshape(columns.shape)
+    robot = model(chain, np.zeros((chain.n, 10)))
+    data = robot.createData()
+    columns = np.array([pin.computeJointTorqueRegressor(robot, data, *state).copy() for state in zip(q, v, a)])
+    bodies = columns.reshape(len(q), chain.n, chain.n, 10)
+    return bodies[..., np.argsort(PINOCCHIO_ORDER)].reshape(columns.shape)
 
 
 def forward_dynamics(chain: Chain, parameters: np.ndarray, q: np.ndarray, v: np.ndarray, tau: np.ndarray) -> np.ndarray:
     """Return accelerations (N, n) by Pinocchio's articulated-body algorithm, sample by sample."""
-    made = model(chain, parameters)
-    data = made.createData()
-    return np.array([pin.aba(made, data, *state).copy() for state in zip(q, v, tau)])
+    robot = model(chain, parameters)
+    data = robot.createData()
+    return np.array([pin.aba(robot, data, *state).copy() for state in zip(q, v, tau)])
 
 
 def _joint(bodies: Bodies, j: int) -> Any:
@@ -77,4 +90,6 @@ def _joint(bodies: Bodies, j: int) -> Any:
     kind = "P" if bodies.kinds[j] == PRISMATIC else "R"
     if bodies.scales[j] > 0:
         return getattr(pin, f"JointModel{kind}{'XYZ'[bodies.axes[j]]}")()
-    return pin.JointModelPrismaticUnaligned(axis) if kind == "P" else pin.JointModelRevoluteUnaligned(axis)
+    if kind == "P":
+        return pin.JointModelPrismaticUnaligned(axis)
+    return pin.JointModelRevoluteUnaligned(axis)

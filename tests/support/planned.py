@@ -29,8 +29,12 @@ WAYPOINTS = np.array(
 def read_setpoints(path: Path) -> dict[str, np.ndarray]:
     """Return the columns of a motion's file: t (N,), and q, v, a, tau (N, n) as far as they are there."""
     table = read_table(path)
-    found = {letter: table.block(letter) for letter in ("q", "v", "a", "tau")}
-    return {"t": table.numbers("t", None)} | {letter: one for letter, one in found.items() if one is not None}
+    columns = {"t": table.numbers("t", None)}
+    for letter in ("q", "v", "a", "tau"):
+        block = table.block(letter)
+        if block is not None:
+            columns[letter] = block
+    return columns
 
 
 @cache
@@ -54,19 +58,21 @@ def base_of_lwr() -> base.Base:
 
 def write_model(folder: Path, **changed: float) -> None:
     """Write what `calib identify` writes of the arm's model, without its covariance; `changed`: values by name."""
-    model, values = identified().model, identified().values
-    values = np.array([changed.get(name, value) for name, value in zip(model.names, values)])
+    model = identified().model
+    values = np.array([changed.get(name, value) for name, value in zip(model.names, identified().values)])
+    table = to_table(Dynamics(model, values), base_of_lwr())
     description.write(folder / "robot.toml", CHAIN)
-    (folder / "dynamics.json").write_text(json.dumps(to_table(Dynamics(model, values), base_of_lwr())))
+    (folder / "dynamics.json").write_text(json.dumps(table))
 
 
 def limits(**changed) -> TimingLimits:
-    kept = {
+    """Return the arm's limits, some of them changed."""
+    bounds = {
         "velocity": np.array([joint.velocity for joint in CHAIN.joints]),
         "acceleration": np.full(7, np.inf),
         "torque": np.array([joint.effort for joint in CHAIN.joints]),
     }
-    return TimingLimits(**kept | changed)
+    return TimingLimits(**bounds | changed)
 
 
 @dataclass(frozen=True)
@@ -89,18 +95,24 @@ class Cart:
     def fastest(self, force: float, way: float) -> float:
         """Return the shortest time from rest to rest: all force forwards, then all backwards, integrated by hand."""
         rate = self.viscous / self.mass
-        ahead, back = (force - self.coulomb) / self.mass, (force + self.coulomb) / self.mass
+        forwards = (force - self.coulomb) / self.mass
+        backwards = (force + self.coulomb) / self.mass
 
         def phases(first: float) -> tuple[float, float]:
             """Return when it rests and where, pushed for `first` seconds."""
             if not rate:
-                speed = ahead * first
-                return first + speed / back, speed * first / 2 + speed**2 / back / 2
-            speed = ahead / rate * -np.expm1(-rate * first)
-            second = np.log1p(rate * speed / back) / rate
-            return first + second, (ahead * first - speed) / rate + (speed - back * second) / rate
+                speed = forwards * first
+                distance = speed * first / 2 + speed**2 / backwards / 2
+                return first + speed / backwards, distance
+            speed = forwards / rate * -np.expm1(-rate * first)
+            second = np.log1p(rate * speed / backwards) / rate
+            distance = (forwards * first - speed) / rate + (speed - backwards * second) / rate
+            return first + second, distance
 
-        return phases(brentq(lambda t: phases(t)[1] - way, 1e-9, 1e3, xtol=1e-14))[0]
+        def overshoot(first: float) -> float:
+            return phases(first)[1] - way
+
+        return phases(brentq(overshoot, 1e-9, 1e3, xtol=1e-14))[0]
 
 
 def cart_limits(force: float = np.inf, velocity: float = np.inf, acceleration: float = np.inf) -> TimingLimits:

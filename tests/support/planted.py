@@ -61,9 +61,18 @@ def measure(
     rng = np.random.default_rng(seed)
     q = random_joints(truth.chain, count, rng)
     return measure_kind(
-        truth, kind, q, rng, sigma=sigma, sigma_rotation=sigma_rotation, with_sigma=stated, station=station,
-        tools=tools, torque=torque, file=file,
-    )  # fmt: skip
+        truth,
+        kind,
+        q,
+        rng,
+        sigma=sigma,
+        sigma_rotation=sigma_rotation,
+        with_sigma=stated,
+        station=station,
+        tools=tools,
+        torque=torque,
+        file=file,
+    )
 
 
 def deviation(found: GeometricFit, exact: Sequence[PoseMeasurements]) -> tuple[float, float]:
@@ -75,16 +84,24 @@ def deviation(found: GeometricFit, exact: Sequence[PoseMeasurements]) -> tuple[f
     Returns:
         dβᵀ C⁻¹ dβ, chi-squared with as many degrees of freedom as base parameters; and ‖r - W dx‖ / ‖r‖.
     """
-    parts = [part for block in prepare(found.cell, exact) for part in observe(found.cell, block, found.free)]
-    residual, matrix = map(np.concatenate, zip(*(part.whitened(np.ones(1)) for part in parts)))
+    residuals = []
+    matrices = []
+    for block in prepare(found.cell, exact):
+        for part in observe(found.cell, block, found.free):
+            part_residual, part_matrix = part.whitened(np.ones(1))
+            residuals.append(part_residual)
+            matrices.append(part_matrix)
+    residual = np.concatenate(residuals)
+    matrix = np.concatenate(matrices)
     scale = np.linalg.norm(matrix, axis=0)
     # parameters that merge leave directions that are zero but for rounding
     dx = np.linalg.lstsq(matrix / scale, residual, rcond=1e-9)[0] / scale
-    rest = np.linalg.norm(residual - matrix @ dx) / np.linalg.norm(residual)
-    base, sigma = found.regrouping(), found.base_sigma()
+    unexplained = np.linalg.norm(residual - matrix @ dx) / np.linalg.norm(residual)
+    base = found.regrouping()
+    sigma = found.base_sigma()
     correlation = base @ found.estimate.covariance @ base.T / np.outer(sigma, sigma)
-    off = base @ dx / sigma
-    return float(off @ np.linalg.solve(correlation, off)), float(rest)
+    distance = base @ dx / sigma
+    return float(distance @ np.linalg.solve(correlation, distance)), float(unexplained)
 
 
 def position_error(found: Installation, truth: Installation, q: np.ndarray) -> np.ndarray:

@@ -65,19 +65,25 @@ def motion(seed: int, duration: float = 20.0, harmonics: int = 6) -> tuple[np.nd
     """Return t (N,), q, v, a (N, 3) of a Fourier series with a period of ten seconds."""
     rng = np.random.default_rng(seed)
     t = np.arange(int(duration * RATE)) / RATE
-    omega = 2 * np.pi / 10.0 * np.arange(1, harmonics + 1)
-    size = rng.normal(size=(2, N, harmonics)) * 0.5 / np.sqrt(np.arange(1, harmonics + 1))
-    s, c = np.sin(np.outer(t, omega)), np.cos(np.outer(t, omega))
-    q = s @ size[0].T + c @ size[1].T
-    v = (c * omega) @ size[0].T - (s * omega) @ size[1].T
-    a = -(s * omega**2) @ size[0].T - (c * omega**2) @ size[1].T
+    order = np.arange(1, harmonics + 1)
+    omega = 2 * np.pi / 10.0 * order
+    sines, cosines = rng.normal(size=(2, N, harmonics)) * 0.5 / np.sqrt(order)
+    s = np.sin(np.outer(t, omega))
+    c = np.cos(np.outer(t, omega))
+    q = s @ sines.T + c @ cosines.T
+    v = (c * omega) @ sines.T - (s * omega) @ cosines.T
+    a = -(s * omega**2) @ sines.T - (c * omega**2) @ cosines.T
     return t, q, v, a
 
 
 def torques(
-    q: np.ndarray, v: np.ndarray, a: np.ndarray, terms: tuple[DriveTerm, ...] = (),
-    values: dict[str, float] | None = None, payload: bool = False,
-) -> np.ndarray:  # fmt: skip
+    q: np.ndarray,
+    v: np.ndarray,
+    a: np.ndarray,
+    terms: tuple[DriveTerm, ...] = (),
+    values: dict[str, float] | None = None,
+    payload: bool = False,
+) -> np.ndarray:
     """Return the true torques (N, 3); load-dependent friction feels the bodies' torque."""
     plain = model(payload=payload)
     bodies = 10 * plain.bodies.count
@@ -87,34 +93,44 @@ def torques(
 
 
 @cache
-def _played(seed: int, terms: tuple[DriveTerm, ...], values: tuple, payload: bool, how: tuple) -> np.ndarray:
+def _played(
+    seed: int, terms: tuple[DriveTerm, ...], values: tuple, payload: bool, motion_settings: tuple
+) -> np.ndarray:
     """Return the true torques (N, 3) of a motion."""
-    return torques(*motion(seed, **dict(how))[1:], terms, dict(values), payload)
+    _, q, v, a = motion(seed, **dict(motion_settings))
+    return torques(q, v, a, terms, dict(values), payload)
 
 
 def series(
-    seed: int, noise: float = 0.2, terms: tuple[DriveTerm, ...] = (), values: dict[str, float] | None = None,
-    payload: bool = False, **how,
-) -> dict[str, np.ndarray]:  # fmt: skip
+    seed: int,
+    noise: float = 0.2,
+    terms: tuple[DriveTerm, ...] = (),
+    values: dict[str, float] | None = None,
+    payload: bool = False,
+    **motion_settings,
+) -> dict[str, np.ndarray]:
     """Return t, q and tau as a controller would log them, torque noise white."""
-    t, q = motion(seed, **how)[:2]
-    tau = _played(seed, terms, tuple((values or {}).items()), payload, tuple(how.items()))
+    t, q = motion(seed, **motion_settings)[:2]
+    hashable_values = tuple((values or {}).items())
+    tau = _played(seed, terms, hashable_values, payload, tuple(motion_settings.items()))
     rng = np.random.default_rng(1000 + seed)
     return {"t": t, "q": q, "tau": tau + noise * rng.normal(size=tau.shape)}
 
 
-def case(name: str, seed: int, carried: tuple[str, ...] = (), band: float = 10.0, gains=None, **how) -> Case:
-    """Return a recorded case."""
-    log = series(seed, payload=bool(carried), **how)
-    effort = log["tau"] if gains is None else log["tau"] / np.asarray(gains)
+def case(name: str, seed: int, carried: tuple[str, ...] = (), band: float = 10.0, gains=None, **settings) -> Case:
+    """Return a recorded case of `series` with other settings; with gains [N m/A] its currents."""
+    log = series(seed, payload=bool(carried), **settings)
+    effort = log["tau"]
+    if gains is not None:
+        effort = effort / np.asarray(gains)
     recording = Recording(log["t"], log["q"], effort, "torque", ("joint1", "joint2", "joint3"), file=name)
     return make_case(name, make_motion(recording, FilterOptions(cutoff=30.0, band=band)), carried=carried)
 
 
-def write(folder: Path, name: str, seed: int, **how) -> Path:
-    """Write a recording as a NumPy archive."""
+def write(folder: Path, name: str, seed: int, **arrays) -> Path:
+    """Write a recording as a NumPy archive, with more arrays or others."""
     path = folder / name
-    np.savez(path, **{**series(seed), **how})
+    np.savez(path, **{**series(seed), **arrays})
     return path
 
 
@@ -127,8 +143,10 @@ def robot(tmp_path: Path) -> Path:
 @pytest.fixture(scope="module")
 def problem() -> IdentificationProblem:
     """Return a problem of identification of the planted arm."""
-    settings, cases = IdentificationSettings(), [case("a", 0)]
-    model, decimator = make_model(arm(), settings), common_decimator(cases, settings)
+    settings = IdentificationSettings()
+    cases = [case("a", 0)]
+    model = make_model(arm(), settings)
+    decimator = common_decimator(cases, settings)
     base = find_base(model, cases, chain_states(arm(), model))
     rows = tuple(observe(model, base.kept, case, decimator) for case in cases)
     terms = [None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept]

@@ -16,8 +16,8 @@ PROBE = Path(__file__).with_name("package_path.py")
 @cache
 def require_same_package() -> None:
     """Fail where a script in a process of its own would import another package than the tests do."""
-    said = subprocess.run([sys.executable, PROBE], capture_output=True, text=True, check=True).stdout
-    assert Path(said.strip()).resolve() == Path(calib.__file__).resolve()
+    probe = subprocess.run([sys.executable, PROBE], capture_output=True, text=True, check=True)
+    assert Path(probe.stdout.strip()).resolve() == Path(calib.__file__).resolve()
 
 
 def run_here(script: Path, *arguments: object, capsys: pytest.CaptureFixture[str]) -> str:

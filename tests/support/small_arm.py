@@ -16,7 +16,7 @@ from calib.identification.closed_loop import controllers
 from calib.identification.closed_loop.simulation import Plant, Sensing, simulate
 from calib.identification.loop import LoopSettings
 from calib.identification.methods.method import IdentificationProblem
-from calib.identification.rows import make_case, observe
+from calib.identification.rows import Case, make_case, observe
 from calib.robot import mdh
 from calib.simulation import known_robots
 
@@ -30,21 +30,32 @@ DRIVES = np.array([0.2, 1.0, 1.5, 0.1, 5.0, 0.8])  # Ia Fv Fc
 PD = controllers.pd(np.array([900.0, 600.0]), np.array([40.0, 30.0]))
 TOOL = np.array([0.02, 0, 0, 0.03, 0, 0.02, 0.1, -0.05, 0.15, 1.5])
 STIFF = PD.slower(0.5)  # carries a payload
+SETTINGS = FilterOptions(cutoff=40.0, band=20.0, clock="stamps")
+NAMES = ("joint1", "joint2")
 LOOP = LoopSettings(controller="pd", kp=tuple(PD.kp), kd=tuple(PD.kd), rate=RATE)
 
 
 @cache
 def robot(v0: float = 0.2) -> tuple[Plant, IdentificationModel, bases.Base]:
+    """Return the arm as it is simulated, its model, and the base parameters of that."""
     chain = mdh.chain("turn and slide", ROWS)
     terms = drives.standard(["Ia Fv Fc"] * 2, v0, [False, True])
     model = IdentificationModel(bodies_of(chain), terms)
-    return Plant(model.bodies, terms, np.concatenate([LINKS, DRIVES])), model, bases.find(model)
+    plant = Plant(model.bodies, terms, np.concatenate([LINKS, DRIVES]))
+    return plant, model, bases.find(model)
+
+
+def random_motion(seconds: float, rate: float, seed: int) -> controllers.Reference:
+    """Return a random Fourier motion of both joints."""
+    limit = np.array([1.5, 0.6])
+    speed = np.full(2, 3.0)
+    return known_robots.random_fourier(-limit, limit, speed, seconds, rate, 8, acceleration=20.0, seed=seed)
 
 
 @cache
 def motion(rate: float = RATE) -> controllers.Reference:
-    limit = np.array([1.5, 0.6])
-    return known_robots.random_fourier(-limit, limit, np.full(2, 3.0), 5.0, rate, 8, acceleration=20.0, seed=5)
+    """Return the motion of `problem`, 5 s."""
+    return random_motion(5.0, rate, seed=5)
 
 
 def problem(
@@ -54,59 +65,56 @@ def problem(
     plant, model, base = robot(v0)
     tick = rate / 200.0
     run = simulate(plant, PD, motion(rate), Sensing(sigma_q, sigma_tau=sigma_tau, every=tick), seed)
-    asked = motion(rate).at(np.arange(len(run.t)) * tick)[0]
-    recording = Recording(run.t, run.measured, run.tau, "torque", ("joint1", "joint2"), q_ref=asked)
-    case = make_case("log", make_motion(recording, FilterOptions(cutoff=40.0, band=20.0, clock="stamps")))
-    decimator = case.motion.decimator
-    rows = (observe(model, base.kept, case, decimator),)
+    reference = motion(rate).at(np.arange(len(run.t)) * tick)[0]
+    recording = Recording(run.t, run.measured, run.tau, "torque", NAMES, q_ref=reference)
+    case = make_case("log", make_motion(recording, SETTINGS))
+    return identification_problem(model, base, [case], replace(LOOP, rate=rate))
+
+
+def identification_problem(
+    model: IdentificationModel, base: bases.Base, cases: list[Case], loop: LoopSettings
+) -> IdentificationProblem:
+    """Return the problem of identifying base parameters from recorded cases of a loop."""
+    decimator = cases[0].motion.decimator
+    rows = tuple(observe(model, base.kept, case, decimator) for case in cases)
     terms = tuple(None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept)
-    return IdentificationProblem(
-        model, base, (case,), decimator, rows, terms, np.full(base.b, -1), loop=replace(LOOP, rate=rate)
-    )  # fmt: skip
+    groups = np.full(base.b, -1)
+    return IdentificationProblem(model, base, tuple(cases), decimator, rows, terms, groups, loop=loop)
 
 
 def sensed(
     rows: TorqueRows, seed: int, sigma_q: float, seconds: float = 5.0
 ) -> tuple[IdentificationProblem, np.ndarray]:
     """Return the problem of two logs with joint torque sensors, without and with a payload, and its true parameters."""
-    chain, motors = mdh.chain("turn and slide", ROWS), np.append(DRIVES, [0.4, 0.5, 2.0, 0.3])
+    chain = mdh.chain("turn and slide", ROWS)
     terms = drives.standard(["Ia Fvm Fcm Fvl Fcl"] * 2, 0.2, [False, True])
     bodies = with_payload(bodies_of(chain), np.eye(4), "tool")
-    amounts = dict(zip([f"{name}{j}" for j in (1, 2) for name in ("Ia", "Fvm", "Fcm")], motors[:6]))
-    amounts |= dict(zip(("Fvl1", "Fcl1", "Fvl2", "Fcl2"), motors[6:]))
-    plant = Plant(bodies, terms, np.concatenate([LINKS, TOOL, [amounts[one.name] for one in terms]]))
-    model, link = (IdentificationModel(bodies, terms, kind) for kind in (rows, LINK))
-    values = {
-        kind: np.append(plant.parameters[: plant.inertial], [amounts[one.name] for one in own.columns])
-        for kind, own in (("model", model), ("link", link))
-    }
+    amounts = dict(zip(("Ia1", "Fvm1", "Fcm1", "Ia2", "Fvm2", "Fcm2"), DRIVES))
+    amounts |= {"Fvl1": 0.4, "Fcl1": 0.5, "Fvl2": 2.0, "Fcl2": 0.3}
+    plant = Plant(bodies, terms, np.concatenate([LINKS, TOOL, [amounts[term.name] for term in terms]]))
+    model = IdentificationModel(bodies, terms, rows)
+    link_model = IdentificationModel(bodies, terms, LINK)
+
+    def values(model: IdentificationModel) -> np.ndarray:
+        return np.append(plant.parameters[: plant.inertial], [amounts[term.name] for term in model.columns])
+
     cases = []
-    for k, carried in enumerate(((), ("tool",))):
-        limit = np.array([1.5, 0.6])
-        asked = known_robots.random_fourier(
-            -limit, limit, np.full(2, 3.0), seconds, RATE, 8, acceleration=20.0, seed=5 + k
-        )
-        there = np.append(link.carried_columns(carried), np.ones(len(terms)))
-        loaded = plant.with_parameters(plant.parameters * there)
-        moved = simulate(loaded, STIFF, asked, Sensing(sigma_q, sigma_tau=0.05, every=3.5), seed)
-        felt = link.torque(values["link"], moved.q, moved.v, moved.a, carried)
-        felt = felt + 0.02 * np.random.default_rng([seed, k]).normal(size=moved.q.shape)
-        ticks = np.arange(len(moved.t)) * 3.5
-        recording = Recording(
-            moved.t, moved.measured, moved.tau, "torque", ("joint1", "joint2"), tau_link=felt, q_ref=asked.at(ticks)[0]
-        )
-        motion_of = make_motion(recording, FilterOptions(cutoff=40.0, band=20.0, clock="stamps"))
-        cases.append(make_case(f"log{k}", motion_of, rows, carried=carried))
+    for k, payloads in enumerate(((), ("tool",))):
+        reference = random_motion(seconds, RATE, seed=5 + k)
+        present = np.append(link_model.carried_columns(payloads), np.ones(len(terms)))
+        loaded = plant.with_parameters(plant.parameters * present)
+        run = simulate(loaded, STIFF, reference, Sensing(sigma_q, sigma_tau=0.05, every=3.5), seed)
+        tau_link = link_model.torque(values(link_model), run.q, run.v, run.a, payloads)
+        tau_link = tau_link + 0.02 * np.random.default_rng([seed, k]).normal(size=run.q.shape)
+        q_ref = reference.at(np.arange(len(run.t)) * 3.5)[0]
+        recording = Recording(run.t, run.measured, run.tau, "torque", NAMES, tau_link=tau_link, q_ref=q_ref)
+        cases.append(make_case(f"log{k}", make_motion(recording, SETTINGS), rows, carried=payloads))
     base = bases.find(model, loads=((), ("tool",)))
-    observed = tuple(observe(model, base.kept, case, cases[0].motion.decimator) for case in cases)
-    own = tuple(None if k < model.inertial else model.columns[k - model.inertial] for k in base.kept)
-    found = IdentificationProblem(
-        model, base, tuple(cases), cases[0].motion.decimator, observed, own, np.full(base.b, -1),
-        loop=replace(LOOP, kp=tuple(STIFF.kp), kd=tuple(STIFF.kd)),
-    )  # fmt: skip
-    return found, base.transform @ values["model"]
+    loop = replace(LOOP, kp=tuple(STIFF.kp), kd=tuple(STIFF.kd))
+    return identification_problem(model, base, cases, loop), base.transform @ values(model)
 
 
 def truth() -> np.ndarray:
+    """Return the true base parameters of `problem`."""
     plant, _, base = robot()
     return base.transform @ plant.parameters

@@ -41,15 +41,15 @@ def position_sigma():
 
 
 def export():
-    with TemporaryDirectory() as place:
-        return calib.export(fitted(), place)
+    with TemporaryDirectory() as folder:
+        return calib.export(fitted(), folder)
 
 
 def compensate():
-    with TemporaryDirectory() as place:
-        targets = Path(place) / "targets.csv"
-        places = np.random.default_rng(0).uniform((0.3, -0.3, 0.2), (0.5, 0.3, 0.5), (50, 3))
-        np.savetxt(targets, places, delimiter=",", header="x [m],y [m],z [m]", comments="")
+    with TemporaryDirectory() as folder:
+        targets = Path(folder) / "targets.csv"
+        positions = np.random.default_rng(0).uniform((0.3, -0.3, 0.2), (0.5, 0.3, 0.5), (50, 3))
+        np.savetxt(targets, positions, delimiter=",", header="x [m],y [m],z [m]", comments="")
         return calib.compensate(fitted(), targets)
 
 
@@ -68,9 +68,16 @@ def torque_sigma():
 
 
 VERBS = (
-    load, select_poses, fit_geometry, position_sigma, export, compensate, design_excitation, identify_dynamics,
+    load,
+    select_poses,
+    fit_geometry,
+    position_sigma,
+    export,
+    compensate,
+    design_excitation,
+    identify_dynamics,
     torque_sigma,
-)  # fmt: skip
+)
 
 
 def processor_time(verb: str) -> float:

@@ -33,8 +33,8 @@ def chosen_and_error(fit: calib.GeometryFit) -> dict[str, object]:
 class Awkward(Exception):
     """Cannot be pickled and read back."""
 
-    def __init__(self, one: int, two: int) -> None:
-        super().__init__(f"{one} and {two}")
+    def __init__(self, first: int, second: int) -> None:
+        super().__init__(f"{first} and {second}")
 
 
 def complain_awkwardly(x: int) -> None:
@@ -129,12 +129,13 @@ def step_by_step(address: str) -> int:
     from calib.apps.fleet import stores
 
     with stores.held(address, lease=1.0) as folder:
-        log, made = folder / "state.json", 0
+        log = folder / "state.json"
+        count = 0
         for step in STEPS:
-            done = log.read_text().splitlines() if log.exists() else []
-            if not any(line.startswith(step) for line in done):
+            lines = log.read_text().splitlines() if log.exists() else []
+            if not any(line.startswith(step) for line in lines):
                 time.sleep(0.15)
                 (folder / f"{step}.txt").write_text(step * 1000)
-                log.write_text("\n".join([*done, f"{step} {os.getpid()}"]))
-                made += 1
-    return made
+                log.write_text("\n".join([*lines, f"{step} {os.getpid()}"]))
+                count += 1
+    return count
