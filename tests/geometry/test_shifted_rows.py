@@ -5,14 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from planted import cell, perturb
+from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import Positions, take
+from calib.geometry.checks import row_lags
 from calib.geometry.checks.readings import without_unseen
 from calib.geometry.checks.wrong_rows import MIN_SHIFTED, SHIFTS, TIED, _best_first, _CutErrors, _shifted, least_error
 from calib.geometry.first_guess import install
 from calib.geometry.installation import see
 from calib.robot.calibrated import evaluate
 from calib.robot.chain import random_joints
+from calib.robot.kinematics import forward
 from calib.robot.library import load
 
 
@@ -67,6 +70,20 @@ def test_a_slip_is_named_at_its_row_and_no_good_row_is_called_unseen(name, seed)
         assert _best_first(nominal, slipped, shift) == first
     visible, findings = without_unseen(arm, stored_twice)
     assert len(visible) == 50 and not findings
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+def test_a_slip_of_poses_is_named_at_its_row(seed):
+    random = np.random.default_rng(seed)
+    arm = forward(load("ur5"), random_joints(load("ur5"), 50, random))
+    noise = Rotation.from_rotvec(1e-4 * random.normal(size=(50, 3))).as_matrix()
+    target = np.array(arm)
+    target[:, :3, :3] = arm[:, :3, :3] @ noise
+    slip = int(random.integers(8, 40))
+    source = np.where(np.arange(50) < slip, np.arange(50), np.arange(50) - 1)
+    for arm_rows, measured_rows, lag in ((arm, target[source], -1), (arm[source], target, 1)):
+        assert row_lags.last_lag(arm_rows, measured_rows) == lag
+        assert row_lags.first_of_lag(arm_rows, measured_rows, lag) == slip
 
 
 @pytest.mark.parametrize("name", ["ur5", "lwr4plus"])

@@ -15,6 +15,8 @@ MIN_TAIL = 6
 TAIL = 1 / 3
 # Largest difference of angles [rad] that counts: a wrong row counts no more than this.
 MAX_DIFFERENCE = 0.2
+# Mean difference of a row's angles, over the median of all, up to which it agrees as well as others (our choice).
+TIED = 3.0
 
 
 def last_lag(arm: np.ndarray, measured: np.ndarray) -> int:
@@ -39,7 +41,9 @@ def last_lag(arm: np.ndarray, measured: np.ndarray) -> int:
 
 
 def first_of_lag(arm: np.ndarray, measured: np.ndarray, lag: int) -> int:
-    """Return the index of the first measured row that agrees with the arm's row `lag` rows further down.
+    """Return the index of the first measured row that agrees with the arm's row `lag` rows further down only.
+
+    A row beside one that was stored twice agrees with both: as few rows as possible are said to be further down.
 
     Args:
         arm, measured: (m, 4, 4) poses, as for `last_lag`.
@@ -48,18 +52,28 @@ def first_of_lag(arm: np.ndarray, measured: np.ndarray, lag: int) -> int:
     m = len(arm)
     rows = np.arange(m)
     sums = []
+    typical = []
     for first in range(m - MIN_TAIL + 1):
         partners = np.where(rows >= first, rows + lag, rows)
         present = (partners >= 0) & (partners < m)
         # further up, the first rows have no partners: the arm's rows there belong to those before
         present &= (rows < first) | (partners >= first) | (first == 0)
         total = 0.0
-        for differences in _differences(arm, measured, partners[present], rows[present]):
+        of_steps = list(_differences(arm, measured, partners[present], rows[present]))
+        present_differences = np.concatenate(of_steps)
+        present_differences = present_differences[np.isfinite(present_differences)]
+        typical.append(float(np.median(present_differences)) if len(present_differences) else 0.0)
+        for differences in of_steps:
             total += float(np.nansum(np.minimum(differences, MAX_DIFFERENCE)))
             # absent rows are no agreement
             total += MAX_DIFFERENCE * (m - np.isfinite(differences).sum())
         sums.append(total)
-    return int(np.argmin(sums))
+    best = int(np.argmin(sums))
+    # a row is part of two angles of each step
+    tie = TIED * 2 * len(STEPS) * typical[best]
+    while best + 1 < len(sums) and sums[best + 1] <= min(sums) + tie:
+        best += 1
+    return best
 
 
 def _differences(
