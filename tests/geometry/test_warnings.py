@@ -1,6 +1,8 @@
 """Two-sided: every warning on measurements and poses is given where it is due, and not where it is not."""
 
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from calib.geometry.observability import PLACES, unidentified
 from calib.procedure.findings import lines_of
 from calib.procedure.kinematic_stage import plausibility
 from calib.robot.calibrated import Deflection, Term
+from calib.robot.chain import Chain
 from calib.simulation.cell import measure as measured_by
 from calib.simulation.virtual_cells import perturbed_cell
 
@@ -179,14 +182,20 @@ REAL = {
 }
 
 
+@cache
+def real_positions(folder: Path) -> tuple[Chain, PoseMeasurements]:
+    """Return a robot and a hundred of its measured poses."""
+    robot, file = (folder / name for name in REAL[folder.name])
+    arm = load(robot)
+    (block,) = read_measurements(file, arm.joint_names)
+    return arm, take(block, np.arange(0, len(block), max(1, len(block) // 100)))
+
+
 @pytest.mark.parametrize("folder", REAL)
 @pytest.mark.parametrize("way", [0.0, 1.0])
 def test_real_poses_are_sound(data, folder, way):
     """Real poses are sound unless a joint counts from the one before."""
-    robot, file = (data / folder / name for name in REAL[folder])
-    arm = load(robot)
-    (block,) = read_measurements(file, arm.joint_names)
-    block = take(block, np.arange(0, len(block), max(1, len(block) // 100)))
+    arm, block = real_positions(data / folder)
     changed = replace(block, q=block.q @ coupling(arm.n, 2, 1, -way).T)
     found = diagnosis.wrong_columns(install(arm, [changed]), [changed], mirrored=True)
     assert (found and (found.code, found.joints)) == (("joint-coupled", (2, 1)) if way else None)
