@@ -250,32 +250,36 @@ def _unexplained_function(samples: MotionSamples, offsets: bool = True) -> Calla
         offsets: whether each joint's torque has an offset.
     """
     m, n = samples.q.shape
+    joints = np.arange(n)
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
 
-    def weighted_rows(columns: np.ndarray) -> np.ndarray:
-        scaled = (columns * scale[:, None]).transpose(1, 0, 2)
-        return scaled.reshape(n * m, -1)
-
+    # A column is a row of the arrays, joint after joint: samples are contiguous, as the regressor writes them.
     # Bodies and offsets are free, the drives' other parameters not negative.
-    drives = samples.drives.reshape(m, n, n, 4)
-    free_columns = [samples.inertial]
+    weighted = samples.inertial.transpose(2, 1, 0) * scale[:, None]
+    free = weighted.reshape(-1, n * m)
     if offsets:
-        free_columns.append(drives[..., 3])
-    free = weighted_rows(np.concatenate(free_columns, axis=2))
-    free = free @ spanning(free.T @ free)
-    positive = weighted_rows(drives[..., :3].reshape(m, n, -1))
-    positive /= np.maximum(np.abs(positive).max(axis=0), 1e-12)
-    size = np.linalg.norm(positive, axis=0)
-    positive -= free @ (free.T @ positive)
+        free = np.concatenate([free, np.repeat(np.diag(scale), m, axis=1)])
+    span = spanning(free @ free.T)
+
+    def without_free(columns: np.ndarray) -> np.ndarray:
+        return columns - columns @ free.T @ span @ span.T @ free
+
+    drives = drive_columns(samples.v, samples.a)[..., :3] * scale[:, None]
+    positive = np.zeros((n, 3, n, m))
+    positive[joints, :, joints] = drives.transpose(1, 2, 0)
+    positive = positive.reshape(3 * n, n * m)
+    positive /= np.maximum(np.abs(positive).max(axis=1), 1e-12)[:, None]
+    size = np.linalg.norm(positive, axis=1)
+    positive = without_free(positive)
     # what bodies and offsets explain wholly leaves rounding, which as a column would explain some noise
-    is_independent = np.linalg.norm(positive, axis=0) > ROUNDING * size
-    positive = positive[:, is_independent]
+    is_independent = np.linalg.norm(positive, axis=1) > ROUNDING * size
+    positive = positive[is_independent].T
     orthonormal, triangle = np.linalg.qr(positive)
 
     def unexplained(mixing: np.ndarray) -> np.ndarray:
         torque = (scale * (samples.torque @ mixing.T)).T.ravel()
         power = torque.reshape(n, m).var(axis=1)
-        torque = torque - free @ (free.T @ torque)
+        torque = without_free(torque)
         values, _ = nnls(triangle, orthonormal.T @ torque)
         residual = torque - positive @ values
         mean_square = (residual.reshape(n, m) ** 2).mean(axis=1)
