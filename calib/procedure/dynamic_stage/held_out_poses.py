@@ -9,22 +9,25 @@ error. Gross rows are moved to the edge of the others (winsorised). The scatter 
 poses, is not in the standard error.
 """
 
+from __future__ import annotations
+
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from calib.geometry import installation
 from calib.geometry.installation import Installation
-from calib.procedure.kinematic_stage.fit_tables import COMPONENTS, TO_CALIBRATED
-from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
 from calib.records import shielded
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.transforms import invert
+
+if TYPE_CHECKING:
+    from calib.procedure.kinematic_stage.folder import FitFolder, ValidationFolder
 
 MIN_POSES = 8
 """Poses from which on errors are compared: 2 standard errors of so few are passed in 4 % by chance (Student's t)."""
@@ -76,6 +79,9 @@ def held_out_errors(source: Path, before: Chain, after: Chain) -> HeldOutErrors 
         source: the fit's folder, or a file in it.
         before, after: the arm of the fit, and the same arm with other values.
     """
+    # slow to load, and only needed where the geometry is identified, too
+    from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
+
     folder = FitFolder(source if source.is_dir() else source.parent)
     if not folder.residuals.is_file() or not folder.robot.is_file():
         return None
@@ -130,6 +136,8 @@ def _residual_rows(folder: FitFolder, cell: Installation, sets: tuple[str, ...])
         cell: its arm, stations and tools.
         sets: names of the sets of rows; outliers are left out.
     """
+    from calib.procedure.kinematic_stage.fit_tables import COMPONENTS
+
     q, residual, tool = [], [], []
     with folder.residuals.open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -149,6 +157,8 @@ def _session_rows(folder: ValidationFolder, cell: Installation) -> _Rows:
 
     The table has predicted minus measured positions, in the base frame.
     """
+    from calib.procedure.kinematic_stage.fit_tables import TO_CALIBRATED
+
     q, residual = [], []
     if folder.errors.is_file() and len(cell.tools) == 1:
         with folder.errors.open(encoding="utf-8", newline="") as file:
