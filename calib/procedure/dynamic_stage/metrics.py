@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
@@ -233,6 +234,8 @@ def on_bounds(identification: Identification) -> tuple[str, ...]:
     return tuple(names)
 
 
+# file, report and console read the same record one after the other
+@lru_cache(maxsize=1)
 def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
     """Return the content of ``metrics.json`` for the outcome of an identification."""
     identification, inputs = outcome.found, outcome.inputs
