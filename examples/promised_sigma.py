@@ -3,9 +3,9 @@
 CALIB_DATA=... python examples/promised_sigma.py [--quick] [--csv FILE] [ROBOT ...]
 
 Recordings of a robot are identified, and another one is taken for the further motion. Its σ are predicted by what
-`calib excite --after` calls; then all of them are identified together. A row per robot; robots without data are skipped.
-A second table takes the residue apart: with the torque errors reached in place of those predicted, and the ceiling, i.e.
-a predictor that errs by no more than the reached σ do, whose torque errors are estimated from so many samples.
+`calib excite --after` calls; then all of them are identified together. The first table has a row per robot; robots
+without data are skipped. The second table says what the rest is due to: the same with the torque errors reached in place
+of those predicted, and the ceiling, i.e. a prediction that misses by nothing but the sampling of the reached σ.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple, cast
@@ -89,7 +90,7 @@ class Robot:
 def parts(file: str, start: float, end: float, count: int) -> list[str]:
     """Return `count` cuts of equal duration of a recording between two times [s]."""
     edges = np.linspace(start, end, count + 1)
-    return [f"{file}@{first:.4g}:{last:.4g}" for first, last in zip(edges[:-1], edges[1:])]
+    return [f"{file}@{first:.4g}:{last:.4g}" for first, last in pairwise(edges)]
 
 
 def each_to_next(recordings: Sequence[str]) -> tuple[Pair, ...]:
@@ -230,7 +231,7 @@ def ceiling(model: DynamicsModel) -> np.ndarray:
 
 
 def density(series: Sequence[np.ndarray], stream: np.random.Generator) -> float:
-    """Return the density of resampled errors of recordings (N_i,), as an identification estimates it, but for a factor."""
+    """Return the density of resampled errors of recordings (N_i,), up to a factor, as an identification estimates it."""
     squares = inflated = 0.0
     for errors in series:
         length = max(MIN_BLOCK, round(BLOCKS * min(inflation(errors), MAX_INFLATION)))

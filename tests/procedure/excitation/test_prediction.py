@@ -123,7 +123,7 @@ def test_earlier_rows_are_weighed_by_the_rows_that_see_a_parameter():
 
 @pytest.mark.parametrize("existing", [0.0, 10.0], ids=["a further motion", "another one beside"])
 def test_added_errors_count_by_the_time_that_is_new(existing):
-    """The earlier recordings keep their variance, and the motions that are not identified have `ADDED_ERRORS` times it."""
+    """Earlier recordings keep their variance; motions that are not identified have `ADDED_ERRORS` times it."""
     bands = ErrorBands(np.array([50.0]), np.ones((1, 2)), seconds=30.0)
     inputs = cast(ExcitationInputs, SimpleNamespace(prior=SimpleNamespace(bands=bands, seconds=existing)))
     variance = (30.0 + (existing + 10.0) * ADDED_ERRORS) / (existing + 40.0)
