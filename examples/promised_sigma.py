@@ -4,8 +4,8 @@ CALIB_DATA=... python examples/promised_sigma.py [--quick] [--csv FILE] [ROBOT .
 
 Recordings of a robot are identified, and another one is taken for the further motion. Its σ are predicted by what
 `calib excite --after` calls; then all of them are identified together. The first table has a row per robot; robots
-without data are skipped. The second table says what the rest is due to: the same with the torque errors reached in place
-of those predicted, and the ceiling, i.e. a prediction that misses by nothing but the sampling of the reached σ.
+without data are skipped. The second table says what the rest is due to: the same with the torque errors reached in
+place of those predicted, and the ceiling, i.e. a prediction that misses by nothing but the sampling of the reached σ.
 """
 
 from __future__ import annotations
@@ -231,7 +231,7 @@ def ceiling(model: DynamicsModel) -> np.ndarray:
 
 
 def density(series: Sequence[np.ndarray], stream: np.random.Generator) -> float:
-    """Return the density of resampled errors of recordings (N_i,), up to a factor, as an identification estimates it."""
+    """Return the density of resampled errors of recordings (N_i,), up to a factor, as identifications estimate it."""
     squares = inflated = 0.0
     for errors in series:
         length = max(MIN_BLOCK, round(BLOCKS * min(inflation(errors), MAX_INFLATION)))

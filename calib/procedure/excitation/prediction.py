@@ -154,7 +154,7 @@ class MotionOutlook:
                 "version, does not state its errors in wider bands: identify again"
             )
         low, high = self.reached
-        return f"in 80 % of cases σ reached of a parameter was {low:g} to {high:g} times σ predicted"
+        return f"on six real robots σ reached of 80 % of the parameters was {low:g} to {high:g} times σ predicted"
 
 
 def foretell(
