@@ -38,6 +38,8 @@ def test_densities_follow_the_colour_of_the_errors():
     assert bands is not None
     assert bands.rows_per_second[0] == RATE / FACTOR
     assert bands.rows_per_second[-1] == RATE
+    # but for the ends that the filters take
+    assert 0.95 * COUNT / RATE < bands.seconds <= COUNT / RATE
     assert bands.density[0] == pytest.approx(1.0)
     white_factor, blue_factor, slow_factor = bands.factor(4.0 * RATE / FACTOR)
     assert white_factor == pytest.approx(1.0, abs=0.2)
@@ -47,7 +49,7 @@ def test_densities_follow_the_colour_of_the_errors():
 
 
 def test_a_narrower_band_changes_nothing():
-    bands = ErrorBands(np.array([10.0, 40.0]), np.array([[1.0, 1.0], [1.0, 4.0]]))
+    bands = ErrorBands(np.array([10.0, 40.0]), np.array([[1.0, 1.0], [1.0, 4.0]]), seconds=20.0)
     assert bands.factor(2.0) == pytest.approx([1.0, 1.0])
     assert bands.factor(20.0) == pytest.approx([1.0, 2.0])
     assert bands.factor(1e3) == pytest.approx([1.0, 4.0])

@@ -35,10 +35,12 @@ class ErrorBands:
     Attributes:
         rows_per_second: (K,) increasing; the first one is that of the identification.
         density: (K, rows) relative densities; 1 in the first row.
+        seconds: duration of the recordings [s]; 0 in files that do not state it.
     """
 
     rows_per_second: Array
     density: Array
+    seconds: float = 0.0
 
     def factor(self, rows_per_second: float) -> np.ndarray:
         """Return the factor (rows,) of the density if all recordings have this number of rows per second.
@@ -85,7 +87,7 @@ def error_bands(
     if not has_errors.any():
         return None
     relative = np.where(has_errors, density / np.where(has_errors, density[0], 1.0), 1.0)
-    return ErrorBands(rates, relative)
+    return ErrorBands(rates, relative, sum(case.duration for case in cases))
 
 
 def _power(

@@ -203,7 +203,8 @@ def _bands(folder: Path, model: ExcitedModel) -> ErrorBands | None:
     bands = IdentificationFolder(folder).metrics().error_bands
     if bands is None:
         return None
-    return ErrorBands(bands.rows_per_second, np.tile(bands.density, len(model.exact.loads)))
+    density = np.tile(bands.density, len(model.exact.loads))
+    return ErrorBands(bands.rows_per_second, density, bands.seconds)
 
 
 def _data_information(folder: Path, model: ExcitedModel) -> np.ndarray | None:

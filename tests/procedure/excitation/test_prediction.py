@@ -12,13 +12,14 @@ import pytest
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError
 from calib.identification.identify_options import IdentifyOptions
+from calib.identification.uncertainty.error_bands import ErrorBands
 from calib.identification.uncertainty.geometry_uncertainty import propagate
 from calib.procedure.dynamic_stage import identify, inputs
 from calib.procedure.excitation import design, prediction
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.geometry_spread import geometry_spread
 from calib.procedure.excitation.inputs import ExcitationInputs
-from calib.procedure.excitation.prediction import _information_root, _reweighted
+from calib.procedure.excitation.prediction import ADDED_ERRORS, _information_root, _reweighted, _wider
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
 
@@ -118,6 +119,15 @@ def test_earlier_rows_are_weighed_by_the_rows_that_see_a_parameter():
     whitened[:, 1, 1] = 5.0
     factor = _reweighted(whitened, np.array([2.0, 4.0]))
     assert factor == pytest.approx([1 / 2, 1 / 4, 1 / 4])
+
+
+@pytest.mark.parametrize("existing", [0.0, 10.0], ids=["a further motion", "another one beside"])
+def test_added_errors_count_by_the_time_that_is_new(existing):
+    """Earlier recordings keep their variance; motions that are not identified have `ADDED_ERRORS` times it."""
+    bands = ErrorBands(np.array([50.0]), np.ones((1, 2)), seconds=30.0)
+    inputs = cast(ExcitationInputs, SimpleNamespace(prior=SimpleNamespace(bands=bands, seconds=existing)))
+    variance = (30.0 + (existing + 10.0) * ADDED_ERRORS) / (existing + 40.0)
+    assert _wider(inputs, np.zeros((5, 2, 3)), band=5.0, seconds=10.0) ** 2 == pytest.approx([variance, variance])
 
 
 def _stored(information: np.ndarray, data: np.ndarray | None) -> ExcitationInputs:
