@@ -54,3 +54,19 @@ def test_positions_on_unseen_real_poses(data):
         assert told[key][0] == count and told[key][4] == pytest.approx(beyond, abs=1), key
         assert told[key][1] == pytest.approx(rms, rel=0.03) and told[key][3] == pytest.approx(width, rel=0.03), key
         assert told[key][2] == pytest.approx(share, abs=1.0), key
+
+
+@pytest.mark.slow
+def test_parameters_of_simulated_arms(monkeypatch, capsys):
+    """Both rows of the parameters' table, of one identification each in place of fifty."""
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    import interval_coverage
+
+    interval_coverage.print_parameters(seeds=1)
+    pattern = re.compile(r"^\| (model exact|effects that no parameter holds) \| (\d+) \| ([\d.]+) % \|", re.MULTILINE)
+    fresh = pattern.findall(capsys.readouterr().out)
+    stated = pattern.findall(TABLE)
+    assert [row[0] for row in fresh] == [row[0] for row in stated] and len(stated) == 2
+    for (name, _, share), (_, _, stated_share) in zip(fresh, stated):
+        # a parameter more or less outside is 1.1 %
+        assert float(share) == pytest.approx(float(stated_share), abs=5.0), name

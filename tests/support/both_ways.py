@@ -30,28 +30,28 @@ class Judgement:
     refused: str = ""
 
 
-def same(one: Any, two: Any, where: str = "") -> None:
+def same(first: Any, second: Any, where: str = "") -> None:
     """Assert that two JSON values are the same but for rounding."""
-    if isinstance(one, Mapping):
-        assert isinstance(two, Mapping) and set(one) == set(two), where
-        for key in one:
-            same(one[key], two[key], f"{where}.{key}")
-    elif isinstance(one, list):
-        assert len(one) == len(two), where
-        for number, pair in enumerate(zip(one, two)):
+    if isinstance(first, Mapping):
+        assert isinstance(second, Mapping) and set(first) == set(second), where
+        for key in first:
+            same(first[key], second[key], f"{where}.{key}")
+    elif isinstance(first, list):
+        assert len(first) == len(second), where
+        for number, pair in enumerate(zip(first, second)):
             same(*pair, f"{where}[{number}]")
-    elif isinstance(one, float):
-        assert two == pytest.approx(one, rel=1e-6, abs=1e-9), where
+    elif isinstance(first, float):
+        assert second == pytest.approx(first, rel=1e-6, abs=1e-9), where
     else:
-        assert one == two, where
+        assert first == second, where
 
 
-def agree(one: Judgement, two: Judgement) -> None:
+def agree(first: Judgement, second: Judgement) -> None:
     """Assert that two ways of asking gave one answer."""
-    assert one.refused == two.refused
-    assert (one.verdict, one.reason) == (two.verdict, two.reason)
-    assert one.notes == two.notes
-    same(one.numbers, two.numbers)
+    assert first.refused == second.refused
+    assert (first.verdict, first.reason) == (second.verdict, second.reason)
+    assert first.notes == second.notes
+    same(first.numbers, second.numbers)
 
 
 def refusal(work: Callable[[], Any]) -> str:
@@ -67,11 +67,12 @@ def read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
-def command(*words: object) -> str:
+def command(name: str, *arguments: object) -> str:
     """Run a command, without figures; return how it was refused."""
-    bare = ["--no-plots"] if words[0] in DRAWING else []
-    arguments = [*(str(word) for word in words), *bare]
-    return refusal(lambda: COMMAND(arguments, standalone_mode=False))
+    line = [name, *(str(argument) for argument in arguments)]
+    if name in DRAWING:
+        line.append("--no-plots")
+    return refusal(lambda: COMMAND(line, standalone_mode=False))
 
 
 def session_with(folder: Path, robot: Path, model: str, *measured: Path) -> Session:
