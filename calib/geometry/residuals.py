@@ -25,6 +25,8 @@ from calib.geometry.installation import Seen
 # largest number of Gauss–Newton steps for the centre of a bar, and length of a step that ends them [m]
 CENTRE_STEPS = 20
 MIN_CHANGE = 1e-13
+# square of the relative size of a centre's direction that lengths do not determine (our choice)
+UNDETERMINED = 1e-12
 
 
 class CommonNoise(Protocol):
@@ -336,8 +338,12 @@ def _fitted(measured: Planes | Bars, seen: Seen, jacobian: np.ndarray) -> list[R
     slope = np.zeros((len(jacobian), len(measured)))
     groups, counts = np.unique(measured.group, return_counts=True)
     # three points lie on a plane, and three lengths meet in a centre, anyway
-    for group in groups[counts > 3]:
-        rows = np.flatnonzero(measured.group == group)
+    rows_of_groups = [np.flatnonzero(measured.group == group) for group in groups[counts > 3]]
+    centres = np.zeros((0, 3))
+    if isinstance(measured, Bars):
+        points_of_groups = [seen.point[:, rows] for rows in rows_of_groups]
+        centres = sphere_centres(points_of_groups, [measured.distance[rows] for rows in rows_of_groups])
+    for number, rows in enumerate(rows_of_groups):
         points = seen.point[:, rows]
         if isinstance(measured, Planes):
             centred = points - points.mean(axis=1, keepdims=True)
@@ -346,7 +352,7 @@ def _fitted(measured: Planes | Bars, seen: Seen, jacobian: np.ndarray) -> list[R
             direction = axes[:, 2:]
             nuisance = np.column_stack([np.ones(len(rows)), centred.T @ axes[:, :2]])
         else:
-            from_centre = points - _sphere_centre(points, measured.distance[rows])[:, None]
+            from_centre = points - centres[number][:, None]
             length = np.linalg.norm(from_centre, axis=0)
             value[rows] = measured.distance[rows] - length
             direction = from_centre / length
@@ -362,22 +368,49 @@ def _fitted(measured: Planes | Bars, seen: Seen, jacobian: np.ndarray) -> list[R
     return [ResidualPart(label, value[None], slope[:, None], sigma, unknowns, np.arange(len(measured)))]
 
 
-def _sphere_centre(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-    """Return the centre (3,) whose distances to points (3, m) fit the lengths (m,) best, by Gauss–Newton.
+def sphere_centres(groups: Sequence[np.ndarray], lengths: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the centres (g, 3) whose distances to the points of each group fit its lengths best, by Gauss–Newton.
 
-    The start value is the linear solution of |p|² - L² = 2 p·c - |c|² (algebraic sphere fit).
+    The start value is the linear solution of |p|² - L² = 2 p·c - |c|² (algebraic sphere fit). All groups take their
+    steps together; rows that fill a group up to the size of the largest are zero.
+
+    Args:
+        groups: points (3, m) of each of g groups.
+        lengths: their distances (m,) from the centre.
     """
-    matrix = np.column_stack([2.0 * points.T, -np.ones(points.shape[1])])
-    squares = (points**2).sum(axis=0) - lengths**2
-    centre = np.linalg.lstsq(matrix, squares, rcond=None)[0][:3]
+    size = max(map(len, lengths), default=0)
+    points = np.zeros((3, len(groups), size))
+    distance = np.zeros((len(groups), size))
+    present = np.zeros((len(groups), size))
+    for number, (group, length) in enumerate(zip(groups, lengths)):
+        points[:, number, : len(length)] = group
+        distance[number, : len(length)] = length
+        present[number, : len(length)] = 1.0
+    matrix = np.concatenate([2.0 * points, -present[None]]).swapaxes(0, 1)
+    squares = np.einsum("igm,igm->gm", points, points) - distance**2
+    centres = _least_squares(matrix, squares)[:, :3]
     for _ in range(CENTRE_STEPS):
-        to_centre = centre[:, None] - points
-        length = np.linalg.norm(to_centre, axis=0)
-        change = np.linalg.lstsq((to_centre / length).T, lengths - length, rcond=None)[0]
-        centre = centre + change
-        if np.linalg.norm(change) < MIN_CHANGE:
+        to_centre = centres.T[..., None] - points
+        length = np.sqrt(np.maximum(np.einsum("igm,igm->gm", to_centre, to_centre), 1e-300))
+        directions = (to_centre * (present / length)).swapaxes(0, 1)
+        change = _least_squares(directions, (distance - length) * present)
+        centres = centres + change
+        if np.abs(change).max(initial=0.0) < MIN_CHANGE:
             break
-    return centre
+    return centres
+
+
+def _least_squares(matrices: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the solutions (g, k) of g small least-squares problems, with hardly any change along undetermined axes.
+
+    Args:
+        matrices: (g, k, m) transposed matrices.
+        values: (g, m) right-hand sides.
+    """
+    square = matrices @ matrices.swapaxes(1, 2)
+    ridge = UNDETERMINED * np.trace(square, axis1=1, axis2=2)
+    square += ridge[:, None, None] * np.eye(square.shape[1])
+    return np.linalg.solve(square, matrices @ values[..., None])[..., 0]
 
 
 def _project(rows: np.ndarray, nuisance: np.ndarray) -> np.ndarray:
