@@ -5,9 +5,9 @@ reason, where the folder is absent.
 """
 
 import gc
-import os
 import signal
 import sys
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -53,12 +53,25 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--findings", choices=("note", "compare"), help=words)
 
 
+def compiling_lock(config: pytest.Config) -> Path | None:
+    """Return the lock file of a test run's workers; None in a process that is no worker, and on Windows."""
+    worker = getattr(config, "workerinput", None)
+    if worker is None or sys.platform == "win32":
+        return None
+    return Path(tempfile.gettempdir()) / f"calib-compiling-{worker['testrunuid']}.lock"
+
+
 def pytest_configure(config: pytest.Config) -> None:
+    # two workers that want a kernel at the same time would both compile it, for up to ten seconds
+    if lock := compiling_lock(config):
+        compiling.take_turns(lock)
     if config.getoption("findings") == "note":
         produced.note()
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
+    if lock := compiling_lock(session.config):
+        lock.unlink(missing_ok=True)
     if session.config.getoption("findings") == "note":
         produced.keep(session.config)
 
@@ -73,13 +86,6 @@ def _one_blas_thread() -> Iterator[None]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put long tests first: one that begins last keeps the other workers waiting."""
     items.sort(key=lambda item: item.get_closest_marker("long") is None)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def _kernels_are_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Two workers that want a kernel at the same time would both compile it, for up to ten seconds."""
-    if "PYTEST_XDIST_WORKER" in os.environ and sys.platform != "win32":
-        compiling.take_turns(tmp_path_factory.getbasetemp().parent / "compiling.lock")
 
 
 def pytest_collection_finish() -> None:

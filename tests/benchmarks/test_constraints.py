@@ -5,6 +5,7 @@ SECONDS at 5 kHz, 60 parameters; processor time. Janot's slides tell of 40 s for
 """
 
 import time
+from functools import cache
 
 import numpy as np
 import pytest
@@ -23,7 +24,6 @@ from calib.simulation.known_robots import random_fourier
 
 PLANT = known_robots.plant("tx40", coupled=True)
 MODEL = known_robots.model(PLANT)
-BASE = bases.find(MODEL)
 INERTIA = np.array(known_robots.truth("tx40")["drives"]["Ia"])
 SECONDS = 4.0  # of motion [s]
 ASKED = {
@@ -39,8 +39,15 @@ ASKED = {
 }  # fmt: skip
 
 
+@cache
+def base() -> bases.Base:
+    """Return the base parameters; importing this module compiles nothing."""
+    return bases.find(MODEL)
+
+
 @pytest.fixture(scope="module")
 def recorded():
+    base()  # before any time is taken
     return simulated(0, SECONDS)
 
 
@@ -61,7 +68,7 @@ def seconds(recorded, constraints, method="iv"):
     began = time.process_time()
     found = identify_instrumental(
         MODEL,
-        BASE,
+        base(),
         [recorded],
         recorded[0].motion.decimator,
         method=method,
@@ -82,8 +89,8 @@ def free(recorded, request):
 @pytest.mark.parametrize("name", ASKED)
 def test_constrained_instruments(recorded, name, free):
     method, alone, before = free
-    terms = [MODEL.columns[k - MODEL.inertial] if k >= MODEL.inertial else None for k in BASE.kept]
-    constraints = make_constraints(ConstraintSettings(**ASKED[name]), MODEL, BASE, BASE.names, terms)
+    terms = [MODEL.columns[k - MODEL.inertial] if k >= MODEL.inertial else None for k in base().kept]
+    constraints = make_constraints(ConstraintSettings(**ASKED[name]), MODEL, base(), base().names, terms)
     held, found = seconds(recorded, constraints, method)
     assert found.constrained is not None and found.constrained.binding
     each = held / alone * len(before.rounds) / len(found.rounds)
@@ -101,9 +108,9 @@ def test_hardly_stable_step_is_no_dead_end():
     """
     recorded = simulated(8, 10.0)
     constraints = make_constraints(
-        ConstraintSettings(bounds={"ZZ2R": (-np.inf, -0.15)}, signs=False), MODEL, BASE, BASE.names,
-        [MODEL.columns[k - MODEL.inertial] if k >= MODEL.inertial else None for k in BASE.kept],
+        ConstraintSettings(bounds={"ZZ2R": (-np.inf, -0.15)}, signs=False), MODEL, base(), base().names,
+        [MODEL.columns[k - MODEL.inertial] if k >= MODEL.inertial else None for k in base().kept],
     )  # fmt: skip
     _, found = seconds(recorded, constraints, "didim")
     assert found.constrained is not None and found.constrained.binding[0].name == "ZZ2R <= -0.15"
-    assert found.fit.estimate.values[BASE.names.index("ZZ2R")] == pytest.approx(-0.15, abs=1e-6)
+    assert found.fit.estimate.values[base().names.index("ZZ2R")] == pytest.approx(-0.15, abs=1e-6)
