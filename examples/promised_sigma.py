@@ -1,6 +1,6 @@
 """How the σ that `calib excite --after` predicts for a further motion compare with those reached.
 
-CALIB_DATA=... python examples/promised_sigma.py [--quick] [--csv FILE] [ROBOT ...]
+CALIB_DATA=... python examples/promised_sigma.py [--quick | --simulated] [--csv FILE] [ROBOT ...]
 
 Recordings of a robot are identified, and another one is taken for the further motion. Its σ are predicted by what
 `calib excite --after` calls; then all of them are identified together. The first table has a row per robot; robots
@@ -43,6 +43,8 @@ DEGREE = 5  # of the spline through a recording's positions
 RESAMPLINGS = 40  # of the torque errors, for the ceiling
 BLOCKS = 6.0  # length of their blocks, in integrated autocorrelations
 MIN_BLOCK = 20  # and in samples, at least
+SIMULATED_SECONDS, SIMULATION_SEED = 10.0, 5
+WRIST = {"coupling": [{"joints": [5, 6], "label": "6"}]}
 
 
 class Pair(NamedTuple):
@@ -121,7 +123,7 @@ ROBOTS = {
     "TX40": Robot("staubli_tx40", (
         *each_to_next(parts(TX40, 0, 5.4, 2)), *each_to_next(parts(TX40, 0, 5.4, 3)), *growing(parts(TX40, 0, 5.4, 3)),
         *each_to_next(parts(TX40, 0, 5.4, 4)),
-    ), {"coupling": [{"joints": [5, 6], "label": "6"}]}),
+    ), WRIST),
     "TIAGo": Robot("tiago_laas", (
         *each_to_next(parts(TIAGO, 9, 67, 2)), *each_to_next(parts(TIAGO, 9, 67, 3)), *growing(parts(TIAGO, 9, 67, 3)),
         *each_to_next(parts(TIAGO, 9, 67, 4)),
@@ -131,6 +133,31 @@ ROBOTS = {
         *each_to_next(parts(LWR, 2.5, 22.5, 2)), *each_to_next(parts(LWR, 2.5, 22.5, 4)),
     )),
 }  # fmt: skip
+
+
+def simulated(place: Path) -> dict[str, Robot]:
+    """Write recordings of two arms, simulated by Pinocchio, and return the robots by their names."""
+    import extrapolation_simulated as simulation  # Pinocchio is a dependency of this alone
+
+    robots = {}
+    for name, arm, behind in (("simulated LWR4+", "lwr4plus", True), ("simulated TX40", "tx40", False)):
+        folder = place / arm
+        folder.mkdir()
+        described = simulation.arm(arm)
+        simulation.write_urdf(described, described.inertias, folder / "model.urdf")
+        wrong = simulation.wrong(described.inertias, SIMULATION_SEED)
+        true = simulation.write_urdf(described, wrong, folder / "true.urdf")
+        logs = [f"log_{number}.npz" for number in range(3)]
+        for number, log in enumerate(logs):
+            seed = 2 * SIMULATION_SEED + number
+            q = simulation.fourier(described, SIMULATED_SECONDS, seed)
+            simulation.record(
+                described, true, q, folder / log, seed=seed, arm_seed=SIMULATION_SEED, family="stribeck",
+                behind=behind, coupled=not behind,
+            )  # fmt: skip
+        options = {} if behind else WRIST
+        robots[name] = Robot(str(folder), (*each_to_next(logs), *growing(logs)), options)
+    return robots
 
 
 class RecordedMotion:
@@ -287,9 +314,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("robots", nargs="*", help="names of robots; all without any")
     parser.add_argument("--quick", action="store_true", help="the first pair of a robot alone")
+    parser.add_argument("--simulated", action="store_true", help="two simulated arms in place of the real robots")
     parser.add_argument("--csv", help="file for the σ of every parameter")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
+    place = tempfile.TemporaryDirectory()
+    if arguments.simulated:
+        robots = simulated(Path(place.name))
+        ROBOTS.update(robots)
+        arguments.robots = list(robots)
     of_robots: dict[str, list[Ratio]] = {}
     print("| robot | pairs | parameters | median | within 30 % | after one recording | after several |", end="")
     print(f" 10–90 % | within {REACHED[0]:g}–{REACHED[1]:g} |\n|{9 * '---|'}", flush=True)
@@ -312,6 +345,7 @@ def main() -> None:
     if arguments.csv:
         with Path(arguments.csv).open("w", newline="") as file:
             csv.writer(file).writerows([Ratio._fields, *(row for rows in of_robots.values() for row in rows)])
+    place.cleanup()
 
 
 if __name__ == "__main__":
