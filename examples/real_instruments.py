@@ -20,6 +20,7 @@ import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -135,20 +136,40 @@ def estimate(row: Row, robot: Any, case: Case, method: str, **more: Any) -> np.n
         return None
 
 
-def study(row: Row) -> str:
-    """Return a row of the table."""
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """A recording and an unseen one, with least squares, plain and under physical constraints (None: failed)."""
+
+    robot: Any
+    case: Case
+    other: Case
+    plain: Identification
+    consistent: np.ndarray | None
+
+
+@lru_cache(maxsize=1)
+def learnt(train: str) -> Learnt:
+    """Return what all rows of a recording have in common."""
+    row = next(row for row in ROWS if row.train == train)
     folder = DATA / row.folder
     paths = [folder / row.train], [folder / row.unseen]
     given = recordings.gather(folder / "model.urdf", *paths, options=settings(row))
-    robot, (case,), (other,) = given.robot, given.cases, given.unseen
-    plain = identify(robot, [case], given.options.settings)
+    (case,), (other,) = given.cases, given.unseen
+    plain = identify(given.robot, [case], given.options.settings)
+    return Learnt(given.robot, case, other, plain, estimate(row, given.robot, case, "pc-wls"))
+
+
+def study(row: Row) -> str:
+    """Return a row of the table."""
+    shared = learnt(row.train)
+    robot, case, other, plain = shared.robot, shared.case, shared.other, shared.plain
     series, period = fitted(case.motion, row.period, row.harmonics)
     motion, away = case.motion, 1e3 * (case.motion.q - series.q).std(axis=0)
     noise = 1e3 * motion.cutoffs.noise
     in_a = 100.0 * motion.cutoffs.acceleration_noise(motion.cutoff, motion.rate) / motion.a.std(axis=0)
     by_series, tests = with_series(plain, case, series)
     asked = replace(case, motion=replace(case.motion, q_ref=frozen(series.q)))
-    estimates = [plain.fitted.estimate.values, estimate(row, robot, case, "pc-wls"), by_series]
+    estimates = [plain.fitted.estimate.values, shared.consistent, by_series]
     estimates += [estimate(row, robot, asked, method, loop=PD) for method in LOOP_METHODS]
     cells = ["–" if one is None else f"{error(plain, one, other):.2f} %" for one in estimates]
     return (

@@ -32,6 +32,7 @@ def run(*parts: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_torques_on_unseen_real_motion(data):
     """Seven of the table's fourteen rows, those that miss the goal among them."""

@@ -10,6 +10,7 @@ from scripts import run_here
 STUDIES = Path(__file__).parents[2] / "examples/lwr4plus"
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_exact_gradients_beat_differences(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Exact gradients beat differences and chance in the same time."""

@@ -51,6 +51,7 @@ def test_04_compensate(tmp_path, capsys):
     assert commands < 0.2 * nominal
 
 
+@pytest.mark.long
 @pytest.mark.slow
 def test_03_session_as_script(tmp_path, capsys):
     said = run_here(EXAMPLES / "03_session_as_script.py", tmp_path, capsys=capsys)
