@@ -382,7 +382,7 @@ def readme_rows(metrics: Metrics) -> list[str]:
 
 def error_rows(runs: list[Metrics]) -> list[str]:
     """Return the table of relative errors on another motion."""
-    errors = np.array([run["cross_validation"]["idim"] for run in runs])
+    errors = by_trial(runs, "cross_validation", "idim")
     return [
         "",
         "| relative error on another loaded motion | x | y | rz |",
@@ -405,16 +405,25 @@ def summary_rows(runs: list[Metrics]) -> list[str]:
         counts = [len(run["methods"][method]["values"]) for run in runs]
         count_cells.append(median_range(counts, ".0f"))
     rows.append(f"| parameters that elimination keeps | {' | '.join(count_cells)} | |")
-    power_cells = []
-    for method in ("pim", "pim_equal_legs"):
-        errors = [run["power_error"][method] for run in runs]
-        power_cells.append(median_range(errors, ".3f"))
-    rows.append(f"| of the power, relative error | | {' | '.join(power_cells)} |")
+    power_cell = median_range(by_trial(runs, "power_error", "pim"), ".3f")
+    equal_legs_cell = median_range(by_trial(runs, "power_error", "pim_equal_legs"), ".3f")
+    rows.append(f"| of the power, relative error | | {power_cell} | {equal_legs_cell} |")
     return rows
 
 
 def table_line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
+
+
+def by_trial(runs: list[Metrics], *keys: str) -> np.ndarray:
+    """Return the values (trials, …) that stand under nested keys of each trial's metrics."""
+    values: list[Any] = []
+    for run in runs:
+        value: Any = run
+        for key in keys:
+            value = value[key]
+        values.append(value)
+    return np.array(values)
 
 
 def label(name: str) -> str:
@@ -439,7 +448,7 @@ def parameter_cell(runs: list[Metrics], method: str, kind: str, name: str, form:
     """
     if method == "pim_equal_legs" and name in LEGS[1:]:
         return "="
-    return median_range([run["methods"][method][kind][name] for run in runs], form)
+    return median_range(by_trial(runs, "methods", method, kind, name), form)
 
 
 def largest_error_cell(runs: list[Metrics], method: str, names: Sequence[str]) -> str:

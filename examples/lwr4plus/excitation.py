@@ -492,45 +492,55 @@ def summary_of(runs: list[Metrics], reference: list[Metrics]) -> Metrics:
     for columns in runs[0]["cond"]:
         condition[columns] = {}
         for scaling in ("raw", "normalised"):
-            condition[columns][scaling] = _spread([run["cond"][columns][scaling] for run in runs])
+            condition[columns][scaling] = _spread(_by_seed(runs, "cond", columns, scaling))
     summary: Metrics = {
         "cond": condition,
-        "share": np.median([run["torque_share"] for run in runs], axis=0).tolist(),
-        "peak": _spread([run["peak"] for run in runs]),
+        "share": np.median(_by_seed(runs, "torque_share"), axis=0).tolist(),
+        "peak": _spread(_by_seed(runs, "peak")),
     }
     for key in FITS:
-        fits = [run[key] for run in runs]
-        reference_fits = [run[key] for run in reference]
-        summary[key] = fit_summary(fits, reference_fits)
+        summary[key] = fit_summary(runs, reference, key)
     return summary
 
 
-def fit_summary(fits: list[Metrics], reference: list[Metrics]) -> Metrics:
+def fit_summary(runs: list[Metrics], reference: list[Metrics], key: str) -> Metrics:
     """Return medians of `fit_metrics` over the seeds, and ratios to those of the reference.
 
     Args:
-        fits: metrics of a motion's fits by seed.
-        reference: metrics of the reference's fits by seed.
+        runs: metrics of a motion by seed.
+        reference: metrics of the reference by seed.
+        key: one of `FITS`.
     """
     summary: Metrics = {}
     for figure in FIGURES:
-        summary[figure] = _spread([fit[figure] for fit in fits])
-    reference_rsd = np.median([fit["median_rsd"] for fit in reference])
-    summary["ratio"] = _spread([fit["median_rsd"] / reference_rsd for fit in fits])
+        summary[figure] = _spread(_by_seed(runs, key, figure))
+    reference_rsd = np.median(_by_seed(reference, key, "median_rsd"))
+    summary["ratio"] = _spread(_by_seed(runs, key, "median_rsd") / reference_rsd)
     for figure in ("size", "separation"):
-        ratio = _geometric_mean(fits, figure) / _geometric_mean(reference, figure)
-        summary[f"{figure}_ratio"] = ratio
+        mean = _geometric_mean(_by_seed(runs, key, figure))
+        reference_mean = _geometric_mean(_by_seed(reference, key, figure))
+        summary[f"{figure}_ratio"] = mean / reference_mean
     return summary
 
 
-def _geometric_mean(fits: list[Metrics], figure: str) -> float:
-    """Return the geometric mean of a figure over the 44 parameters and the seeds."""
-    return float(np.exp(np.mean(np.log([fit[figure] for fit in fits]))))
+def _by_seed(runs: list[Metrics], *keys: str) -> np.ndarray:
+    """Return the values (seeds, …) that stand under nested keys of each run's metrics."""
+    values: list[Any] = []
+    for run in runs:
+        value: Any = run
+        for key in keys:
+            value = value[key]
+        values.append(value)
+    return np.array(values)
 
 
-def _spread(values: list[float]) -> list[float]:
+def _geometric_mean(values: np.ndarray) -> float:
+    return float(np.exp(np.mean(np.log(values))))
+
+
+def _spread(values: np.ndarray) -> list[float]:
     """Return median, least and largest."""
-    return [float(np.median(values)), float(min(values)), float(max(values))]
+    return [float(np.median(values)), float(values.min()), float(values.max())]
 
 
 def geometries(arm: Arm, motions: dict[str, Reference], seed: int) -> Metrics:

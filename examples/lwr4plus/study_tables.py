@@ -192,7 +192,8 @@ def consistency(metrics: Metrics) -> Tables:
     tables = {"consistency-geometries": table(head, rows)}
     if metrics["coverage"]:
         columns = [_coverage_column(coverage) for coverage in metrics["coverage"].values()]
-        coverage_rows = [(label, *(column[label] for column in columns)) for label in columns[0]]
+        labels = columns[0].keys()
+        coverage_rows = list(zip(labels, *(column.values() for column in columns)))
         tables["consistency-coverage"] = table(" | ".join(["", *metrics["coverage"]]), coverage_rows)
     return tables
 
@@ -367,8 +368,14 @@ def _merit_at(curve: Sequence[Sequence[float]], seconds: float) -> float | None:
 
 def _seeds(values: Iterable[float | None], form: str) -> str:
     """Return one value per seed, with a dash for None."""
-    cells = ["–" if value is None else f"{value:{form}}" for value in values]
+    cells = [_or_dash(value, form) for value in values]
     return " / ".join(cells)
+
+
+def _or_dash(value: float | None, form: str) -> str:
+    if value is None:
+        return "–"
+    return f"{value:{form}}"
 
 
 SHOW: dict[str, Callable[[Metrics], Tables]] = {
