@@ -106,42 +106,48 @@ def growing(recordings: Sequence[str]) -> tuple[Pair, ...]:
     return tuple(Pair(tuple(recordings[:count]), recordings[count]) for count in range(2, len(recordings)))
 
 
-UR10E = [f"ur-20_02_{name}.npz" for name in (
-    "05-20sec_8harm", "05-20sec_12harm", "06-20sec_10harm", "06-20sec_5harm", "10-20sec_7harm", "10-30sec_12harm",
+def halves_to_quarters(file: str, start: float, end: float) -> tuple[Pair, ...]:
+    """Return pairs of the halves, thirds and quarters of a recording between two times [s]."""
+    pairs: list[Pair] = []
+    for count in (2, 3, 4):
+        pairs += each_to_next(parts(file, start, end, count))
+    return tuple(pairs)
+
+
+UR10E_LOGS = (
+    "05-20sec_8harm",
+    "05-20sec_12harm",
+    "06-20sec_10harm",
+    "06-20sec_5harm",
+    "10-20sec_7harm",
+    "10-30sec_12harm",
     "19_14harm50sec",
-)]  # fmt: skip
-PANDA, TX40, TIAGO = "traj1_first60pct.npz", "tx40_first_5p4s.npz", "dynamic.npz"
-LWR, KR300 = "measurements_1.npz", ["traj_A.npz", "traj_B.npz"]
-HALVES = [*parts(KR300[0], 0, 10, 2), *parts(KR300[1], 0, 10, 2)]
+)
+UR10E = [f"ur-20_02_{name}.npz" for name in UR10E_LOGS]
+UR10E_GAINS = {"gains": [14.87, 13.26, 11.13, 10.62, 11.03, 11.47]}  # [N m/A], by their authors
+PANDA = ("traj1_first60pct.npz", 0.0, 12.5)
+TX40 = ("tx40_first_5p4s.npz", 0.0, 5.4)
+TIAGO = ("dynamic.npz", 9.0, 67.0)
+LWR = ("measurements_1.npz", 2.5, 22.5)
+KR300 = ["traj_A.npz", "traj_B.npz"]
+KR300_HALVES = [*parts(KR300[0], 0, 10, 2), *parts(KR300[1], 0, 10, 2)]
 ROBOTS = {
-    "Panda": Robot("franka_panda_inria", (
-        *each_to_next(parts(PANDA, 0, 12.5, 2)), *each_to_next(parts(PANDA, 0, 12.5, 3)),
-        *each_to_next(parts(PANDA, 0, 12.5, 4)), *growing(parts(PANDA, 0, 12.5, 4)),
-    )),
-    "UR10e": Robot("ur10e_innopolis", (*each_to_next(UR10E), *growing(UR10E)),
-                   {"gains": [14.87, 13.26, 11.13, 10.62, 11.03, 11.47]}),
-    "TX40": Robot("staubli_tx40", (
-        *each_to_next(parts(TX40, 0, 5.4, 2)), *each_to_next(parts(TX40, 0, 5.4, 3)), *growing(parts(TX40, 0, 5.4, 3)),
-        *each_to_next(parts(TX40, 0, 5.4, 4)),
-    ), WRIST),
-    "TIAGo": Robot("tiago_laas", (
-        *each_to_next(parts(TIAGO, 9, 67, 2)), *each_to_next(parts(TIAGO, 9, 67, 3)), *growing(parts(TIAGO, 9, 67, 3)),
-        *each_to_next(parts(TIAGO, 9, 67, 4)),
-    )),
-    "KR300": Robot("kuka_kr300_tuk", (*each_to_next(KR300), *each_to_next(HALVES), *growing(HALVES))),
-    "LWR4+": Robot("kuka_lwr4plus_iit", (
-        *each_to_next(parts(LWR, 2.5, 22.5, 2)), *each_to_next(parts(LWR, 2.5, 22.5, 4)),
-    )),
-}  # fmt: skip
+    "Panda": Robot("franka_panda_inria", (*halves_to_quarters(*PANDA), *growing(parts(*PANDA, 4)))),
+    "UR10e": Robot("ur10e_innopolis", (*each_to_next(UR10E), *growing(UR10E)), UR10E_GAINS),
+    "TX40": Robot("staubli_tx40", (*halves_to_quarters(*TX40), *growing(parts(*TX40, 3))), WRIST),
+    "TIAGo": Robot("tiago_laas", (*halves_to_quarters(*TIAGO), *growing(parts(*TIAGO, 3)))),
+    "KR300": Robot("kuka_kr300_tuk", (*each_to_next(KR300), *each_to_next(KR300_HALVES), *growing(KR300_HALVES))),
+    "LWR4+": Robot("kuka_lwr4plus_iit", (*each_to_next(parts(*LWR, 2)), *each_to_next(parts(*LWR, 4)))),
+}
 
 
-def simulated(place: Path) -> dict[str, Robot]:
+def simulated(parent: Path) -> dict[str, Robot]:
     """Write recordings of two arms, simulated by Pinocchio, and return the robots by their names."""
     import extrapolation_simulated as simulation  # Pinocchio is a dependency of this alone
 
     robots = {}
     for name, arm, behind in (("simulated LWR4+", "lwr4plus", True), ("simulated TX40", "tx40", False)):
-        folder = place / arm
+        folder = parent / arm
         folder.mkdir()
         described = simulation.arm(arm)
         simulation.write_urdf(described, described.inertias, folder / "model.urdf")
@@ -152,9 +158,16 @@ def simulated(place: Path) -> dict[str, Robot]:
             seed = 2 * SIMULATION_SEED + number
             q = simulation.fourier(described, SIMULATED_SECONDS, seed)
             simulation.record(
-                described, true, q, folder / log, seed=seed, arm_seed=SIMULATION_SEED, family="stribeck",
-                behind=behind, coupled=not behind,
-            )  # fmt: skip
+                described,
+                true,
+                q,
+                folder / log,
+                seed=seed,
+                arm_seed=SIMULATION_SEED,
+                family="stribeck",
+                behind=behind,
+                coupled=not behind,
+            )
         options = {} if behind else WRIST
         robots[name] = Robot(str(folder), (*each_to_next(logs), *growing(logs)), options)
     return robots
@@ -195,8 +208,8 @@ def identified(robot: str, recordings: tuple[str, ...]) -> DynamicsModel:
 @cache
 def design_inputs(robot: str, earlier: tuple[str, ...]) -> ExcitationInputs:
     """Return the inputs of a design after the identification of earlier recordings."""
-    with tempfile.TemporaryDirectory() as place:
-        folder = identified(robot, earlier).save(Path(place) / "identified", plots=False)
+    with tempfile.TemporaryDirectory() as parent:
+        folder = identified(robot, earlier).save(Path(parent) / "identified", plots=False)
         return read_inputs(ROBOTS[robot].urdf, ExcitationSettings(outlook=False), after=folder)
 
 
@@ -215,19 +228,29 @@ def ratios(robot: str, pair: Pair) -> Iterator[Ratio]:
     family = RecordedMotion(together)
     assert inputs.prior is not None and inputs.prior.sigmas is not None
     density = np.array(together.to_dict()["error_density"]) / inputs.prior.sigmas**2
-    known = replace(inputs, prior=replace(inputs.prior, growth=None, bands=cast(Any, KnownErrors(density))))
-    names = list(together.found.names)
+    prior = replace(inputs.prior, growth=None, bands=cast(Any, KnownErrors(density)))
+    with_errors = predicted(replace(inputs, prior=prior), family)
+
+    positions = {name: position for position, name in enumerate(together.found.names)}
     ceilings = ceiling(together)
-    held = on_bounds(together.found)
+    bounded = on_bounds(together.found)
     label = f"{' + '.join(pair.earlier)} → {pair.further}"
-    for row, row_known in zip(predicted(inputs, family), predicted(known, family)):
-        if row.name in names and row.name not in held and row.sigma_before:
-            place = names.index(row.name)
-            reached = float(together.estimate.sigma[place])
-            several = len(pair.earlier) > 1
-            yield Ratio(
-                robot, label, row.name, several, row.sigma_before, row.sigma, reached, row_known.sigma, ceilings[place]
-            )
+    for row, row_with_errors in zip(predicted(inputs, family), with_errors):
+        # a parameter on its bound has no σ of its own
+        if row.name not in positions or row.name in bounded or not row.sigma_before:
+            continue
+        position = positions[row.name]
+        yield Ratio(
+            robot,
+            label,
+            row.name,
+            several=len(pair.earlier) > 1,
+            before=row.sigma_before,
+            predicted=row.sigma,
+            reached=float(together.estimate.sigma[position]),
+            with_errors=row_with_errors.sigma,
+            ceiling=ceilings[position],
+        )
 
 
 def ceiling(model: DynamicsModel) -> np.ndarray:
@@ -254,7 +277,7 @@ def ceiling(model: DynamicsModel) -> np.ndarray:
     by_row /= (fitted.std**2 * fitted.inflation)[:, None]
     shares = by_row / np.maximum(np.diag(covariance), 1e-300)
     resampled = np.exp(0.5 * logarithms @ shares)
-    return np.mean(np.abs(resampled - 1.0) <= WITHIN, axis=0)
+    return np.mean(within(resampled), axis=0)
 
 
 def density(series: Sequence[np.ndarray], stream: np.random.Generator) -> float:
@@ -271,9 +294,14 @@ def density(series: Sequence[np.ndarray], stream: np.random.Generator) -> float:
     return squares * min(inflated / count, MAX_INFLATION) + 1e-300
 
 
-def share(near: np.ndarray) -> str:
-    """Return the share of a mask in percent; a dash if there are none."""
-    return f"{100.0 * np.mean(near):.0f} %" if len(near) else "–"
+def share(mask: np.ndarray) -> str:
+    """Return the share of a mask in percent; a dash if it is empty."""
+    return f"{100.0 * np.mean(mask):.0f} %" if len(mask) else "–"
+
+
+def within(ratio: np.ndarray) -> np.ndarray:
+    """Return whether σ reached is within `WITHIN` of the predicted one (k,)."""
+    return np.abs(ratio - 1.0) <= WITHIN
 
 
 def spread(of_robots: Sequence[np.ndarray]) -> np.ndarray:
@@ -285,29 +313,76 @@ def spread(of_robots: Sequence[np.ndarray]) -> np.ndarray:
     return values[order][np.searchsorted(cumulative, RANGE)]
 
 
-def line(robot: str, rows: Sequence[Ratio]) -> str:
+def ratio_line(robot: str, rows: Sequence[Ratio]) -> str:
     """Return a robot's row of the first table."""
-    ratio, several = np.array([row.reached / row.predicted for row in rows]), np.array([row.several for row in rows])
-    near = np.abs(ratio - 1.0) <= WITHIN
-    low, high = np.quantile(ratio, RANGE)
-    said = (ratio >= REACHED[0]) & (ratio <= REACHED[1])
-    return (
-        f"| {robot} | {len({row.pair for row in rows})} | {len(ratio)} | {np.median(ratio):.2f} | {share(near)} | "
-        f"{share(near[~several])} | {share(near[several])} | {low:.2f}–{high:.2f} | {share(said)} |"
-    )
-
-
-def residue(robot: str, rows: Sequence[Ratio], others: Sequence[np.ndarray]) -> str:
-    """Return a robot's row of the second table."""
     ratio = np.array([row.reached / row.predicted for row in rows])
-    known = np.array([row.reached / row.with_errors for row in rows])
-    near = np.abs(known - 1.0) <= WITHIN
-    kept = ""
-    if others:
-        low, high = spread(others)
-        kept = f"{low:.2f}–{high:.2f}: {share((ratio >= low) & (ratio <= high))}"
+    several = np.array([row.several for row in rows])
+    pairs = {row.pair for row in rows}
+    low, high = np.quantile(ratio, RANGE)
+    in_stated_range = (ratio >= REACHED[0]) & (ratio <= REACHED[1])
+    cells = (
+        robot,
+        str(len(pairs)),
+        str(len(ratio)),
+        f"{np.median(ratio):.2f}",
+        share(within(ratio)),
+        share(within(ratio[~several])),
+        share(within(ratio[several])),
+        f"{low:.2f}–{high:.2f}",
+        share(in_stated_range),
+    )
+    return f"| {' | '.join(cells)} |"
+
+
+def residue_line(robot: str, rows: Sequence[Ratio], other_ratios: Sequence[np.ndarray]) -> str:
+    """Return a robot's row of the second table.
+
+    Args:
+        robot: its name.
+        rows: its parameters.
+        other_ratios: ratios of the other robots, whose range is held against this one.
+    """
+    ratio = np.array([row.reached / row.predicted for row in rows])
+    ratio_with_errors = np.array([row.reached / row.with_errors for row in rows])
+    cover = ""
+    if other_ratios:
+        low, high = spread(other_ratios)
+        cover = f"{low:.2f}–{high:.2f}: {share((ratio >= low) & (ratio <= high))}"
     highest = 100.0 * np.mean([row.ceiling for row in rows])
-    return f"| {robot} | {share(np.abs(ratio - 1.0) <= WITHIN)} | {share(near)} | {highest:.0f} % | {kept} |"
+    return f"| {robot} | {share(within(ratio))} | {share(within(ratio_with_errors))} | {highest:.0f} % | {cover} |"
+
+
+def print_tables(robots: Sequence[str], quick: bool) -> list[Ratio]:
+    """Print both tables, a robot's row as soon as it is made, and return what they are made of.
+
+    Args:
+        robots: names of the robots.
+        quick: whether only the first pair of a robot is taken.
+    """
+    header = "robot | pairs | parameters | median | within 30 % | after one recording | after several | 10–90 %"
+    print(f"| {header} | within {REACHED[0]:g}–{REACHED[1]:g} |\n|{9 * '---|'}", flush=True)
+    rows_of_robots: dict[str, list[Ratio]] = {}
+    for name in robots:
+        robot = ROBOTS[name]
+        if not robot.urdf.exists():
+            print(f"{name} is skipped: no {robot.urdf}", flush=True)
+            continue
+        pairs = robot.pairs[:1] if quick else robot.pairs
+        rows_of_robots[name] = [row for pair in pairs for row in ratios(name, pair)]
+        print(ratio_line(name, rows_of_robots[name]), flush=True)
+
+    print("\n| robot | within 30 % | with the torque errors reached | ceiling | 10–90 % of the others: holds |")
+    print(f"|{5 * '---|'}")
+    ratio_of_robots = {}
+    for name, rows in rows_of_robots.items():
+        ratio_of_robots[name] = np.array([row.reached / row.predicted for row in rows])
+    for name, rows in rows_of_robots.items():
+        other_ratios = [ratio for peer, ratio in ratio_of_robots.items() if peer != name]
+        print(residue_line(name, rows, other_ratios))
+    if len(ratio_of_robots) > 1:
+        low, high = spread(list(ratio_of_robots.values()))
+        print(f"\n10–90 % of all robots, which count alike: {low:.2f}–{high:.2f}")
+    return [row for rows in rows_of_robots.values() for row in rows]
 
 
 def main() -> None:
@@ -318,34 +393,16 @@ def main() -> None:
     parser.add_argument("--csv", help="file for the σ of every parameter")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
-    place = tempfile.TemporaryDirectory()
-    if arguments.simulated:
-        robots = simulated(Path(place.name))
-        ROBOTS.update(robots)
-        arguments.robots = list(robots)
-    of_robots: dict[str, list[Ratio]] = {}
-    print("| robot | pairs | parameters | median | within 30 % | after one recording | after several |", end="")
-    print(f" 10–90 % | within {REACHED[0]:g}–{REACHED[1]:g} |\n|{9 * '---|'}", flush=True)
-    for name in arguments.robots or ROBOTS:
-        robot = ROBOTS[name]
-        if not robot.urdf.exists():
-            print(f"{name} is skipped: no {robot.urdf}", flush=True)
-            continue
-        pairs = robot.pairs[:1] if arguments.quick else robot.pairs
-        of_robots[name] = [row for pair in pairs for row in ratios(name, pair)]
-        print(line(name, of_robots[name]), flush=True)
-    print("\n| robot | within 30 % | with the torque errors reached | ceiling | 10–90 % of the others: holds |")
-    print(f"|{5 * '---|'}")
-    reached = {name: np.array([row.reached / row.predicted for row in rows]) for name, rows in of_robots.items()}
-    for name, rows in of_robots.items():
-        print(residue(name, rows, [ratio for other, ratio in reached.items() if other != name]))
-    if len(reached) > 1:
-        low, high = spread(list(reached.values()))
-        print(f"\n10–90 % of all robots, which count alike: {low:.2f}–{high:.2f}")
+    with tempfile.TemporaryDirectory() as folder:
+        names = arguments.robots or list(ROBOTS)
+        if arguments.simulated:
+            arms = simulated(Path(folder))
+            ROBOTS.update(arms)
+            names = list(arms)
+        rows = print_tables(names, arguments.quick)
     if arguments.csv:
         with Path(arguments.csv).open("w", newline="") as file:
-            csv.writer(file).writerows([Ratio._fields, *(row for rows in of_robots.values() for row in rows)])
-    place.cleanup()
+            csv.writer(file).writerows([Ratio._fields, *rows])
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 FIGURES_FILE = ROOT / "tests/size.toml"
 PACKAGES = ("calib", "poses", "trajectories")
+WRITTEN_TO_BE_READ = (*PACKAGES, "examples", "docs")
 NESTED_STATEMENT = 3  # comprehensions and conditionals in a statement from which on it is called nested
 
 EMPTY_WORDS = """
