@@ -494,7 +494,7 @@ def test_a_front_serves_the_goals():
 @pytest.mark.slow
 def test_torque_goal_works_without_friction():
     """Typical friction stands in for what nobody knows yet, so that condition numbers do not pay for a goal in vain."""
-    settings = replace(SHORT, starts=2, evaluations=300, outlook=False)
+    settings = replace(SHORT, starts=1, evaluations=100, outlook=False)
     plain = design.excite("lwr4plus", settings)
     found = design.excite("lwr4plus", replace(settings, goals=("wrist=0.1",)))
     assert found.goals[0][3] >= 0.1 and "torque goals expect friction" in " ".join(found.notes)
