@@ -227,13 +227,13 @@ def _verdicts(content: Any) -> list[tuple[str, str]]:
 
 
 def test_poses_are_held_out_by_default(measured: Session) -> None:
-    """Without a validation file, a share of the poses is held out."""
+    """Without a validation file, a share of the poses is held out; five are too few for the verdict, which says so."""
     measured.path("3-measured/validation_measured.csv").unlink()
     assert go_on(measured) is not None, "waits for the planned validation poses"
     edit(measured.path("session.toml"), "holdout = 0.0", "holdout = 0.25")
     assert go_on(measured) is None
     found = json.loads(measured.path("5-validation/metrics.json").read_text())
-    assert found["validation"]["measured.csv"]["poses"] == 5 and "on measured.csv, unseen" in found["reason"]
+    assert found["validation"]["measured.csv"]["poses"] == 5 and "(5 unseen poses are too few)" in found["reason"]
     assert json.loads(measured.path("4-fit/metrics.json").read_text())["fit"]["poses"] == 15
 
 
