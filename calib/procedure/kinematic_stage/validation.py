@@ -94,7 +94,7 @@ def judge(
 
     Three kinds of findings count in every group: the other findings on the fit
     (`calib.procedure.kinematic_stage.plausibility`), ``gross-unseen-rows``, which replaces ``refuted``, and
-    ``few-unseen-poses``: fewer than `MIN_UNSEEN` poses of a file decide nothing, but may contradict a pass.
+    ``few-unseen-poses``: fewer than `MIN_UNSEEN` poses of a file prove nothing, but may contradict the fit.
 
     Args:
         fit: errors of both arms on the fitted rows.

@@ -67,8 +67,11 @@ SCALE = finding("lengths-grew", factor=1.01, sigma=1e-4, explained=0.9, off=0.01
         # few poses decide nothing, not even beside others that do, but withhold a pass that they contradict
         ({"a": few_rows(1.0, 0.01)}, {"cross_validated": None}, "marginal", "no-unseen-poses"),
         ({"a": few_rows(1.0, 0.1)}, {}, "pass", ""),
-        ({"a": few_rows(1.0, 2.0)}, {}, "marginal", "few-unseen-poses"),
-        ({"a": few_rows(1.0, 2.0), "b": rows(1.0, 0.1)}, {}, "marginal", "few-unseen-poses"),
+        ({"a": few_rows(1.0, 0.5)}, {}, "marginal", "few-unseen-poses"),
+        ({"a": few_rows(1.0, 0.5), "b": rows(1.0, 0.1)}, {}, "marginal", "few-unseen-poses"),
+        # or refute the fit
+        ({"a": few_rows(1.0, 2.0)}, {}, "fail", "few-unseen-poses"),
+        ({"a": few_rows(1.0, 2.0), "b": rows(1.0, 0.1)}, {}, "fail", "few-unseen-poses"),
         ({"a": few_rows(1.0, 0.1), "b": rows(1.0, 1.1)}, {}, "fail", "worse-than-nominal"),
         ({"a": rows(1.0, 0.99)}, {"reach": 1.0}, "fail", "no-better-model"),
         # only frames were asked for: the tolerance decides, without one nothing does
