@@ -35,8 +35,10 @@ MIN_PAIRED = 0.5
 MAX_CUTS = 120
 # smallest number of rows in which two targets are searched (our choice)
 MIN_MIXED = 24
-# squared error of a row, over the mean, up to which it is none of other rows (our choice)
+# squared error that a row may add, over the mean of all rows, where it fits as well as they do: three sigma (our choice)
 TIED = 9.0
+# [m] rms error below which it is rounding: sums of squares of positions of some metres have 1e-15 m² of it
+POSITION_ROUNDING = 1e-7
 # largest number of iterations of the assignment of rows to targets; a few are needed
 MAX_ROUNDS = 50
 # size of a combination of columns, relative to the largest, below which it is rounding: some 1e6 roundings of double
@@ -181,7 +183,8 @@ def _best_first(nominal: Installation, block: Positions, shift: int) -> int | No
     best = coarse[np.argmin(errors.at(coarse))]
     around = numbers[np.abs(numbers - best) < max(len(numbers) // MAX_CUTS, 1)]
     best = int(around[np.argmin(errors.at(around))])
-    return _last_as_good(errors.at(numbers[numbers >= best]), numbers[numbers >= best], len(block))
+    later = numbers[numbers >= best]
+    return _last_as_good(errors.at(later), later, len(block))
 
 
 def _first_rows(block: Positions, shift: int) -> np.ndarray:
@@ -201,8 +204,11 @@ def _last_as_good(squares: np.ndarray, numbers: np.ndarray, count: int) -> int:
         numbers: (k,) their row numbers, the best one first.
         count: number of rows.
     """
-    as_good = count * squares < (count + TIED) * squares[0]
-    return int(numbers[np.argmin(as_good) - 1 if not as_good.all() else -1])
+    least = max(float(squares[0]), POSITION_ROUNDING**2)
+    is_worse = count * squares >= (count + TIED) * least
+    if not is_worse.any():
+        return int(numbers[-1])
+    return int(numbers[np.argmax(is_worse) - 1])
 
 
 @dataclass(frozen=True, eq=False)
