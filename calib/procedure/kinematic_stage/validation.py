@@ -94,7 +94,8 @@ def judge(
 
     Three kinds of findings count in every group: the other findings on the fit
     (`calib.procedure.kinematic_stage.plausibility`), ``gross-unseen-rows``, which replaces ``refuted``, and
-    ``few-unseen-poses``: fewer than `MIN_UNSEEN` poses of a file prove nothing, but may contradict the fit.
+    ``few-unseen-poses``: fewer than `MIN_UNSEEN` poses of a file prove nothing, but may contradict the fit. Their
+    gross rows are named, and do not contradict it.
 
     Args:
         fit: errors of both arms on the fitted rows.
@@ -106,7 +107,7 @@ def judge(
         arm: name of the deliverable if there are several; otherwise empty.
     """
     unseen = {name: comparison for name, comparison in validation.items() if comparison.decides}
-    few = list(_few(fit, validation, cross_validated))
+    few = [*_few(fit, validation, cross_validated), *_gross_of_few(validation, findings.reach)]
     nominal_rms = fit.errors[0].rms
     fitted_rms = fit.errors[1].rms
     frames_only = findings.model == requested_model == "frames"
@@ -165,6 +166,8 @@ def judge(
 def _few(fit: Comparison, validation: Mapping[str, Comparison], cross_validated: float | None) -> Iterator[Finding]:
     """Yield a finding on each validation file with too few poses for a verdict.
 
+    Rows that are far off with both arms do not count (`_gross_of_few`).
+
     Args:
         fit: errors of both arms on the fitted rows.
         validation: name of a validation file -> errors of both arms.
@@ -173,9 +176,23 @@ def _few(fit: Comparison, validation: Mapping[str, Comparison], cross_validated:
     promised = max(fit.errors[1].rms if cross_validated is None else cross_validated, TINY)
     for name, rows in validation.items():
         if rows.proves and rows.few is not None:
-            rms = rows.errors[1].rms
+            sizes = rows.errors[1].main[~_far_off_with_both_arms(rows)]
+            rms = float(np.sqrt(np.sum(sizes**2) / max(len(sizes), 1)))
             values = {"where": name, "poses": rows.few, "least": MIN_UNSEEN, "rms": rms, "times": rms / promised}
             yield finding("few-unseen-poses", **values)
+
+
+def _gross_of_few(validation: Mapping[str, Comparison], reach: float) -> Iterator[Finding]:
+    """Yield the findings of `_gross` on validation files with too few poses for a verdict.
+
+    Args:
+        validation: name of a validation file -> errors of both arms.
+        reach: reach of the arm [m].
+    """
+    for name, rows in validation.items():
+        if rows.proves and rows.few is not None:
+            nominal, calibrated = rows.errors
+            yield from filter(level_of, _gross(_Proof(nominal.rms, calibrated.rms, name, rows), reach))
 
 
 def _frames_verdict(
@@ -257,15 +274,22 @@ def _gross(proof: _Proof, reach: float) -> Iterator[Finding]:
     """
     if proof.rows is None:
         return
-    before = proof.rows.errors[0].main
     after = proof.rows.errors[1].main
-    gross = _far_above_median(before) & _far_above_median(after)
+    gross = _far_off_with_both_arms(proof.rows)
     rows = _row_texts(proof.rows, gross)
     # errors of zero are of rows that determine themselves, such as three points of a plane
     if rows and np.any(after[~gross]):
         without = float(np.sqrt(np.mean(after[~gross] ** 2)))
         share = min(proof.before, proof.after) / reach
         yield finding("gross-unseen-rows", rows=rows, without=without, times=proof.after / without, share=share)
+
+
+def _far_off_with_both_arms(comparison: Comparison) -> np.ndarray:
+    """Return flags (m,): whether the errors of both arms are far above their medians in each row of a comparison."""
+    nominal, calibrated = comparison.errors
+    if not len(calibrated.main):
+        return np.zeros(0, dtype=bool)
+    return _far_above_median(nominal.main) & _far_above_median(calibrated.main)
 
 
 def _far_above_median(sizes: np.ndarray) -> np.ndarray:
