@@ -35,7 +35,7 @@ MIN_PAIRED = 0.5
 MAX_CUTS = 120
 # smallest number of rows in which two targets are searched (our choice)
 MIN_MIXED = 24
-# squared error that a row may add, over the mean of all rows, where it fits as well as they do: three sigma (our choice)
+# squared error that a row may add, over the mean of all rows, where it fits as well as they do (our choice)
 TIED = 9.0
 # [m] rms error below which it is rounding: sums of squares of positions of some metres have 1e-15 m² of it
 POSITION_ROUNDING = 1e-7

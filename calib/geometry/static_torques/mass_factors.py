@@ -1,11 +1,11 @@
-"""Masses of an arm as unknowns of its fit, where poses under several stated loads tell them from the compliance.
+"""Masses of an arm as unknowns of its fit, where poses under several stated loads separate them from the compliance.
 
 Gravity turns an element by c (m_load(q) + Σ_i m_i(q, f_i, Δ_i)): c is its compliance, m_load the moment
-of the stated load, m_i that of body i as described. f_i is the logarithm of the factor of its mass, Δ_i the change of
+of the stated load, m_i that of body i. f_i is the logarithm of the factor of its described mass, Δ_i [m] the change of
 its first moments over its described mass. Their prior is normal: all bodies have one factor in common, as descriptions
 of another arm of the family or without motors do, and each has one of its own. The estimate is the most probable one,
-by Gauss–Newton steps in which the parameters of the fit move along. Under a single load c and the masses are one
-product, and the prior remains.
+by Gauss–Newton steps in which the parameters of the fit move along. Under a single load only the product of c and the
+masses is determined, and the prior remains.
 """
 
 from collections.abc import Sequence
@@ -24,19 +24,24 @@ from calib.geometry.weighing import GeometricFit
 from calib.robot.calibrated import BY_TORQUE
 from calib.robot.chain import Chain
 
-# prior standard deviation of the logarithm of the factor that all masses have in common, and of each body's
-# (our choice): of a description, and of a usual arm
-DESCRIBED_FACTOR, USUAL_FACTOR = (0.5, 0.3), (1.0, 0.5)
-# the same of a centre of mass, as a share of the arm's length (our choice)
+# prior standard deviations of the logarithm of the factor that all masses have in common, and of that of a single
+# body, of described masses (our choice)
+DESCRIBED_FACTOR = 0.5, 0.3
+# the same of the masses of a usual arm, where none are described (our choice)
+USUAL_FACTOR = 1.0, 0.5
+# prior standard deviation of a centre of mass, as a share of the arm's length (our choice)
 CENTRE_SHARE = 0.05
 # [kg/m²] mass of a usual arm over the square of its length (our choice)
 USUAL_MASS = 40.0
 # largest change of a logarithm in one step, and change in standard deviations below which the steps end (our choice)
 MAX_STEP, SETTLED = 1.0, 0.1
-# step of the differences by which the residuals' derivatives are computed, in standard deviations of the prior
+# step of the differences by which the residuals' derivatives are computed, in standard deviations of the prior (our
+# choice)
 DIFFERENCE = 0.02
-# standard deviations of the common factor from which on it is stated
+# standard deviations by which the total mass has to differ from the described one to be stated (our choice)
 MIN_SIGMAS = 3.0
+# [kg] load whose deflection is compared with its doubt: any does, since both grow with it; every arm carries this one
+TEST_LOAD = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +113,7 @@ class MassFactors:
         covariance = np.linalg.inv(0.5 * (information + information.T))
         change = covariance @ (by_masses.T @ residual - precision @ self.values)
         n = self.chain.n
-        change *= min(1.0, MAX_STEP / float(np.max(np.abs(change[:n]))))
+        change /= max(1.0, float(np.max(np.abs(change[:n]))) / MAX_STEP)
         doubt = self._doubt(fit, measured, slope, covariance)
         return replace(self, values=self.values + change, covariance=covariance, doubt=doubt)
 
@@ -144,24 +149,12 @@ class MassFactors:
             slope: (f, 4 n) change of the fit's parameters per unknown.
             covariance: (4 n, 4 n) posterior covariance of the unknowns.
         """
-        cell = fit.cell
-        chain = cell.chain
-        elements = {name: number for number, name in enumerate(chain.names)}
-        numbers = layout(cell).index("deflection").tolist()
-        compliance = np.zeros(len(chain.elements))
-        slopes = np.zeros((len(chain.elements), len(self.values)))
-        for position, parameter in enumerate(fit.free.tolist()):
-            if parameter not in numbers:
-                continue
-            number = numbers.index(parameter)
-            term = cell.deflection.terms[number]
-            if term.basis in BY_TORQUE:
-                compliance[elements[term.element]] += np.asarray(cell.deflection.coefficients)[number]
-                slopes[elements[term.element]] += slope[position]
+        chain = fit.cell.chain
+        compliance, slopes = _compliance_slopes(fit, slope)
+        test_load = carried_load(chain, np.array([[TEST_LOAD, 0.0, 0.0, 0.0]]))
         total, doubtful = 0.0, 0.0
         for block in measured:
-            load = np.tile(carried_load(chain, np.array([[1.0, 0.0, 0.0, 0.0]])), (len(block), 1))
-            motions = load_motions(cell, replace(block, load=load))
+            motions = load_motions(fit.cell, replace(block, load=np.tile(test_load, (len(block), 1))))
             total += float(np.sum(np.einsum("k,kim->im", compliance, motions) ** 2))
             by_unknown = np.einsum("ku,kim->uim", slopes, motions).reshape(len(self.values), -1)
             doubtful += float(np.sum((covariance @ by_unknown) * by_unknown))
@@ -185,6 +178,30 @@ class MassFactors:
 def several_loads(measured: Sequence[PoseMeasurements]) -> bool:
     """Return whether poses were measured under several stated loads."""
     return any(block.payload is not None for block in measured) and len(load_masses(measured)) > 1
+
+
+def _compliance_slopes(fit: GeometricFit, slope: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the fitted compliance (K,) of each element [rad/(N m)], and its change (K, u) per unknown.
+
+    Args:
+        fit: a fit with compliance by torques.
+        slope: (f, u) change of the fit's parameters per unknown.
+    """
+    cell = fit.cell
+    chain = cell.chain
+    elements = {name: number for number, name in enumerate(chain.names)}
+    numbers = layout(cell).index("deflection").tolist()
+    compliance = np.zeros(len(chain.elements))
+    slopes = np.zeros((len(chain.elements), slope.shape[1]))
+    for position, parameter in enumerate(fit.free.tolist()):
+        if parameter not in numbers:
+            continue
+        number = numbers.index(parameter)
+        term = cell.deflection.terms[number]
+        if term.basis in BY_TORQUE:
+            compliance[elements[term.element]] += np.asarray(cell.deflection.coefficients)[number]
+            slopes[elements[term.element]] += slope[position]
+    return compliance, slopes
 
 
 def _of_masses(cell: Installation, masses: np.ndarray) -> Installation:
