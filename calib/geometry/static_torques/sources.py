@@ -132,12 +132,12 @@ def torques_used(
         deflection: the fitted corrections.
         gravity: the fitted gravity; None without measured torques.
         source: `MEASURED` or `MODELLED`.
-        by_loads: whether the deflection under several stated loads told the masses.
+        by_loads: whether the masses are estimated from the deflection under several stated loads.
     """
     if not deflection.by_torque:
         return []
     if gravity is None:
-        origin = "of masses that the stated loads tell" if by_loads else "of the described masses"
+        origin = "of masses fitted to the deflection under the stated loads" if by_loads else "of the described masses"
         return [finding("torques-used", source=origin, sigma=None, joint=None, worst=None)]
     texts = {
         MEASURED: "as measured, elsewhere of masses fitted to these",

@@ -154,7 +154,7 @@ class MotionOutlook:
                 "version, does not state its errors in wider bands: identify again"
             )
         low, high = self.reached
-        return f"on six real robots σ reached of 80 % of the parameters was {low:g} to {high:g} times σ predicted"
+        return f"on six real robots, 80 % of the parameters reached a σ of {low:g} to {high:g} times the predicted one"
 
 
 def foretell(
@@ -451,6 +451,7 @@ def _wider(inputs: ExcitationInputs, regressor: np.ndarray, band: float, seconds
         band: identification band of the motion [Hz].
         seconds: duration of the motion [s].
     """
+    # earlier recordings of unknown duration (0) count as none, which gives the largest σ
     if inputs.prior is None or inputs.prior.bands is None:
         return np.ones(regressor.shape[1])
     bands = inputs.prior.bands

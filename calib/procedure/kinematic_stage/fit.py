@@ -44,7 +44,8 @@ Progress = Callable[[str], None]
 
 # nominal errors fall by this factor when each file gets a station of its own: the instrument was moved (our choice)
 MOVED = 3.0
-# largest number of selections until the masses under several loads have converged (our choice)
+# largest number of selections until the masses under several loads have converged; the last masses are taken then (our
+# choice)
 MASS_ROUNDS = 8
 # smallest cross-validated error with corrections over that without, if errors of joints are random (our choice)
 MIN_RANDOM = 0.8
@@ -281,17 +282,17 @@ def _selected(
 
 
 def _masses_unknown(inputs: Inputs) -> bool:
-    """Return whether poses under several stated loads may tell the arm's masses, which nothing else has told."""
-    told = inputs.gravity is not None or inputs.masses is not None or inputs.compliance is not None
-    earlier = inputs.earlier is not None and inputs.earlier.corrections is not None
+    """Return whether only poses under several stated loads can determine the masses that deflect the arm."""
+    known = inputs.gravity is not None or inputs.masses is not None or inputs.compliance is not None
+    corrected = inputs.earlier is not None and inputs.earlier.corrections is not None
     serial = len(inputs.chain.driven) == inputs.chain.n
-    return serial and not told and not earlier and several_loads(inputs.fit)
+    return serial and not known and not corrected and several_loads(inputs.fit)
 
 
 def _weighed(
     inputs: Inputs, options: FitOptions, settings: FitSettings, weighing: Settings
 ) -> tuple[MassFactors | None, Inputs, tuple[Callable[..., ModelSelection], ModelSelection]]:
-    """Return the masses that the loads tell, the inputs with their torques, and the model selected on these.
+    """Return the masses estimated from the deflection under loads, the inputs with their torques, and the model on these.
 
     The masses are None where no compliance by torques is selected.
 
@@ -309,6 +310,7 @@ def _weighed(
         if not fit.cell.deflection.by_torque or not fit.solution.status.good:
             return None, inputs, selected
         following = factors.step(fit, loaded.fit)
+        # the masses of this fit, with the covariance that the step computed there
         reached = replace(following, values=factors.values)
         if following.change_from(factors) < SETTLED:
             break

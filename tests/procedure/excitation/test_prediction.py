@@ -121,12 +121,13 @@ def test_earlier_rows_are_weighed_by_the_rows_that_see_a_parameter():
     assert factor == pytest.approx([1 / 2, 1 / 4, 1 / 4])
 
 
+@pytest.mark.parametrize("earlier", [30.0, 0.0], ids=["stated time", "file without a time"])
 @pytest.mark.parametrize("existing", [0.0, 10.0], ids=["a further motion", "another one beside"])
-def test_added_errors_count_by_the_time_that_is_new(existing):
+def test_added_errors_count_by_the_time_that_is_new(existing, earlier):
     """Earlier recordings keep their variance; motions that are not identified have `ADDED_ERRORS` times it."""
-    bands = ErrorBands(np.array([50.0]), np.ones((1, 2)), seconds=30.0)
+    bands = ErrorBands(np.array([50.0]), np.ones((1, 2)), seconds=earlier)
     inputs = cast(ExcitationInputs, SimpleNamespace(prior=SimpleNamespace(bands=bands, seconds=existing)))
-    variance = (30.0 + (existing + 10.0) * ADDED_ERRORS) / (existing + 40.0)
+    variance = (earlier + (existing + 10.0) * ADDED_ERRORS) / (earlier + existing + 10.0)
     assert _wider(inputs, np.zeros((5, 2, 3)), band=5.0, seconds=10.0) ** 2 == pytest.approx([variance, variance])
 
 

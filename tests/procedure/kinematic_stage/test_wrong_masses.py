@@ -58,7 +58,7 @@ def test_masses_described_2_5_times_too_large_are_seen_and_the_unseen_load_is_pr
     assert np.median(rows.intervals.radius) < 4.0 * NOISE
     scaled = codes(fit)["masses-scaled"]
     assert abs(scaled["factor"] - 1.0 / 2.5) < 3.0 * scaled["sigma"]
-    assert codes(fit)["torques-used"]["source"] == "of masses that the stated loads tell"
+    assert codes(fit)["torques-used"]["source"] == "of masses fitted to the deflection under the stated loads"
     folder = FitFolder(fit.save(tmp_path / "saved", plots=False))
     assert folder.findings().discrepancy.mass_doubt == fit.expected.discrepancy.mass_doubt
     driven = folder.driven(gather(tmp_path / "arm.urdf", [tmp_path / "fit.csv"]))
