@@ -25,8 +25,8 @@ from calib.geometry.installation import Seen
 # largest number of Gauss–Newton steps for the centre of a bar, and length of a step that ends them [m]
 CENTRE_STEPS = 20
 MIN_CHANGE = 1e-13
-# square of the relative size of a centre's direction that lengths do not determine (our choice)
-UNDETERMINED = 1e-12
+# ridge of a centre's normal equations over their trace (our choice): along directions of less the centre hardly moves
+RIDGE = 1e-12
 
 
 class CommonNoise(Protocol):
@@ -391,6 +391,7 @@ def sphere_centres(groups: Sequence[np.ndarray], lengths: Sequence[np.ndarray]) 
     centres = _least_squares(matrix, squares)[:, :3]
     for _ in range(CENTRE_STEPS):
         to_centre = centres.T[..., None] - points
+        # a point in the centre has no direction
         length = np.sqrt(np.maximum(np.einsum("igm,igm->gm", to_centre, to_centre), 1e-300))
         directions = (to_centre * (present / length)).swapaxes(0, 1)
         change = _least_squares(directions, (distance - length) * present)
@@ -408,7 +409,7 @@ def _least_squares(matrices: np.ndarray, values: np.ndarray) -> np.ndarray:
         values: (g, m) right-hand sides.
     """
     square = matrices @ matrices.swapaxes(1, 2)
-    ridge = UNDETERMINED * np.trace(square, axis1=1, axis2=2)
+    ridge = RIDGE * np.trace(square, axis1=1, axis2=2)
     square += ridge[:, None, None] * np.eye(square.shape[1])
     return np.linalg.solve(square, matrices @ values[..., None])[..., 0]
 

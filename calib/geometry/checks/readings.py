@@ -233,7 +233,7 @@ def _repeated(nominal: Installation, block: Positions) -> list[Repeated]:
             index = rows[readings[rows] == number]
             distance = float(np.linalg.norm(np.ptp(predicted[index], axis=0)))
             entry = Repeated(tool, tuple(index.tolist()), distance)
-            if distance >= MIN_APART and not _slips(nominal, block, entry):
+            if distance >= MIN_APART and not _stored_twice(nominal, block, entry):
                 result.append(entry)
         zeros = rows[is_zero[rows]]
         if len(zeros) == 1 and off[zeros[0]] > max(MIN_OFF, MIN_TIMES_OFF * float(np.median(off[rows]))):
@@ -241,10 +241,10 @@ def _repeated(nominal: Installation, block: Positions) -> list[Repeated]:
     return result
 
 
-def _slips(nominal: Installation, block: Positions, repeated: Repeated) -> bool:
-    """Return whether all rows behind a reading that two successive rows repeat are paired with wrong joint values.
+def _stored_twice(nominal: Installation, block: Positions, repeated: Repeated) -> bool:
+    """Return whether two successive rows repeat a good reading, and all later ones have the joint values of other rows.
 
-    Both rows then hold a good reading, and the search for shifted rows names the second one.
+    The search for shifted rows then names the second one.
 
     Args:
         nominal: the nominal arm.

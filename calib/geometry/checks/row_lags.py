@@ -15,7 +15,7 @@ MIN_TAIL = 6
 TAIL = 1 / 3
 # Largest difference of angles [rad] that counts: a wrong row counts no more than this.
 MAX_DIFFERENCE = 0.2
-# Mean difference of a row's angles, over the median of all, up to which it agrees as well as others (our choice).
+# Mean difference of a row's angles over the median of all, up to which the row agrees with its partner (our choice).
 TIED = 3.0
 
 
@@ -43,7 +43,7 @@ def last_lag(arm: np.ndarray, measured: np.ndarray) -> int:
 def first_of_lag(arm: np.ndarray, measured: np.ndarray, lag: int) -> int:
     """Return the index of the first measured row that agrees with the arm's row `lag` rows further down only.
 
-    A row beside one that was stored twice agrees with both: as few rows as possible are said to be further down.
+    A row beside one that was stored twice agrees with both rows of the arm, and is not counted as further down.
 
     Args:
         arm, measured: (m, 4, 4) poses, as for `last_lag`.
@@ -60,20 +60,21 @@ def first_of_lag(arm: np.ndarray, measured: np.ndarray, lag: int) -> int:
         present &= (rows < first) | (partners >= first) | (first == 0)
         total = 0.0
         of_steps = list(_differences(arm, measured, partners[present], rows[present]))
-        present_differences = np.concatenate(of_steps)
-        present_differences = present_differences[np.isfinite(present_differences)]
-        typical.append(float(np.median(present_differences)) if len(present_differences) else 0.0)
         for differences in of_steps:
             total += float(np.nansum(np.minimum(differences, MAX_DIFFERENCE)))
             # absent rows are no agreement
             total += MAX_DIFFERENCE * (m - np.isfinite(differences).sum())
         sums.append(total)
-    best = int(np.argmin(sums))
+        available = np.concatenate(of_steps)
+        available = available[np.isfinite(available)]
+        typical.append(float(np.median(available)) if len(available) else 0.0)
+    first = int(np.argmin(sums))
     # a row is part of two angles of each step
-    tie = TIED * 2 * len(STEPS) * typical[best]
-    while best + 1 < len(sums) and sums[best + 1] <= min(sums) + tie:
-        best += 1
-    return best
+    tie = TIED * 2 * len(STEPS) * typical[first]
+    largest = sums[first] + tie
+    while first + 1 < len(sums) and sums[first + 1] <= largest:
+        first += 1
+    return first
 
 
 def _differences(

@@ -27,7 +27,7 @@ from calib.transforms import from_quaternion
 SHIFTS = (1, -1, 2, -2)
 # smallest number of shifted rows (our choice)
 MIN_SHIFTED = 3
-# smallest ratio of the errors without a repeated reading, and with a shift there (our choice)
+# smallest ratio of the rms errors without a repeated reading, and with a shift there (our choice)
 MIN_SLIP = 3.0
 # smallest share of the shifted rows whose joint values are available, not held out (our choice)
 MIN_PAIRED = 0.5
@@ -144,6 +144,8 @@ def _shifts(nominal: Installation, block: Positions) -> Iterator[tuple[int, int]
 
 def slips(nominal: Installation, block: Positions, row: int) -> bool:
     """Return whether readings from a row on, which repeats the one before, belong to the joint values one row up.
+
+    They do where the least error with these is far below that with all rows in place but the two equal readings.
 
     Args:
         nominal: the nominal arm.

@@ -292,7 +292,7 @@ def _masses_unknown(inputs: Inputs) -> bool:
 def _weighed(
     inputs: Inputs, options: FitOptions, settings: FitSettings, weighing: Settings
 ) -> tuple[MassFactors | None, Inputs, tuple[Callable[..., ModelSelection], ModelSelection]]:
-    """Return the masses estimated from the deflection under loads, the inputs with their torques, and the model on these.
+    """Return the masses fitted to the deflection under loads, the inputs with their torques, and the model of these.
 
     The masses are None where no compliance by torques is selected.
 
