@@ -34,9 +34,8 @@ from calib.procedure.dynamic_stage.inputs import gather
 
 DATA = Path(os.environ.get("CALIB_DATA", "../shared/data"))
 FORGETTING = 0.02  # l of Kreisselmeier's filter [1/s]
-RESOLVED = (
-    1e-12  # singular values of Φ, with columns of unit norm, as shares of the largest, above which Δ is no rounding
-)
+# singular values of Φ, with columns of unit norm, as shares of the largest, above which Δ is no rounding
+RESOLVED = 1e-12
 IDENTIFIABLE = 1e-10  # the same of the observation matrix, for least squares
 RIDGES = np.logspace(-10.0, 2.0, 121)
 REFERENCES = ("LS", "ridge", "DREM")

@@ -261,6 +261,22 @@ def test_a_payload_in_another_unit_is_refused(chain, payload, says):
         payload_load(chain, payload)
 
 
+def test_a_gantry_without_masses_carries_by_the_travel_of_its_axes(tmp_path):
+    """Its links have no length; a kilogram was refused as more than it carries."""
+    tags = ['<robot name="gantry"><link name="l0"/>']
+    for number, axis in enumerate(("1 0 0", "0 1 0", "0 0 1"), 1):
+        tags.append(
+            f'<link name="l{number}"/><joint name="j{number}" type="prismatic"><parent link="l{number - 1}"/>'
+            f'<child link="l{number}"/><axis xyz="{axis}"/>'
+            '<limit lower="0" upper="0.8" effort="500" velocity="1"/></joint>'
+        )
+    (tmp_path / "gantry.urdf").write_text("".join([*tags, "</robot>"]))
+    gantry = urdf_format.read(tmp_path / "gantry.urdf")
+    assert payload_load(gantry, 20.0)[3] == 20.0
+    with pytest.raises(UsageError, match="state it in kg"):
+        payload_load(gantry, 20e3)
+
+
 def changed(measured, change):
     torque = np.array(measured.measured_torque)
     change(torque)

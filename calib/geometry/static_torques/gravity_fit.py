@@ -160,7 +160,7 @@ def carried_load(chain: Chain, payload: np.ndarray) -> np.ndarray:
 
 def _check_payload(chain: Chain, payload: np.ndarray) -> None:
     """Raise a UsageError for payloads (m, 4) whose centre is beyond the arm's reach, or which are too heavy for it."""
-    reach = chain.stretched_length()
+    reach = chain.stretched_length() + _travel(chain)
     distance = float(np.linalg.norm(np.nan_to_num(payload[:, 1:]), axis=1).max(initial=0.0))
     message = f"payload: its centre is {distance:.3g} m from the tip, the arm reaches {reach:.3g} m; state it in m"
     require(distance <= reach, message, UsageError)
@@ -170,6 +170,13 @@ def _check_payload(chain: Chain, payload: np.ndarray) -> None:
         limit = MAX_PAYLOAD_SHARE * float(chain.inertias[:, 9].sum())
     message = f"payload of {mass:.4g} kg: more than such an arm carries ({limit:.3g} kg at most); state it in kg"
     require(mass <= limit, message, UsageError)
+
+
+def _travel(chain: Chain) -> float:
+    """Return the sum of the farthest travels of an arm's prismatic joints [m], 1 m for a joint without limits."""
+    farthest = np.max(np.abs(chain.sampling_limits()), axis=0)
+    prismatic = [joint.kind == "prismatic" for joint in chain.joints]
+    return float(farthest[prismatic].sum())
 
 
 def payload_load(chain: Chain, payload: float | Sequence[float] | None) -> np.ndarray | None:

@@ -194,7 +194,7 @@ def _with_package_meshes(urdf: Path, content: str, name: str, source: Path | Non
             missing.append(uri)
             continue
         path = _path_in_package(uri)
-        # another mesh of the same name gets another one
+        # a different mesh of the same name gets another path
         while copies.get(str(path), mesh) != mesh:
             path = path.with_stem(f"{path.stem}_")
         copies[str(path)] = mesh

@@ -76,7 +76,7 @@ def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[pa
         failure: reason why no tracking was simulated; empty: none.
     """
     if failure:
-        line = f"tracking with the model as feedforward was not simulated:  {failure}"
+        line = f"tracking with the model as feedforward was not simulated: {failure}"
         return [page.Text("Tracking, simulated", [line])]
     if not replays:
         return []
