@@ -409,7 +409,8 @@ def _least_squares(matrices: np.ndarray, values: np.ndarray) -> np.ndarray:
         values: (g, m) right-hand sides.
     """
     square = matrices @ matrices.swapaxes(1, 2)
-    ridge = RIDGE * np.trace(square, axis1=1, axis2=2)
+    # of a group without any direction, as of lengths zero, the matrix is zero
+    ridge = np.maximum(RIDGE * np.trace(square, axis1=1, axis2=2), np.finfo(float).tiny)
     square += ridge[:, None, None] * np.eye(square.shape[1])
     return np.linalg.solve(square, matrices @ values[..., None])[..., 0]
 

@@ -27,6 +27,15 @@ def test_centres_of_groups_of_any_size_are_those_of_a_general_solver(noise):
     assert np.allclose(sphere_centres(groups, lengths), expected, atol=1e-7)
 
 
+def test_a_group_without_any_direction_leaves_the_others_as_they_are():
+    """All its points are in the centre."""
+    random = np.random.default_rng(0)
+    direction = random.normal(size=(3, 6))
+    sphere = np.array([[0.5], [0.1], [0.2]]) + 0.3 * direction / np.linalg.norm(direction, axis=0)
+    centres = sphere_centres([np.zeros((3, 4)), sphere], [np.zeros(4), np.full(6, 0.3)])
+    assert np.allclose(centres, [[0.0, 0.0, 0.0], [0.5, 0.1, 0.2]], atol=1e-12)
+
+
 def test_a_direction_that_lengths_do_not_determine_does_not_move_the_centre():
     """Points on a line determine no side: the centre stays on the line."""
     points = np.zeros((3, 10))

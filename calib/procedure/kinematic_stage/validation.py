@@ -122,7 +122,7 @@ def judge(
     if not proofs and cross_validated is not None:
         where = "by cross-validation only"
         if few and all(level_of(note) == "note" for note in few):
-            where += f" ({few[0].values['poses']} unseen poses are too few)"
+            where += f" (too few unseen poses: {few[0].values['poses']})"
         proofs = [_Proof(nominal_rms, cross_validated, where)]
     if not proofs and frames_only:
         # so few parameters leave the errors on the fitted poses as they are

@@ -481,8 +481,8 @@ def test_few_unseen_poses_are_said_and_decide_nothing(cell, calib) -> None:
     for count in (7, 8):
         validated = cell.write(f"v{count}.csv", other[:count])
         _, out, err = calib("fit", "ur5", file, "--model", "geometry", "--validate", validated, "--out", f"o{count}")
-        said = f"v{count}.csv: {count} unseen poses, too few (below 8)"
+        said = f"v{count}.csv: too few unseen poses ({count} of 8)"
         page = Path(f"o{count}/report.html").read_text()
         assert (said in out) is (said in page) is (count == 7), err
-        assert (f"by cross-validation only ({count} unseen poses are too few)" in out) is (count == 7)
+        assert (f"by cross-validation only (too few unseen poses: {count})" in out) is (count == 7)
         assert (f"on v{count}.csv, unseen" in out) is (count == 8)
