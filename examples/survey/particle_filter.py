@@ -29,7 +29,7 @@ from calib.apps.studies.experiment import Experiment, make_experiment
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import IdentificationProblem
 from calib.identification.registry import method_named
-from calib.identification.survey.filters import _steps, _thin
+from calib.identification.survey.filters import samples_with_torques, thinning_factor
 from calib.identification.survey.simulated_robot import Stepper, believed_robot, stepper
 
 # scheme of the parameters' motion: factor of the positions' noise
@@ -123,7 +123,7 @@ def particle_filter(
     robot = believed_robot(problem, method_named("ukf"))
 
     # noise, as the Kalman filters have it
-    thin = _thin(case)
+    thin = thinning_factor(case)
     position_noise = SCHEMES[scheme] * motion.cutoffs.noise / np.sqrt(thin)
     torque_noise = plain.std / np.sqrt(thin * np.sum(np.square(problem.decimator.taps)))
     slow = 1e-3 * np.abs(motion.v).max(axis=0)
@@ -150,7 +150,7 @@ def particle_filter(
         rng,
     )
     effective = []
-    for measured, torques in _steps(case, slice(0, len(motion))):
+    for measured, torques in samples_with_torques(case, slice(0, len(motion))):
         _predict(particles, model, torques)
         _weigh(particles, model, measured)
         effective.append(particles.effective)

@@ -71,6 +71,12 @@ def short_name(condition: Condition) -> str:
     return condition.name.removeprefix("MCS-")
 
 
+def condition_heading(summaries: Iterable[ConditionSummary]) -> str:
+    """Return the heading of a table with a column per condition."""
+    names = [short_name(summary.condition) for summary in summaries]
+    return table_line(["method", *names])
+
+
 def count_range(counts: Sequence[int]) -> str:
     """Return the smallest and the largest count, as one number where they are equal."""
     low, high = min(counts), max(counts)
@@ -102,7 +108,7 @@ def torque_table(summaries: Sequence[ConditionSummary]) -> Iterator[str]:
     for summary in summaries:
         for method in summary.methods:
             names[method.method] = None
-    yield table_line(["method", *(short_name(summary.condition) for summary in summaries)])
+    yield condition_heading(summaries)
     yield header_rule(len(summaries))
     for name in names:
         yield table_line([name, *(_torque_cell(summary, name) for summary in summaries)])
@@ -157,7 +163,7 @@ def coverage_table(summaries: Sequence[ConditionSummary], names: Sequence[str]) 
     """
     by_name = {short_name(summary.condition): summary for summary in summaries}
     columns = [by_name[name] for name in names if name in by_name]
-    yield table_line(["method", *(short_name(summary.condition) for summary in columns)])
+    yield condition_heading(columns)
     yield header_rule(len(columns))
     for method in METHODS:
         cells = [median_figure(summary, method, "coverage") for summary in columns]
@@ -194,7 +200,9 @@ def _differ_by_motion(designed: Condition, random: Condition) -> bool:
 
 def _both_motions(pair: tuple[ConditionSummary, ConditionSummary], method: str, figure: str) -> str:
     """Return a method's figure on random and on designed motion; empty if it has no rows on one of them."""
-    random, designed = (median_figure(summary, method, figure) for summary in pair)
+    random_summary, designed_summary = pair
+    random = median_figure(random_summary, method, figure)
+    designed = median_figure(designed_summary, method, figure)
     if random and designed:
         return f"{random} → {designed}"
     return ""
@@ -221,15 +229,23 @@ def cost_table(rows: Iterable[TrialRow]) -> Iterator[str]:
         for column, (robot, factor) in COST_COLUMNS.items():
             mean = _mean_time(method_rows, robot, factor)
             totals[column] += mean
-            cells.append("" if math.isnan(mean) else number(mean))
+            cells.append(time_cell(mean))
         yield table_line(cells)
     minutes = [number(100 * seconds / 60) for seconds in totals.values()]
     yield f"| all, 100 runs each [CPU min] | | | {' | '.join(minutes)} |"
 
 
+def time_cell(seconds: float) -> str:
+    """Return a time; empty for NaN."""
+    if math.isnan(seconds):
+        return ""
+    return number(seconds)
+
+
 def _mean_time(rows: Iterable[TrialRow], robot: str, factor: int) -> float:
     """Return the mean processor time [s] of the rows of a robot and a decimation factor; NaN without a time."""
-    times = [row.cpu for row in rows if row.robot == robot and row.decimation == factor and not math.isnan(row.cpu)]
+    selected = [row.cpu for row in rows if row.robot == robot and row.decimation == factor]
+    times = [seconds for seconds in selected if not math.isnan(seconds)]
     if not times:
         return math.nan
     return sum(times) / len(times)

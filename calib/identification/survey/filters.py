@@ -162,7 +162,7 @@ def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndar
         forward_dynamics(robot.at(values, case), q, v, np.zeros_like(q))
 
 
-def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def samples_with_torques(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield the samples that the filter uses, with the torques between them.
 
     Each is a position q (n,), and the mean torques (s, n) in s equal time steps since the last sample.
@@ -173,7 +173,7 @@ def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[
         max_step: longest time step of the dynamics [s].
     """
     motion = case.motion
-    thin = _thin(case)
+    thin = thinning_factor(case)
     # as the positions were: the same band on both sides
     q = motion.q[part]
     tau = low_passed(case.target[part], motion)
@@ -190,8 +190,13 @@ def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[
         yield q[k], np.diff(sums, axis=0) * (steps / thin)
 
 
-def _thin(case: Case, rate_factor: float = 4.0) -> int:
-    # rate_factor: times the positions' cut-off: rate of the filter, at least
+def thinning_factor(case: Case, rate_factor: float = 4.0) -> int:
+    """Return the number of samples of a recording per sample that the filter uses.
+
+    Args:
+        case: the recording.
+        rate_factor: least rate of the filter, as a multiple of the positions' cut-off.
+    """
     max_rate = rate_factor * float(case.motion.cutoff.max())
     return max(1, int(case.motion.rate / max_rate))
 
@@ -206,7 +211,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
         noise: (n,) standard deviation of the torque noise of a sample [N m or N].
     """
     motion = case.motion
-    thin = _thin(case)
+    thin = thinning_factor(case)
     n = case.motion.n
     if part.stop - part.start <= 2 * thin:
         return before
@@ -229,7 +234,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     parameter_count = len(before.robot.plant.parameters)
     full = _Stepping(robot_stepper, before.kind, n, parameter_count, columns, carried)
     sizes = []
-    for q, tau in _steps(case, part):
+    for q, tau in samples_with_torques(case, part):
         belief = full.step(belief, np.ascontiguousarray(tau), period / len(tau), torque)
         belief, size = corrected(belief, q, n, position_noise)
         require(

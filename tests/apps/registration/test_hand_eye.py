@@ -328,8 +328,8 @@ def test_turns_about_one_axis_leave_positions_open(tmp_path, capsys):
 
 def test_pass_prints_no_error_above_the_tolerance(tmp_path):
     """Held-out poses within the tolerance do not make a pass of fitted poses above it."""
-    robot, seen = sampled(8, 16)
-    seen[:, :3, 3] += 2e-3 * np.random.default_rng(8).normal(size=(16, 3))
+    robot, seen = sampled(8, 36)
+    seen[:, :3, 3] += 2e-3 * np.random.default_rng(9).normal(size=(36, 3))
     path = table(tmp_path / "pairs.csv", robot, seen)
     fit = calib.hand_eye(None, path, PlacementSettings(holdout=0.25))
     fitted = fit.fit.errors[1].rms
