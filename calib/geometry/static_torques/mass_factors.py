@@ -95,7 +95,7 @@ class MassFactors:
         return float(np.max(np.abs(self.values - earlier.values) / np.sqrt(np.diag(self.covariance))))
 
     def blocks(self, measured: Sequence[PoseMeasurements], masses: np.ndarray) -> list[PoseMeasurements]:
-        """Return blocks with the torques of other masses."""
+        """Return blocks with the torques of other masses (n, 10), and of the stated loads."""
         chain = replace(self.chain, inertias=masses)
         return [with_stated_load(chain, block) for block in measured]
 
@@ -108,6 +108,7 @@ class MassFactors:
         """
         residual, by_masses, by_fit = self._derivatives(fit, measured)
         slope = -fit.estimate.covariance @ by_fit.T @ by_masses
+        # the fit's parameters move along, and take with them what they explain
         precision = np.linalg.inv(self.prior)
         information = by_masses.T @ by_masses + by_masses.T @ by_fit @ slope + precision
         covariance = np.linalg.inv(0.5 * (information + information.T))
@@ -120,7 +121,9 @@ class MassFactors:
     def _derivatives(
         self, fit: GeometricFit, measured: Sequence[PoseMeasurements]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return whitened residuals (N,), and their derivatives by the unknowns (N, 4 n) and by the fit's parameters.
+        """Return whitened residuals (N,), and the derivatives of the predictions.
+
+        These are by the unknowns (N, 4 n), from differences, and by the fit's parameters (N, f).
 
         Args:
             fit, measured: arguments of `step`.
@@ -136,6 +139,7 @@ class MassFactors:
             cell = _of_masses(fit.cell, masses)
             blocks = prepare(cell, self.blocks(measured, masses))
             changed, _ = fit.whitened_rows(cell, blocks, fit.free[:0])
+            # a residual is measured minus predicted
             columns.append((residual - changed) / difference)
         return residual / noise, np.stack(columns, axis=1) / noise, by_fit / noise
 

@@ -250,7 +250,6 @@ def _unexplained_function(samples: MotionSamples, offsets: bool = True) -> Calla
         offsets: whether each joint's torque has an offset.
     """
     m, n = samples.q.shape
-    joints = np.arange(n)
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
 
     # A column is a row of the arrays, joint after joint: samples are contiguous, as the regressor writes them.
@@ -264,11 +263,7 @@ def _unexplained_function(samples: MotionSamples, offsets: bool = True) -> Calla
     def without_free(columns: np.ndarray) -> np.ndarray:
         return columns - columns @ free.T @ span @ span.T @ free
 
-    drives = drive_columns(samples.v, samples.a)[..., :3] * scale[:, None]
-    positive = np.zeros((n, 3, n, m))
-    positive[joints, :, joints] = drives.transpose(1, 2, 0)
-    positive = positive.reshape(3 * n, n * m)
-    positive /= np.maximum(np.abs(positive).max(axis=1), 1e-12)[:, None]
+    positive = _drive_rows(samples, scale)
     size = np.linalg.norm(positive, axis=1)
     positive = without_free(positive)
     # what bodies and offsets explain wholly leaves rounding, which as a column would explain some noise
@@ -286,6 +281,23 @@ def _unexplained_function(samples: MotionSamples, offsets: bool = True) -> Calla
         return np.maximum(mean_square / np.maximum(power, 1e-300), 1e-9)
 
     return unexplained
+
+
+def _drive_rows(samples: MotionSamples, scale: np.ndarray) -> np.ndarray:
+    """Return the columns of the drives' parameters but offsets as rows (3 n, n m), joint after joint, each at most 1.
+
+    Args:
+        samples: m samples of a recording of n joints.
+        scale: (n,) factors of the joints' torques.
+    """
+    m, n = samples.q.shape
+    joints = np.arange(n)
+    drives = drive_columns(samples.v, samples.a)[..., :3] * scale[:, None]
+    rows = np.zeros((n, 3, n, m))
+    # a drive acts on its joint's torque alone
+    rows[joints, :, joints] = drives.transpose(1, 2, 0)
+    rows = rows.reshape(3 * n, n * m)
+    return rows / np.maximum(np.abs(rows).max(axis=1), 1e-12)[:, None]
 
 
 def _robot_changes(samples: MotionSamples) -> list[Change[Columns]]:

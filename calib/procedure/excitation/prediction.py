@@ -451,11 +451,11 @@ def _wider(inputs: ExcitationInputs, regressor: np.ndarray, band: float, seconds
         band: identification band of the motion [Hz].
         seconds: duration of the motion [s].
     """
-    # earlier recordings of unknown duration (0) count as none, which gives the largest σ
     if inputs.prior is None or inputs.prior.bands is None:
         return np.ones(regressor.shape[1])
     bands = inputs.prior.bands
-    # motions that were not identified add errors, too
+    # motions that were not identified add errors, too; identified ones of unknown duration (0) count as none, which
+    # gives the largest σ
     added = inputs.prior.seconds + seconds
     share = added / (bands.seconds + added)
     return np.sqrt(bands.factor(rows_per_second(band, seconds)) * (1.0 + (ADDED_ERRORS - 1.0) * share))
