@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.data.poses.measurements import KINDS, Planes, PoseMeasurements, Sockets
-from calib.errors import UsageError, one_of
+from calib.errors import UsageError, one_of, require
 from calib.geometry.installation import Installation, see
 from calib.records import FieldValues
 from calib.robot.calibrated import evaluate
@@ -62,10 +62,13 @@ def measure_kind(
         file: name of the file for messages.
 
     Raises:
-        UsageError: an unknown kind, or the arm does not reach its sockets or planes.
+        UsageError: an unknown kind, an odd number of rows of distances, fewer rows of a bar than centres, or the arm
+            does not reach its sockets or planes.
     """
     one_of(kind, KINDS, "kind of measurement", UsageError)
     count = len(q)
+    require(kind != "distance" or count % 2 == 0, f"{count} rows: two rows make a distance", UsageError)
+    require(kind != "bar" or count >= CENTRES, f"{count} rows: fewer than the {CENTRES} centres of a bar", UsageError)
     tool = np.resize(np.array(tools), count)
     if kind in ("sockets", "plane"):
         return _touched(truth, kind, q, tool, sigma, with_sigma, file, rng)

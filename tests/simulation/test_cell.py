@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from calib.errors import UsageError
 from calib.geometry.first_guess import install
 from calib.geometry.fit import fit, polish_frames
 from calib.geometry.observation import observe
@@ -15,6 +16,7 @@ from calib.robot.kinematics import forward
 from calib.robot.library import load
 from calib.simulation import lwr4plus
 from calib.simulation.cell import Cell, SimulatedInstrument, measure, true_poses
+from calib.simulation.kinds import measure_kind
 from calib.simulation.virtual_cells import lwr4plus_cell, perturbed_cell, rigid, virtual_cell
 from calib.transforms import invert, rotation_vector
 
@@ -123,3 +125,11 @@ def test_table_2_frames_equal_its_product() -> None:
     seen = lwr4plus.station(table) @ forward(lwr4plus.arm(table), q) @ lwr4plus.tool(table)
     np.testing.assert_allclose(seen[:, :3, 3], expected[:, :3, 3], atol=1e-12)
     assert np.abs(rotation_vector(invert(seen)[:, :3, :3] @ expected[:, :3, :3])).max() < 1e-12
+
+
+@pytest.mark.parametrize(("kind", "count", "says"), [("distance", 7, "two rows"), ("bar", 2, "3 centres")])
+def test_rows_that_make_no_distance_or_bar_are_refused(kind, count, says):
+    arm = load("ur5")
+    truth = virtual_cell("ur5").truth
+    with pytest.raises(UsageError, match=says):
+        measure_kind(truth, kind, random_joints(arm, count, 0), np.random.default_rng(0))

@@ -135,7 +135,9 @@ def judge(
     common = [*gross, *few, *(noticed for noticed in findings.noticed if noticed.code not in RIGID)]
 
     # The first group of rules that says something decides.
-    groups: list[Iterable[Finding]] = [_far_off(proofs, {"the fitted poses": fit, **unseen}, tolerance, findings.reach)]
+    # orientations contradict the fit on few poses, too
+    sets = {"the fitted poses": fit} | {name: rows for name, rows in validation.items() if rows.proves}
+    groups: list[Iterable[Finding]] = [_far_off(proofs, sets, tolerance, findings.reach)]
     if not frames_only:
         groups.append(_nothing_gained(proofs, findings))
     groups.append(_worse(proofs, findings.reach))

@@ -11,9 +11,9 @@ from calib.procedure.dynamic_stage.with_geometry import GeometryFromTorquesMetri
 from calib.procedure.report import page
 from calib.units import small
 
-# geometric errors listed, and parameters that they change
+# number of geometric errors, and of parameters, that are listed (our choice)
 MAX_EFFECTS = 8
-# change of a parameter [σ] from which on it counts as changed
+# change of a parameter [σ] from which on it counts as changed (our choice)
 SIGNIFICANT = 2.0
 
 

@@ -73,6 +73,7 @@ SCALE = finding("lengths-grew", factor=1.01, sigma=1e-4, explained=0.9, off=0.01
         ({"a": few_rows(1.0, 2.0)}, {}, "fail", "few-unseen-poses"),
         ({"a": few_rows(1.0, 2.0), "b": rows(1.0, 0.1)}, {}, "fail", "few-unseen-poses"),
         ({"a": few_rows(1.0, 0.1), "b": rows(1.0, 1.1)}, {}, "fail", "worse-than-nominal"),
+        ({"a": replace(rows(1.0, 0.1, turned=6.0), few=7)}, {}, "fail", "orientations-off"),
         # a row that is far off with both arms is named, as among many
         ({"a": replace(with_row_off(1.0, 0.1, 30.0, 30.0), few=7)}, {}, "marginal", "gross-unseen-rows"),
         ({"a": rows(1.0, 0.99)}, {"reach": 1.0}, "fail", "no-better-model"),
