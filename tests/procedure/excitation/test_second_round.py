@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import calib
+from calib.procedure.excitation.prediction import ADDED_ERRORS
 from calib.simulation.virtual_arm import moving_arm, play, record
 from calib.simulation.virtual_cells import lwr4plus_cell
 
@@ -39,7 +40,9 @@ def test_the_predicted_sigma_is_reached(tmp_path):
     reached = _sigma(calib.identify_dynamics("lwr4plus", [*logs, log(design, 2)]))
     before = _sigma(known)
     predicted = {row.name: row for row in design.predicted}
-    assert all(row.sigma <= row.sigma_before * (1 + 1e-6) for row in predicted.values())
+    # a further recording informs, but adds errors, too, which widen what it does not inform on
+    widening = np.sqrt(ADDED_ERRORS)
+    assert all(row.sigma <= widening * row.sigma_before for row in predicted.values())
     both = [name for name in predicted if reached.get(name, 0.0) > 0.0]
     assert np.allclose([predicted[name].sigma_before for name in both], [before[name] for name in both], rtol=1e-3)
     ratio = np.array([reached[name] / predicted[name].sigma for name in both])
