@@ -137,7 +137,7 @@ class ParallelFit(ChartedResult, ReportedResult):
             share = after / max(before, 1e-300)
             times = after / max(fitted, 1e-300)
             rules.append(finding("worse-than-nominal", times=share))
-            rules.append(finding("no-transfer", times=times, remedy=""))
+            rules.append(finding("no-transfer", times=times, errors=f"on {where} rows", remedy=""))
             rules.append(finding("small-gain", left=share))
         if not figures:
             rules = [finding("no-unseen-poses")]

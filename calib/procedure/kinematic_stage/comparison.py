@@ -97,7 +97,7 @@ class Comparison:
         settled: False if the placement of base and tool on these rows did not converge; then the errors are
             meaningless.
         placed_by: number of measured values, and number of placement parameters fitted to them, if there are too few
-            values to judge by the errors (`MARGIN`); otherwise None.
+            values to judge by the errors (`MARGIN`); otherwise, and of fitted rows, None.
         few: number of poses, if these are fewer than a verdict needs (`MIN_UNSEEN`); otherwise None.
         intervals: errors of the calibrated arm with their predicted intervals; None without an error model of the fit.
         plain: errors of the plain reference, with frames fitted to the same rows; None on fitted rows, and without a
@@ -125,6 +125,11 @@ class Comparison:
     def decides(self) -> bool:
         """Whether a verdict may follow from these rows."""
         return self.proves and self.few is None
+
+    @property
+    def may_contradict(self) -> bool:
+        """Whether these rows are too few to prove anything, but may contradict the fit."""
+        return self.placed_by is not None or (self.proves and self.few is not None)
 
     @property
     def of_urdf(self) -> Comparison:
@@ -247,7 +252,7 @@ def compare_unseen(
         frames = "base and tool placement refitted on these rows"
         if not settled:
             frames = "base and tool placement did not converge on these rows"
-        elif measured < MARGIN * parameters:
+        elif measured < MARGIN * parameters and not unseen.seen:
             placed_by = measured, parameters
             frames = f"base and tool placement: {parameters} parameters fitted to only {measured} numbers of these rows"
     elif unseen.held_out:

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.errors import Finding, finding
+from calib.errors import Finding, finding, listing
 from calib.geometry.checks.file_change import changed_since_fit
-from calib.geometry.error_model import ErrorModel
+from calib.geometry.error_model import ErrorModel, outside
 from calib.geometry.fit import without_corrections
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.ladder import MIN_GAIN
@@ -39,6 +39,8 @@ ELSEWHERE = 20.0
 OUTLIER_SIGMAS = 8.0
 # error [m] below which none is taken in a ratio
 TINY = 1e-300
+# share of a joint's fitted range by which a pose may be outside without being an extrapolation (our choice)
+RANGE_MARGIN = 0.1
 # share of errors that the fit states to be within the intervals
 NOMINAL_COVERAGE = 0.95
 # name of each deliverable in messages
@@ -89,13 +91,14 @@ def judge(
     4. ``worse-than-nominal``; from cross-validation only, if both errors are below `FLOOR` times the reach,
        ``keep-nominal``, since the nominal arm may have been fitted to these rows;
     5. ``no-unseen-poses``;
-    6. ``rigid-misfit`` or ``gross-rows`` of the fit, ``refuted``, ``no-transfer``, ``intervals-too-narrow``,
-       ``small-gain``, ``many-outliers``; without any of them: pass.
+    6. ``rigid-misfit`` or ``gross-rows`` of the fit, ``refuted``, ``contradicted``, ``no-transfer``,
+       ``intervals-too-narrow``, ``small-gain``, ``many-outliers``; without any of them: pass.
 
     Three kinds of findings count in every group: the other findings on the fit
-    (`calib.procedure.kinematic_stage.plausibility`), ``gross-unseen-rows``, which replaces ``refuted``, and
-    ``few-unseen-poses``: fewer than `MIN_UNSEEN` poses of a file prove nothing, but may contradict the fit. Their
-    gross rows are named, and do not contradict it.
+    (`calib.procedure.kinematic_stage.plausibility`), ``gross-unseen-rows``, which replaces ``refuted``, and those on
+    files that prove nothing, but may contradict the fit: ``few-unseen-poses`` (fewer than `MIN_UNSEEN` poses),
+    ``placement-takes-all`` (few numbers beside the fitted placement), and ``contradicted``. Their gross rows are named,
+    and do not contradict it.
 
     Args:
         fit: errors of both arms on the fitted rows.
@@ -107,7 +110,10 @@ def judge(
         arm: name of the deliverable if there are several; otherwise empty.
     """
     unseen = {name: comparison for name, comparison in validation.items() if comparison.decides}
-    few = [*_few(fit, validation, cross_validated), *_gross_of_few(validation, findings.reach)]
+    promised = _promised(fit, cross_validated)
+    few = [*_few(validation, promised), *_gross_of_few(validation, findings.reach)]
+    small = {name: rows for name, rows in validation.items() if rows.may_contradict}
+    few += filter(level_of, _contradicted(fit, small, promised))
     nominal_rms = fit.errors[0].rms
     fitted_rms = fit.errors[1].rms
     frames_only = findings.model == requested_model == "frames"
@@ -122,7 +128,8 @@ def judge(
     if not proofs and cross_validated is not None:
         where = "by cross-validation only"
         if few and all(level_of(note) == "note" for note in few):
-            where += f" (too few unseen poses: {few[0].values['poses']})"
+            counts = [f"{rows.poses if rows.few is None else rows.few} in {name}" for name, rows in small.items()]
+            where += f" (too few unseen poses: {listing(counts, 2)})"
         proofs = [_Proof(nominal_rms, cross_validated, where)]
     if not proofs and frames_only:
         # so few parameters leave the errors on the fitted poses as they are
@@ -158,41 +165,102 @@ def judge(
     # Grossly wrong unseen rows refute no promise of the fit.
     if gross:
         cross_validated = None
-    doubts = _doubts(worst, fitted_rms, cross_validated, unseen, findings)
+    doubts = _doubts(worst, fit, cross_validated, promised, unseen, findings)
     verdict = Verdict.of(_figures(worst, arm), [*gross, *few, *findings.noticed, *doubts])
     if verdict.level == "pass":
         return Verdict("pass", _figures(worst, arm, tolerance))
     return verdict
 
 
-def _few(fit: Comparison, validation: Mapping[str, Comparison], cross_validated: float | None) -> Iterator[Finding]:
-    """Yield a finding on each validation file with too few poses for a verdict.
+def _promised(fit: Comparison, cross_validated: float | None) -> float:
+    """Return the error [m] that a fit leads to expect on other poses: the cross-validated one, else the fitted one.
 
-    Rows that are far off with both arms do not count (`_gross_of_few`).
+    Args:
+        fit: errors of both arms on the fitted rows.
+        cross_validated: cross-validated error [m]; None if not computed.
+    """
+    return max(fit.errors[1].rms if cross_validated is None else cross_validated, TINY)
+
+
+def _few(validation: Mapping[str, Comparison], promised: float) -> Iterator[Finding]:
+    """Yield a finding on each validation file that proves nothing, but may contradict the fit.
+
+    Rows that are far off with both arms do not count (`_gross_of_few`). What a fitted placement leaves is a lower bound
+    of the error.
+
+    Args:
+        validation: name of a validation file -> errors of both arms.
+        promised: error that the fit leads to expect [m].
+    """
+    for name, rows in validation.items():
+        if not rows.may_contradict:
+            continue
+        rms = _rms(rows.errors[1].main[~_far_off_with_both_arms(rows)])
+        times = rms / promised
+        if rows.placed_by is not None:
+            measured, fitted = rows.placed_by
+            values = {"measured": measured, "fitted": fitted, "wanted": MARGIN * fitted}
+            yield finding("placement-takes-all", file=name, rms=rms, times=times, **values)
+        else:
+            yield finding("few-unseen-poses", where=name, poses=rows.few, least=MIN_UNSEEN, rms=rms, times=times)
+
+
+def _contradicted(
+    fit: Comparison, validation: Mapping[str, Comparison], promised: float, remedy: str = ""
+) -> Iterator[Finding]:
+    """Yield a finding on each validation file whose errors within the fitted range are far above the expected error.
+
+    Rows that are far off with both arms do not count, nor do poses at which the model extrapolates.
 
     Args:
         fit: errors of both arms on the fitted rows.
         validation: name of a validation file -> errors of both arms.
-        cross_validated: cross-validated error [m]; None if not computed.
+        promised: error that the fit leads to expect [m].
+        remedy: advice for the case that instrument or tool were moved; empty if they cannot have been.
     """
-    promised = max(fit.errors[1].rms if cross_validated is None else cross_validated, TINY)
     for name, rows in validation.items():
-        if rows.proves and rows.few is not None:
-            sizes = rows.errors[1].main[~_far_off_with_both_arms(rows)]
-            rms = float(np.sqrt(np.sum(sizes**2) / max(len(sizes), 1)))
-            values = {"where": name, "poses": rows.few, "least": MIN_UNSEEN, "rms": rms, "times": rms / promised}
-            yield finding("few-unseen-poses", **values)
+        extrapolated = _extrapolated(fit, rows)
+        rms = _rms(rows.errors[1].main[~_far_off_with_both_arms(rows) & ~extrapolated])
+        within = ""
+        if np.any(extrapolated):
+            within = "within the fitted range"
+        values = {"where": name, "rms": rms, "within": within, "remedy": remedy}
+        yield finding("contradicted", times=rms / promised, **values)
+
+
+def _extrapolated(fit: Comparison, rows: Comparison) -> np.ndarray:
+    """Return flags (m,): whether each error of `rows` is of a pose with a joint outside its fitted range.
+
+    The range is widened by `RANGE_MARGIN` on both sides. Where errors do not belong to single rows, none is flagged.
+
+    Args:
+        fit: errors on the fitted rows.
+        rows: errors on other rows.
+    """
+    sizes = rows.errors[1].main
+    if not fit.blocks or sum(len(block) for block in rows.blocks) != len(sizes):
+        return np.zeros(len(sizes), dtype=bool)
+    learnt = np.concatenate([block.q for block in fit.blocks])
+    margin = RANGE_MARGIN * np.ptp(learnt, axis=0)
+    widened = np.array([learnt.min(axis=0) - margin, learnt.max(axis=0) + margin])
+    q = np.concatenate([block.q for block in rows.blocks])
+    return np.any(outside(q, widened), axis=1)
+
+
+def _rms(sizes: np.ndarray) -> float:
+    """Return the root mean square of errors (m,); 0 without errors."""
+    return float(np.sqrt(np.sum(sizes**2) / max(len(sizes), 1)))
 
 
 def _gross_of_few(validation: Mapping[str, Comparison], reach: float) -> Iterator[Finding]:
-    """Yield the findings of `_gross` on validation files with too few poses for a verdict.
+    """Yield the findings of `_gross` on validation files that prove nothing, but may contradict the fit.
 
     Args:
         validation: name of a validation file -> errors of both arms.
         reach: reach of the arm [m].
     """
     for name, rows in validation.items():
-        if rows.proves and rows.few is not None:
+        if rows.may_contradict:
             nominal, calibrated = rows.errors
             yield from filter(level_of, _gross(_Proof(nominal.rms, calibrated.rms, name, rows), reach))
 
@@ -356,8 +424,9 @@ def _worse(proofs: Sequence[_Proof], reach: float) -> list[Finding]:
 
 def _doubts(
     worst: _Proof,
-    fitted_rms: float,
+    fit: Comparison,
     cross_validated: float | None,
+    promised: float,
     unseen: Mapping[str, Comparison],
     findings: Findings,
 ) -> Iterator[Finding]:
@@ -367,20 +436,25 @@ def _doubts(
 
     Args:
         worst: the largest errors on which the verdict is based.
-        fitted_rms: rms error on the fitted rows [m].
-        cross_validated: cross-validated error [m]; None if not computed.
+        fit: errors of both arms on the fitted rows.
+        cross_validated: cross-validated error [m]; None if not computed, or if grossly wrong rows may not refute it.
+        promised: error that the fit leads to expect [m].
         unseen: name of a validation file -> errors of both arms.
         findings: warnings and notes on the fit.
     """
-    times = worst.after / max(fitted_rms, TINY)
+    times = worst.after / max(fit.errors[1].rms, TINY)
+    errors_of = "on unseen poses"
+    if not unseen:
+        errors_of = "by cross-validation"
     remedy = ""
     if any(rows.shares_frames for rows in unseen.values()):
         remedy = catalogue()["placed-elsewhere"].advice
     rigid_explains = not any(noticed.code in RIGID for noticed in findings.noticed)
     if unseen and cross_validated is not None and rigid_explains:
-        promised = worst.after / max(cross_validated, TINY)
-        yield finding("refuted", times=times, promised=promised, left=worst.ratio, remedy=remedy)
-    yield finding("no-transfer", times=times, remedy=remedy)
+        times_promised = worst.after / max(cross_validated, TINY)
+        yield finding("refuted", times=times, promised=times_promised, left=worst.ratio, remedy=remedy)
+    yield from _contradicted(fit, unseen, promised, remedy)
+    yield finding("no-transfer", times=times, errors=errors_of, remedy=remedy)
     for name, rows in unseen.items():
         if rows.intervals is None:
             continue
@@ -497,9 +571,9 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
     noticed += inputs.noticed
     if deliverable == "urdf" and fitted.alone is not None:
         of_urdf = {name: rows.of_urdf for name, rows in validation.items()}
-        noticed += _few(fitted.of_urdf, of_urdf, findings.rigid_cross_validated)
+        noticed += _few(of_urdf, _promised(fitted.of_urdf, findings.rigid_cross_validated))
     else:
-        noticed += _few(fitted, validation, findings.cross_validated)
+        noticed += _few(validation, _promised(fitted, findings.cross_validated))
     noticed += load_changes(inputs.fit, [rows.block for rows in inputs.unseen.values()])
     copies = _copies(inputs)
     if copies:
@@ -656,10 +730,7 @@ def _noticed(name: str, rows: Comparison, usual: float) -> Iterator[Finding]:
         )
     if not rows.settled:
         yield finding("placement-unsettled", file=name)
-    elif rows.placed_by is not None:
-        measured, fitted = rows.placed_by
-        yield finding("placement-takes-all", file=name, measured=measured, fitted=fitted, wanted=MARGIN * fitted)
-    elif intervals is not None:
+    elif rows.placed_by is None and intervals is not None:
         count = len(intervals.size)
         median = np.median(intervals.radius)
         yield finding("interval-coverage", file=name, covered=intervals.covered, errors=count, median=median)

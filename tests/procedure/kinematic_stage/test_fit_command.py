@@ -471,7 +471,7 @@ def test_self_explaining_file_proves_nothing(cell, calib) -> None:
     for count, scored in ((6, False), (12, True)):
         few = cell.write("few.csv", other[:count])
         _, out, err = calib("fit", "ur5", file, "--model", "offsets", "--validate", few, "--refit-frames", "--out", "o")
-        assert ("few.csv is not scored: base and tool placement use 9" in out) is not scored, err
+        assert ("few.csv not scored (9 placement parameters, 18 numbers)" in out) is not scored, err
         assert ("on few.csv, unseen" in out) is scored
 
 
@@ -484,5 +484,5 @@ def test_few_unseen_poses_are_said_and_decide_nothing(cell, calib) -> None:
         said = f"v{count}.csv: too few unseen poses ({count} of 8)"
         page = Path(f"o{count}/report.html").read_text()
         assert (said in out) is (said in page) is (count == 7), err
-        assert (f"by cross-validation only (too few unseen poses: {count})" in out) is (count == 7)
+        assert (f"by cross-validation only (too few unseen poses: {count} in v{count}.csv)" in out) is (count == 7)
         assert (f"on v{count}.csv, unseen" in out) is (count == 8)

@@ -30,6 +30,11 @@ def few_rows(nominal, calibrated) -> Comparison:
     return replace(rows(nominal, calibrated), few=7)
 
 
+def placed_rows(nominal, calibrated) -> Comparison:
+    """Return a comparison with errors of these sizes [mm] that a placement fitted to few numbers left."""
+    return replace(rows(nominal, calibrated, proves=False), placed_by=(24, 9))
+
+
 def with_row_off(nominal, calibrated, nominal_off, calibrated_off) -> Comparison:
     """Return the comparison with other errors [mm] of row 7."""
     found = rows(nominal, calibrated)
@@ -55,7 +60,12 @@ SCALE = finding("lengths-grew", factor=1.01, sigma=1e-4, explained=0.9, off=0.01
         ({"a": rows(3.3, 3.1)}, {}, "fail", "refuted"),
         ({"a": rows(3.3, 3.1)}, {"cross_validated": 1e-3}, "marginal", "no-transfer"),
         ({"a": rows(1.0, 0.1)}, {"noticed": (MISFIT,)}, "marginal", "rigid-misfit"),
-        ({"a": rows(3.3, 3.1)}, {"noticed": (MISFIT,)}, "marginal", "rigid-misfit"),
+        ({"a": rows(3.3, 3.1)}, {"noticed": (MISFIT,), "cross_validated": 5e-4}, "marginal", "rigid-misfit"),
+        # ten times the cross-validated error contradicts a fit, however much was gained
+        ({"a": rows(1.0, 0.5)}, {"cross_validated": 4.9e-5}, "fail", "contradicted"),
+        ({"a": rows(1.0, 0.5)}, {"cross_validated": 5.1e-5}, "marginal", "no-transfer"),
+        ({"a": rows(3.3, 2.0)}, {"noticed": (MISFIT,)}, "fail", "contradicted"),
+        ({"a": rows(9.0, 2.0), "b": rows(9.0, 0.1)}, {}, "fail", "contradicted"),
         ({"a": rows(1.0, 0.1)}, {"noticed": (LIGHT,)}, "pass", ""),
         ({"a": rows(1.0, 0.1)}, {"noticed": (SCALE,)}, "marginal", "lengths-grew"),
         ({"a": rows(1.0, 1.1)}, {"noticed": (SCALE,)}, "fail", "worse-than-nominal"),
@@ -70,8 +80,20 @@ SCALE = finding("lengths-grew", factor=1.01, sigma=1e-4, explained=0.9, off=0.01
         ({"a": few_rows(1.0, 0.5)}, {}, "marginal", "few-unseen-poses"),
         ({"a": few_rows(1.0, 0.5), "b": rows(1.0, 0.1)}, {}, "marginal", "few-unseen-poses"),
         # or refute the fit
-        ({"a": few_rows(1.0, 2.0)}, {}, "fail", "few-unseen-poses"),
-        ({"a": few_rows(1.0, 2.0), "b": rows(1.0, 0.1)}, {}, "fail", "few-unseen-poses"),
+        ({"a": few_rows(1.0, 2.0)}, {}, "fail", "contradicted"),
+        ({"a": few_rows(1.0, 2.0), "b": rows(1.0, 0.1)}, {}, "fail", "contradicted"),
+        # what a placement fitted to few numbers leaves is a lower bound of the error
+        ({"a": placed_rows(1.0, 0.1)}, {}, "pass", ""),
+        ({"a": placed_rows(1.0, 0.1)}, {"cross_validated": None}, "marginal", "no-unseen-poses"),
+        ({"a": placed_rows(1.0, 0.5)}, {}, "marginal", "placement-takes-all"),
+        ({"a": placed_rows(3.3, 2.0)}, {}, "fail", "contradicted"),
+        ({"a": placed_rows(3.3, 2.0), "b": rows(1.0, 0.1)}, {}, "fail", "contradicted"),
+        (
+            {"a": replace(with_row_off(1.0, 0.1, 30.0, 30.0), proves=False, placed_by=(24, 9))},
+            {},
+            "marginal",
+            "gross-unseen-rows",
+        ),
         ({"a": few_rows(1.0, 0.1), "b": rows(1.0, 1.1)}, {}, "fail", "worse-than-nominal"),
         ({"a": replace(rows(1.0, 0.1, turned=6.0), few=7)}, {}, "fail", "orientations-off"),
         # a row that is far off with both arms is named, as among many
@@ -117,6 +139,48 @@ def test_rules(unseen, changes, level, code):
     found = judge(rows(1.0, 0.1, False), unseen, findings, cross_validated=findings.cross_validated, **asked)
     assert (found.level, found.code) == (level, code), found
     assert len(found.reason.split()) <= 25
+
+
+def at(comparison, q) -> Comparison:
+    """Return the comparison with the joint values q (50, n)."""
+    return replace(comparison, blocks=(Poses(q),))
+
+
+class Poses(SimpleNamespace):
+    """A block of measurements, of which only the joint values are read."""
+
+    def __init__(self, q):
+        super().__init__(q=q, rows=np.arange(len(q)))
+
+    def __len__(self):
+        return len(self.q)
+
+
+@pytest.mark.parametrize("few", [None, 7])
+def test_extrapolation_is_no_contradiction(few):
+    """Large errors contradict a fit only on poses whose joints are within the fitted range, or little outside."""
+    fitted = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 6))
+    fit = at(rows(1.0, 0.1, False), fitted)
+    levels = {}
+    for scale in (0.5, 1.1, 3.0):
+        unseen = replace(at(rows(9.0, 2.0), scale * np.sign(fitted)), few=few)
+        levels[scale] = judge(fit, {"a": unseen}, FITTED, cross_validated=1e-4).level
+    assert levels == {0.5: "fail", 1.1: "fail", 3.0: "marginal"}
+    # one wrong pose in three is within the range: the others neither hide nor add to it
+    far = np.where(np.arange(50)[:, None] % 3 == 0, 0.5, 3.0) * np.sign(fitted)
+    verdict = judge(fit, {"a": replace(at(rows(9.0, 2.0), far), few=few)}, FITTED, cross_validated=1e-4)
+    assert verdict.level == "fail" and "within the fitted range" in verdict.reason
+
+
+def test_the_reason_names_what_its_errors_are_of():
+    """A verdict by cross-validation says so, and names the files that are too small to decide it."""
+    small = {"g3.csv": replace(few_rows(1.0, 0.1), few=3), "g7.csv": few_rows(1.0, 0.1)}
+    fit = rows(1.0, 0.01, False)
+    verdict = judge(fit, small, FITTED, cross_validated=1e-4)
+    assert "(too few unseen poses: 3 in g3.csv, 7 in g7.csv)" in verdict.reason
+    assert "error by cross-validation 10.0 times" in verdict.reason
+    many = judge(fit, {"a": rows(1.0, 0.1)}, FITTED, cross_validated=1e-4)
+    assert "error on unseen poses 10.0 times" in many.reason
 
 
 def test_deliverables_have_separate_verdicts():

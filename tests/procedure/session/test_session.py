@@ -233,7 +233,10 @@ def test_poses_are_held_out_by_default(measured: Session) -> None:
     edit(measured.path("session.toml"), "holdout = 0.0", "holdout = 0.25")
     assert go_on(measured) is None
     found = json.loads(measured.path("5-validation/metrics.json").read_text())
-    assert found["validation"]["measured.csv"]["poses"] == 5 and "(too few unseen poses: 5)" in found["reason"]
+    assert (
+        found["validation"]["measured.csv"]["poses"] == 5
+        and "(too few unseen poses: 5 in measured.csv)" in found["reason"]
+    )
     assert json.loads(measured.path("4-fit/metrics.json").read_text())["fit"]["poses"] == 15
 
 
