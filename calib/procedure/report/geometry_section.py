@@ -264,7 +264,7 @@ def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
     sets = [(f"fitted: {metrics.fit.poses} poses", metrics.fit)]
     for name, rows in metrics.validation.items():
         role = "unseen" if rows.unseen else "NOT unseen"
-        sets.append((f"{role}: {name}, {rows.poses} poses", rows))
+        sets.append((f"{role}: {name}, {counted(rows.poses, 'pose')}", rows))
     return sets
 
 
