@@ -230,15 +230,18 @@ def _contradicted(fit: Comparison, validation: Mapping[str, Comparison], promise
 
 
 def _extrapolated(fit: Comparison, rows: Comparison) -> np.ndarray:
-    """Return flags (m,): whether each error of `rows` is of a pose with a joint outside its fitted range.
+    """Return flags (m,): whether each error of `rows` is of a pose outside the fitted joint ranges or loads.
 
-    The range is widened by `RANGE_MARGIN` on both sides. Where errors do not belong to single rows, none is flagged.
+    The ranges are widened by `RANGE_MARGIN` on both sides. Where errors do not belong to single rows, none is flagged
+    by its joints.
 
     Args:
         fit: errors on the fitted rows.
         rows: errors on other rows.
     """
     sizes = rows.errors[1].main
+    if load_changes(fit.blocks, rows.blocks):
+        return np.ones(len(sizes), dtype=bool)
     if not fit.blocks or sum(len(block) for block in rows.blocks) != len(sizes):
         return np.zeros(len(sizes), dtype=bool)
     learnt = np.concatenate([block.q for block in fit.blocks])

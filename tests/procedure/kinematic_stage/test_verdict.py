@@ -40,7 +40,7 @@ def with_row_off(nominal, calibrated, nominal_off, calibrated_off) -> Comparison
     found = rows(nominal, calibrated)
     for each, off in zip(found.errors, (nominal_off, calibrated_off)):
         each.main[7] = 1e-3 * off
-    return replace(found, blocks=(SimpleNamespace(rows=np.arange(50)),))
+    return replace(found, blocks=(SimpleNamespace(rows=np.arange(50), load=None),))
 
 
 FITTED = Findings("geometry", 1e-4, None, 0.0, np.inf)
@@ -141,16 +141,16 @@ def test_rules(unseen, changes, level, code):
     assert len(found.reason.split()) <= 25
 
 
-def at(comparison, q) -> Comparison:
-    """Return the comparison with the joint values q (50, n)."""
-    return replace(comparison, blocks=(Poses(q),))
+def at(comparison, q, mass=0.0) -> Comparison:
+    """Return the comparison with the joint values q (50, n), measured with a load of this mass [kg]."""
+    return replace(comparison, blocks=(Poses(q, np.tile([0.0, 0.0, 0.0, mass], (50, 1))),))
 
 
 class Poses(SimpleNamespace):
-    """A block of measurements, of which only the joint values are read."""
+    """A block of measurements, of which only the joint values and the load are read."""
 
-    def __init__(self, q):
-        super().__init__(q=q, rows=np.arange(len(q)))
+    def __init__(self, q, load):
+        super().__init__(q=q, rows=np.arange(len(q)), load=load, file="a.csv")
 
     def __len__(self):
         return len(self.q)
@@ -166,6 +166,8 @@ def test_extrapolation_is_no_contradiction(few):
         unseen = replace(at(rows(9.0, 2.0), scale * np.sign(fitted)), few=few)
         levels[scale] = judge(fit, {"a": unseen}, FITTED, cross_validated=1e-4).level
     assert levels == {0.5: "fail", 1.1: "fail", 3.0: "marginal"}
+    loaded = replace(at(rows(9.0, 2.0), fitted, mass=5.0), few=few)
+    assert judge(fit, {"a": loaded}, FITTED, cross_validated=1e-4).level == "marginal", "under another load"
     # one wrong pose in three is within the range: the others neither hide nor add to it
     far = np.where(np.arange(50)[:, None] % 3 == 0, 0.5, 3.0) * np.sign(fitted)
     verdict = judge(fit, {"a": replace(at(rows(9.0, 2.0), far), few=few)}, FITTED, cross_validated=1e-4)
