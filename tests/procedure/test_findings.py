@@ -105,6 +105,7 @@ def test_part_without_value_is_left_out():
 def test_the_command_explains_a_code(calib):
     code, out, _ = calib("explain", "moved")
     assert code == 0 and "fail where times > 5" in out and 'accept = ["moved"]' in out
+    assert "validation.csv: too few unseen poses (5 of 8)" in calib("explain", "few-unseen-poses")[1]
     assert calib("explain")[1].splitlines() == [*catalogue(), *findings.glossary()]
     assert "left out of the fit" in calib("explain", "Cross-validated")[1]
     code, _, err = calib("explain", "mover")

@@ -475,6 +475,17 @@ def test_self_explaining_file_proves_nothing(cell, calib) -> None:
         assert ("on few.csv, unseen" in out) is scored
 
 
+@pytest.mark.parametrize(("count", "frames"), [(6, ["--refit-frames"]), (7, []), (8, [])])
+def test_unseen_poses_of_a_changed_arm_contradict_the_fit(cell, calib, count, frames) -> None:
+    """Joint 3 moved by 4 mrad since the fit: few poses fail as many do, also where the placement is fitted to them."""
+    file = cell.write("a.csv", cell.measure(60))
+    moved = [row | {"q3": row["q3"] + 4e-3} for row in cell.measure(count, 1)]
+    given = ("ur5", file, "--model", "geometry", "--validate", cell.write("moved.csv", moved), *frames)
+    code, out, err = calib("fit", *given, "--out", "o")
+    assert (code, json.loads(Path("o/metrics.json").read_text())["code"]) == (1, "contradicted"), err
+    assert "moved.csv: " in out and "times expected" in out
+
+
 def test_few_unseen_poses_are_said_and_decide_nothing(cell, calib) -> None:
     """Seven poses are named on the console, in the verdict and on the certificate; eight decide it."""
     file, other = cell.write("a.csv", cell.measure(60)), cell.measure(8, 1)
