@@ -43,6 +43,8 @@ RESUMED = ("next", "redo", "demo", "study")
 INTERRUPTED_CODE = 130
 TERMINATED_CODE = 143
 BROKEN_PIPE_CODE = 141
+# Time after which an exit by SIGTERM is repeated [s]; to remove temporary files takes less (our choice).
+EXIT_AGAIN = 5.0
 
 app = typer.Typer(
     cls=CommandGroup,
@@ -102,9 +104,21 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _terminate(number: int, frame: object) -> None:
-    """End the command as by an error, so that temporary files and worker processes go; a second signal is ignored."""
+    """End the command as by an error, so that temporary files and worker processes go; further signals are ignored.
+
+    A library whose callback is running may lose the exit. It is therefore repeated until the command has ended.
+    """
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, _terminate)
+        signal.setitimer(signal.ITIMER_REAL, EXIT_AGAIN)
     raise SystemExit(TERMINATED_CODE)
+
+
+def _stop_repeating() -> None:
+    """Let no further exit follow a SIGTERM."""
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 @lru_cache(maxsize=1)
@@ -142,6 +156,7 @@ def run(arguments: list[str] | None = None) -> int:
         return _interrupted(arguments)
     except SystemExit as stop:  # terminated, or Typer's: completion is done, or the output's reader has gone
         if stop.code == TERMINATED_CODE:
+            _stop_repeating()
             return _interrupted(arguments, TERMINATED_CODE)
         return BROKEN_PIPE_CODE if stop.code else 0
     except Exception as error:
