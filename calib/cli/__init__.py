@@ -36,8 +36,14 @@ EXIT_CODES = (
 )
 BEGIN = "Begin with calib demo; at a robot with calib new CELL, then calib next CELL. calib COMMAND --help: an example."
 INTERRUPTED = "interrupted; no incomplete files were left"
-# These commands keep what they have done; every other one starts over.
-RESUMED = ("next", "redo", "demo", "study")
+# These commands keep what they have done, and how they go on; every other one starts over.
+GOES_ON = "the same command goes on from here"
+RESUMED = {
+    "next": GOES_ON,
+    "redo": GOES_ON,
+    "study": GOES_ON,
+    "demo": "calib next FOLDER goes on from here; calib demo --bring FOLDER simulates the files that it asks for",
+}
 # Exit code of an interrupted command, of a terminated one, and of one whose output nobody reads, as a shell says of
 # SIGINT, SIGTERM and SIGPIPE.
 INTERRUPTED_CODE = 130
@@ -215,9 +221,10 @@ def _spread(arguments: list[str]) -> list[str]:
 
 
 def _interrupted(arguments: list[str], code: int = INTERRUPTED_CODE) -> int:
-    resumes = bool(set(RESUMED) & set(arguments[:2]))
-    outcome = "goes on from here" if resumes else "starts over"
-    return _complain(f"{INTERRUPTED}; the same command {outcome}", code)
+    outcome = "the same command starts over"
+    for word in arguments[:2]:
+        outcome = RESUMED.get(word, outcome)
+    return _complain(f"{INTERRUPTED}; {outcome}", code)
 
 
 def _complain(message: str, code: int) -> int:
