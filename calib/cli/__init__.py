@@ -36,13 +36,21 @@ EXIT_CODES = (
 )
 BEGIN = "Begin with calib demo; at a robot with calib new CELL, then calib next CELL. calib COMMAND --help: an example."
 INTERRUPTED = "interrupted; no incomplete files were left"
-# These commands keep what they have done; every other one starts over.
-RESUMED = ("next", "redo", "demo", "study")
+# These commands keep what they have done, and how they go on; every other one starts over.
+GOES_ON = "the same command goes on from here"
+RESUMED = {
+    "next": GOES_ON,
+    "redo": GOES_ON,
+    "study": GOES_ON,
+    "demo": "calib next FOLDER goes on from here; calib demo --bring FOLDER simulates the files that it asks for",
+}
 # Exit code of an interrupted command, of a terminated one, and of one whose output nobody reads, as a shell says of
 # SIGINT, SIGTERM and SIGPIPE.
 INTERRUPTED_CODE = 130
 TERMINATED_CODE = 143
 BROKEN_PIPE_CODE = 141
+# Time after which an exit by SIGTERM is repeated [s]; to remove temporary files takes less (our choice).
+EXIT_AGAIN = 5.0
 
 app = typer.Typer(
     cls=CommandGroup,
@@ -102,9 +110,21 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _terminate(number: int, frame: object) -> None:
-    """End the command as by an error, so that temporary files and worker processes go; a second signal is ignored."""
+    """End the command as by an error, so that temporary files and worker processes go; further signals are ignored.
+
+    A library whose callback is running may lose the exit. It is therefore repeated until the command has ended.
+    """
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    if hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, _terminate)
+        signal.setitimer(signal.ITIMER_REAL, EXIT_AGAIN)
     raise SystemExit(TERMINATED_CODE)
+
+
+def _stop_repeating() -> None:
+    """Let no further exit follow a SIGTERM."""
+    if hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 @lru_cache(maxsize=1)
@@ -142,6 +162,7 @@ def run(arguments: list[str] | None = None) -> int:
         return _interrupted(arguments)
     except SystemExit as stop:  # terminated, or Typer's: completion is done, or the output's reader has gone
         if stop.code == TERMINATED_CODE:
+            _stop_repeating()
             return _interrupted(arguments, TERMINATED_CODE)
         return BROKEN_PIPE_CODE if stop.code else 0
     except Exception as error:
@@ -200,9 +221,10 @@ def _spread(arguments: list[str]) -> list[str]:
 
 
 def _interrupted(arguments: list[str], code: int = INTERRUPTED_CODE) -> int:
-    resumes = bool(set(RESUMED) & set(arguments[:2]))
-    outcome = "goes on from here" if resumes else "starts over"
-    return _complain(f"{INTERRUPTED}; the same command {outcome}", code)
+    outcome = "the same command starts over"
+    for word in arguments[:2]:
+        outcome = RESUMED.get(word, outcome)
+    return _complain(f"{INTERRUPTED}; {outcome}", code)
 
 
 def _complain(message: str, code: int) -> int:

@@ -142,12 +142,16 @@ def workers(where: str | int | None = None) -> Iterator[Workers]:
 
 
 @contextmanager
-def finishing() -> Iterator[None]:
-    """Run the block to its end even after Ctrl-C: the first Ctrl-C is ignored, a second one stops the block at once."""
+def finishing() -> Iterator[list[int]]:
+    """Run the block to its end even after Ctrl-C: the first Ctrl-C is ignored, a second one stops the block at once.
+
+    Yields the list of ignored signals, which grows when Ctrl-C is pressed.
+    """
+    heard: list[int] = []
     if threading.current_thread() is not threading.main_thread():
-        yield
+        yield heard
         return
-    before, heard = signal.getsignal(signal.SIGINT), []
+    before = signal.getsignal(signal.SIGINT)
 
     def note(number: int, frame: object) -> None:
         if heard:
@@ -156,6 +160,6 @@ def finishing() -> Iterator[None]:
 
     signal.signal(signal.SIGINT, note)
     try:
-        yield
+        yield heard
     finally:
         signal.signal(signal.SIGINT, before)

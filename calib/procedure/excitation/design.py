@@ -95,6 +95,7 @@ class Designed:
         playback: setpoints for the controller.
         notes: remarks for the user.
         goal_notes: those of the `notes` that are on goals: missed, or decided by typical friction.
+        cut_short: whether Ctrl-C was pressed after the search, so that the front or the predictions may be missing.
         outlook: predicted accuracy of the parameters and torques that the motion identifies; None without torque
             limits, from which torque errors are
             assumed.
@@ -115,6 +116,12 @@ class Designed:
     predicted: Sequence[PredictedSigma] = ()
     stored_front: StoredFront | None = None
     goal_notes: tuple[str, ...] = ()
+    cut_short: bool = False
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C was pressed, during the search or after it."""
+        return self.found.interrupted or self.cut_short
 
     def periodic(self, motion: SearchResult) -> Periodic:
         """Return a result of the search as a periodic motion."""
@@ -229,24 +236,29 @@ def search_motion(
 
     show("verifying")
     motion, problem = _with_whole_samples(motion, problem, settings.rate)
-    with finishing():
+    cut_short = False
+    with finishing() as ignored:
         motion, proof = ensured(problem, motion, checked)
     stored = picked
     if picked is None and settings.front and not motion.interrupted:
         # the motion exists: what follows may be cut short
-        with suppress(KeyboardInterrupt):
+        try:
             front = _front(problem, inputs, motion, goals, settings.front, settings.evaluations, report)
             front, nearest, nearest_proof = _nearest_goals(front, problem, goals, inputs, (motion, proof), checked)
             motions = [_periodic(result, inputs, settings, problem.family) for result in front.found]
             motion, proof, stored = nearest, nearest_proof, StoredFront(front, tuple(motions))
-    with finishing():
+        except KeyboardInterrupt:
+            cut_short = True
+    with finishing() as ignored_later:
         playback = play(problem.family, motion, inputs, settings)
         condition_numbers = _condition_of(inputs, problem.family, motion, settings.repeat)
         values = _reached(problem, goals, motion, inputs)
     outlook, predicted = None, ()
-    with suppress(KeyboardInterrupt):
+    try:
         show("predicting sigmas of other periods")
         outlook, predicted = foretell(inputs, settings, problem, motion, problem_of_period)
+    except KeyboardInterrupt:
+        cut_short = True
 
     goal_notes: tuple[str, ...] = ()
     if goals and not problem.goals:
@@ -275,6 +287,7 @@ def search_motion(
         predicted=predicted,
         stored_front=stored,
         goal_notes=goal_notes,
+        cut_short=cut_short or bool(ignored or ignored_later),
     )
 
 

@@ -199,10 +199,17 @@ def _growth(folder: Path, model: ExcitedModel) -> ErrorGrowth | None:
 
 
 def _bands(folder: Path, model: ExcitedModel) -> ErrorBands | None:
-    """Return how the errors of an identification depend on the band; None for files of earlier versions."""
+    """Return how the errors of an identification depend on the band; None for files of earlier versions.
+
+    Raises:
+        UsageError: if the stored bands are damaged.
+    """
     bands = IdentificationFolder(folder).metrics().error_bands
     if bands is None:
         return None
+    expected = (len(bands.rows_per_second), model.exact.model.rows)
+    if np.shape(bands.density) != expected or not np.all(np.asarray(bands.density) > 0.0):
+        raise UsageError(f"{folder}/metrics.json: error_bands is damaged; identify again")
     density = np.tile(bands.density, len(model.exact.loads))
     return ErrorBands(bands.rows_per_second, density, bands.seconds)
 

@@ -205,7 +205,7 @@ def _design(
         progress=report_progress,
     )
     # a session is resumed, not gone on with half a search
-    if designed.found.interrupted:
+    if designed.interrupted:
         raise KeyboardInterrupt
     draw = None
     if session.plots and name == "training":

@@ -129,7 +129,7 @@ def extend(session: Session, say: Say) -> list[str]:
         designed = design.search_motion(inputs, replace(settings, goals=(aim,)), progress=say)
     except (CalibError, ValueError) as error:
         return [f"joints or parameters fall short, but no further motion could be designed: {error}"]
-    if designed.found.interrupted:
+    if designed.interrupted:
         raise KeyboardInterrupt
     motion_folder.write_design(designed, session.path(f"6-excitation/{round_name}"))
     aimed = designed.inputs.columns.aimed_names if weak else ()

@@ -491,6 +491,18 @@ def test_a_front_serves_the_goals():
     assert missed[found.front.designed].max() < missed.max(axis=1).min() + 0.02 and found.proof.feasible
 
 
+def test_ctrl_c_after_the_search_is_heard(monkeypatch):
+    """The motion stands without predictions; a session, which would go on with its next step, is told."""
+
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(design, "foretell", interrupted)
+    motion = design.excite("tx40", replace(SHORT, starts=1, evaluations=20, outlook=False))
+    assert motion.interrupted and not motion.found.interrupted
+    assert motion.outlook is None and motion.proof is not None
+
+
 @pytest.mark.slow
 def test_torque_goal_works_without_friction():
     """Typical friction stands in for what nobody knows yet, so that condition numbers do not pay for a goal in vain."""

@@ -15,8 +15,9 @@ from calib.identification.identify_options import IdentifyOptions
 from calib.identification.uncertainty.error_bands import ErrorBands
 from calib.identification.uncertainty.geometry_uncertainty import propagate
 from calib.procedure.dynamic_stage import identify, inputs
-from calib.procedure.excitation import design, prediction
+from calib.procedure.excitation import design, prediction, prior_motions
 from calib.procedure.excitation import folder as motion_folder
+from calib.procedure.excitation.excited_model import ExcitedModel
 from calib.procedure.excitation.geometry_spread import geometry_spread
 from calib.procedure.excitation.inputs import ExcitationInputs
 from calib.procedure.excitation.prediction import ADDED_ERRORS, _information_root, _reweighted, _wider
@@ -110,6 +111,15 @@ def test_missing_prediction_is_refused(motion, outcome, tmp_path):
     other = replace(outcome, found=SimpleNamespace(names=["one", "two"], fitted=fitted))
     with pytest.raises(UsageError, match="none of the 2 identified parameters"):
         prediction.compared_with_identification(motion, other)
+
+
+@pytest.mark.parametrize("density", [np.ones((1, 3)), np.ones((2, 2)), np.zeros((2, 3))])
+def test_damaged_error_bands_are_refused(monkeypatch, tmp_path, density):
+    metrics = SimpleNamespace(error_bands=ErrorBands(np.array([10.0, 20.0]), density))
+    monkeypatch.setattr(prior_motions, "IdentificationFolder", lambda folder: SimpleNamespace(metrics=lambda: metrics))
+    model = SimpleNamespace(exact=SimpleNamespace(model=SimpleNamespace(rows=3), loads=("",)))
+    with pytest.raises(UsageError, match="error_bands is damaged; identify again"):
+        prior_motions._bands(tmp_path, cast(ExcitedModel, model))
 
 
 def test_earlier_rows_are_weighed_by_the_rows_that_see_a_parameter():
