@@ -128,7 +128,7 @@ def judge(
     if not proofs and cross_validated is not None:
         where = "by cross-validation only"
         if few and all(level_of(note) == "note" for note in few):
-            counts = [f"{rows.poses if rows.few is None else rows.few} in {name}" for name, rows in small.items()]
+            counts = [f"{rows.few or rows.poses} in {name}" for name, rows in small.items()]
             where += f" (too few unseen poses: {listing(counts, 2)})"
         proofs = [_Proof(nominal_rms, cross_validated, where)]
     if not proofs and frames_only:
