@@ -18,6 +18,7 @@ from calib.procedure.answers import CertificateSection
 from calib.procedure.excitation.settings import HARMONICS, ExcitationSettings
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
 from calib.procedure.session.folder import open_session
+from calib.procedure.session.recording_names import check_labels
 from calib.procedure.session.settings import (
     DynamicsSection,
     FitSection,
@@ -74,8 +75,20 @@ def test_number_spelling_makes_nothing_stale() -> None:
     assert changed_inputs({"a.csv": "10"}, {"a.csv": "1e1"}) == "a.csv has changed", "a file's mark is no number"
 
 
+def tell_recordings_apart(loads: dict[str, float]) -> bool:
+    """Whether labels are allowed: a drawn one may be ``NONE``, which stands in names of recordings."""
+    try:
+        check_labels(loads)
+    except ValueError:
+        return False
+    return True
+
+
+LOADS = st.dictionaries(WORDS, st.floats(1e-3, 1e3), max_size=3).filter(tell_recordings_apart)
+
+
 @settings(deadline=None)
-@given(WORDS, WORDS, WORDS, st.dictionaries(WORDS, st.floats(1e-3, 1e3), max_size=3), st.integers(0, 2**63 - 1))
+@given(WORDS, WORDS, WORDS, LOADS, st.integers(0, 2**63 - 1))
 def test_names_come_back_whatever_they_hold(name: str, given_as: str, link: str, loads: dict, seed: int) -> None:
     made = SessionSettings(
         name, "2026-01-01T00:00:00+00:00", seed, RobotSection("1-robot/robot.urdf", given_as, link, link),
