@@ -42,6 +42,8 @@ DIFFERENCE = 0.02
 MIN_SIGMAS = 3.0
 # [kg] load whose deflection is compared with its doubt: any does, since both grow with it; every arm carries this one
 TEST_LOAD = 1e-3
+# size of a column below which gravity does not turn its element
+TINY = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +123,7 @@ class MassFactors:
     def _derivatives(
         self, fit: GeometricFit, measured: Sequence[PoseMeasurements]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return whitened residuals (N,), and the derivatives of the predictions.
+        """Return whitened residuals (N,) of rows and of the compliance's prior, and the derivatives of the predictions.
 
         These are by the unknowns (N, 4 n), from differences, and by the fit's parameters (N, f).
 
@@ -130,7 +132,9 @@ class MassFactors:
         """
         noise = fit.estimate.residual_std
         residual, by_fit = fit.whitened_rows(fit.cell, fit.blocks, fit.free)
-        columns = []
+        positions = _compliance_positions(fit)
+        sizes = np.linalg.norm(by_fit[:, positions], axis=0)
+        columns, growths = [], []
         for number, variance in enumerate(np.diag(self.prior)):
             difference = DIFFERENCE * np.sqrt(variance)
             values = self.values.copy()
@@ -138,10 +142,19 @@ class MassFactors:
             masses = self._masses(values)
             cell = _of_masses(fit.cell, masses)
             blocks = prepare(cell, self.blocks(measured, masses))
-            changed, _ = fit.whitened_rows(cell, blocks, fit.free[:0])
+            changed, by_compliance = fit.whitened_rows(cell, blocks, fit.free[positions])
             # a residual is measured minus predicted
             columns.append((residual - changed) / difference)
-        return residual / noise, np.stack(columns, axis=1) / noise, by_fit / noise
+            growths.append((np.linalg.norm(by_compliance, axis=0) - sizes) / np.maximum(sizes, TINY) / difference)
+        by_masses = np.stack(columns, axis=1) / noise
+        # the prior of a compliance is one of its deflection: it narrows as the masses grow
+        prior = np.full(len(fit.free), np.inf) if fit.prior is None else fit.prior
+        in_sigmas = np.asarray(fit.estimate.values)[positions] / prior[positions]
+        widths = np.zeros((len(positions), len(fit.free)))
+        widths[np.arange(len(positions)), positions] = 1.0 / prior[positions]
+        residual = np.concatenate([residual / noise, -in_sigmas])
+        by_masses = np.concatenate([by_masses, in_sigmas[:, None] * np.stack(growths, axis=1)])
+        return residual, by_masses, np.concatenate([by_fit / noise, widths])
 
     def _doubt(
         self, fit: GeometricFit, measured: Sequence[PoseMeasurements], slope: np.ndarray, covariance: np.ndarray
@@ -197,15 +210,19 @@ def _compliance_slopes(fit: GeometricFit, slope: np.ndarray) -> tuple[np.ndarray
     numbers = layout(cell).index("deflection").tolist()
     compliance = np.zeros(len(chain.elements))
     slopes = np.zeros((len(chain.elements), slope.shape[1]))
-    for position, parameter in enumerate(fit.free.tolist()):
-        if parameter not in numbers:
-            continue
-        number = numbers.index(parameter)
-        term = cell.deflection.terms[number]
-        if term.basis in BY_TORQUE:
-            compliance[elements[term.element]] += np.asarray(cell.deflection.coefficients)[number]
-            slopes[elements[term.element]] += slope[position]
+    for position in _compliance_positions(fit):
+        number = numbers.index(fit.free[position])
+        element = elements[cell.deflection.terms[number].element]
+        compliance[element] += np.asarray(cell.deflection.coefficients)[number]
+        slopes[element] += slope[position]
     return compliance, slopes
+
+
+def _compliance_positions(fit: GeometricFit) -> np.ndarray:
+    """Return the positions (k,) of the coefficients of compliance by torques among a fit's parameters."""
+    numbers = layout(fit.cell).index("deflection")
+    by_torque = [term.basis in BY_TORQUE for term in fit.cell.deflection.terms]
+    return np.flatnonzero(np.isin(fit.free, numbers[by_torque]))
 
 
 def _of_masses(cell: Installation, masses: np.ndarray) -> Installation:
