@@ -40,6 +40,8 @@ MAX_STEP, SETTLED = 1.0, 0.1
 DIFFERENCE = 0.02
 # standard deviations by which the total mass has to differ from the described one to be stated (our choice)
 MIN_SIGMAS = 3.0
+# standard deviations at the limit of an interval of 95 %
+LIMIT = 1.96
 # [kg] load whose deflection is compared with its doubt: any does, since both grow with it; every arm carries this one
 TEST_LOAD = 1e-3
 # size of a column below which gravity does not turn its element
@@ -161,6 +163,8 @@ class MassFactors:
     ) -> float:
         """Return the standard deviation of the deflection by a load at the fitted poses, as a share of it.
 
+        That of its logarithm is computed. The deflection is log-normal, and the share is that of its upper limit.
+
         Args:
             fit, measured: arguments of `step`.
             slope: (f, 4 n) change of the fit's parameters per unknown.
@@ -175,7 +179,8 @@ class MassFactors:
             total += float(np.sum(np.einsum("k,kim->im", compliance, motions) ** 2))
             by_unknown = np.einsum("ku,kim->uim", slopes, motions).reshape(len(self.values), -1)
             doubtful += float(np.sum((covariance @ by_unknown) * by_unknown))
-        return float(np.sqrt(doubtful / max(total, 1e-300)))
+        of_logarithm = float(np.sqrt(doubtful / max(total, 1e-300)))
+        return float(np.expm1(LIMIT * of_logarithm)) / LIMIT
 
     def findings(self) -> list[Finding]:
         """Return a finding if the masses together differ from those of the description."""
