@@ -5,7 +5,9 @@ of the stated load, m_i that of body i. f_i is the logarithm of the factor of it
 its first moments over its described mass. Their prior is normal: all bodies have one factor in common, as descriptions
 of another arm of the family or without motors do, and each has one of its own. The estimate is the most probable one,
 by Gauss–Newton steps in which the parameters of the fit move along. Under a single load only the product of c and the
-masses is determined, and the prior remains.
+masses is determined, and the prior remains. The fit's prior of c has a width estimated from the same rows. It is taken
+as the prior of that product, the deflection: a prior of c alone, fixed during a step, would draw c to zero and the
+masses to large values.
 """
 
 from collections.abc import Sequence
@@ -27,7 +29,7 @@ from calib.robot.chain import Chain
 # prior standard deviations of the logarithm of the factor that all masses have in common, and of that of a single
 # body, of described masses (our choice)
 DESCRIBED_FACTOR = 0.5, 0.3
-# the same of the masses of a usual arm, where none are described (our choice)
+# the same of the masses of a usual arm, of bodies whose masses are not described (our choice)
 USUAL_FACTOR = 1.0, 0.5
 # prior standard deviation of a centre of mass, as a share of the arm's length (our choice)
 CENTRE_SHARE = 0.05
@@ -53,11 +55,11 @@ class MassFactors:
     """Unknown masses of an arm of n bodies: logarithms of factors (n), then first moments per described mass (3 n) [m].
 
     Attributes:
-        chain: the nominal arm, with described masses or those of a usual arm.
+        chain: the nominal arm, with described masses; of bodies without, with those of a usual arm.
         values, prior: (4 n,) most probable unknowns so far, and (4 n, 4 n) covariance of their prior.
         covariance: (4 n, 4 n) posterior covariance; the prior before the first step.
         doubt: standard deviation of a load's deflection due to the masses, as a share of it.
-        described: whether the masses are those of the description.
+        described: (n,) mask of the bodies whose masses are those of the description.
     """
 
     chain: Chain
@@ -65,22 +67,23 @@ class MassFactors:
     prior: np.ndarray
     covariance: np.ndarray
     doubt: float
-    described: bool = True
+    described: np.ndarray
 
     @classmethod
     def before(cls, chain: Chain) -> "MassFactors":
         """Return the unknowns of a nominal arm before any measurement."""
-        masses = reference_masses(chain)
-        common, single = DESCRIBED_FACTOR
-        described = chain.inertias is not None and chain.inertias[:, 9].sum() > 0.0
-        if not described:
-            common, single = USUAL_FACTOR
-            masses *= USUAL_MASS * chain.stretched_length() ** 2 / masses[:, 9].sum()
+        described = np.zeros(chain.n, dtype=bool) if chain.inertias is None else chain.inertias[:, 9] > 0.0
+        masses = reference_masses(replace(chain, inertias=None))
+        masses *= USUAL_MASS * chain.stretched_length() ** 2 / masses[:, 9].sum()
+        if chain.inertias is not None:
+            masses[described] = chain.inertias[described]
         n = chain.n
         prior = np.diag(np.full(4 * n, (CENTRE_SHARE * chain.stretched_length()) ** 2))
-        prior[:n, :n] = common**2 + single**2 * np.eye(n)
-        doubt = float(np.hypot(common, single))
-        return cls(replace(chain, inertias=masses), np.zeros(4 * n), prior, prior, doubt, bool(described))
+        prior[:n, :n] = 0.0
+        for bodies, (common, single) in ((described, DESCRIBED_FACTOR), (~described, USUAL_FACTOR)):
+            prior[:n, :n] += common**2 * np.outer(bodies, bodies) + single**2 * np.diag(bodies)
+        doubt = float(np.sqrt(np.max(np.diag(prior)[:n])))
+        return cls(replace(chain, inertias=masses), np.zeros(4 * n), prior, prior, doubt, described)
 
     @property
     def masses(self) -> np.ndarray:
@@ -183,8 +186,11 @@ class MassFactors:
         return float(np.expm1(LIMIT * of_logarithm)) / LIMIT
 
     def findings(self) -> list[Finding]:
-        """Return a finding if the masses together differ from those of the description."""
-        if not self.described:
+        """Return a finding if the masses together differ from those of a description of all bodies.
+
+        Neighbours share the moment of a body: gravity does not tell its mass where theirs are not described.
+        """
+        if not self.described.all():
             return []
         described = np.asarray(self.chain.inertias)[:, 9]
         masses = self.masses[:, 9]
