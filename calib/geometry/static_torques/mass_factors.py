@@ -5,7 +5,9 @@ of the stated load, m_i that of body i. f_i is the logarithm of the factor of it
 its first moments over its described mass. Their prior is normal: all bodies have one factor in common, as descriptions
 of another arm of the family or without motors do, and each has one of its own. The estimate is the most probable one,
 by Gauss–Newton steps in which the parameters of the fit move along. Under a single load only the product of c and the
-masses is determined, and the prior remains.
+masses is determined, and the prior remains. The fit's prior of c has a width estimated from the same rows. It is taken
+as the prior of that product, the deflection: a prior of c alone, fixed during a step, would draw c to zero and the
+masses to large values.
 """
 
 from collections.abc import Sequence
@@ -27,7 +29,7 @@ from calib.robot.chain import Chain
 # prior standard deviations of the logarithm of the factor that all masses have in common, and of that of a single
 # body, of described masses (our choice)
 DESCRIBED_FACTOR = 0.5, 0.3
-# the same of the masses of a usual arm, where none are described (our choice)
+# the same of the masses of a usual arm, of bodies whose masses are not described (our choice)
 USUAL_FACTOR = 1.0, 0.5
 # prior standard deviation of a centre of mass, as a share of the arm's length (our choice)
 CENTRE_SHARE = 0.05
@@ -40,8 +42,12 @@ MAX_STEP, SETTLED = 1.0, 0.1
 DIFFERENCE = 0.02
 # standard deviations by which the total mass has to differ from the described one to be stated (our choice)
 MIN_SIGMAS = 3.0
+# standard deviations at the limit of an interval of 95 %
+LIMIT = 1.96
 # [kg] load whose deflection is compared with its doubt: any does, since both grow with it; every arm carries this one
 TEST_LOAD = 1e-3
+# size of a column below which gravity does not turn its element
+TINY = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +55,11 @@ class MassFactors:
     """Unknown masses of an arm of n bodies: logarithms of factors (n), then first moments per described mass (3 n) [m].
 
     Attributes:
-        chain: the nominal arm, with described masses or those of a usual arm.
+        chain: the nominal arm, with described masses; of bodies without, with those of a usual arm.
         values, prior: (4 n,) most probable unknowns so far, and (4 n, 4 n) covariance of their prior.
         covariance: (4 n, 4 n) posterior covariance; the prior before the first step.
         doubt: standard deviation of a load's deflection due to the masses, as a share of it.
-        described: whether the masses are those of the description.
+        described: (n,) mask of the bodies whose masses are those of the description.
     """
 
     chain: Chain
@@ -61,22 +67,23 @@ class MassFactors:
     prior: np.ndarray
     covariance: np.ndarray
     doubt: float
-    described: bool = True
+    described: np.ndarray
 
     @classmethod
     def before(cls, chain: Chain) -> "MassFactors":
         """Return the unknowns of a nominal arm before any measurement."""
-        masses = reference_masses(chain)
-        common, single = DESCRIBED_FACTOR
-        described = chain.inertias is not None and chain.inertias[:, 9].sum() > 0.0
-        if not described:
-            common, single = USUAL_FACTOR
-            masses *= USUAL_MASS * chain.stretched_length() ** 2 / masses[:, 9].sum()
+        described = np.zeros(chain.n, dtype=bool) if chain.inertias is None else chain.inertias[:, 9] > 0.0
+        masses = reference_masses(replace(chain, inertias=None))
+        masses *= USUAL_MASS * chain.stretched_length() ** 2 / masses[:, 9].sum()
+        if chain.inertias is not None:
+            masses[described] = chain.inertias[described]
         n = chain.n
         prior = np.diag(np.full(4 * n, (CENTRE_SHARE * chain.stretched_length()) ** 2))
-        prior[:n, :n] = common**2 + single**2 * np.eye(n)
-        doubt = float(np.hypot(common, single))
-        return cls(replace(chain, inertias=masses), np.zeros(4 * n), prior, prior, doubt, bool(described))
+        prior[:n, :n] = 0.0
+        for bodies, (common, single) in ((described, DESCRIBED_FACTOR), (~described, USUAL_FACTOR)):
+            prior[:n, :n] += common**2 * np.outer(bodies, bodies) + single**2 * np.diag(bodies)
+        doubt = float(np.sqrt(np.max(np.diag(prior)[:n])))
+        return cls(replace(chain, inertias=masses), np.zeros(4 * n), prior, prior, doubt, described)
 
     @property
     def masses(self) -> np.ndarray:
@@ -121,7 +128,7 @@ class MassFactors:
     def _derivatives(
         self, fit: GeometricFit, measured: Sequence[PoseMeasurements]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return whitened residuals (N,), and the derivatives of the predictions.
+        """Return whitened residuals (N,) of rows and of the compliance's prior, and the derivatives of the predictions.
 
         These are by the unknowns (N, 4 n), from differences, and by the fit's parameters (N, f).
 
@@ -130,7 +137,9 @@ class MassFactors:
         """
         noise = fit.estimate.residual_std
         residual, by_fit = fit.whitened_rows(fit.cell, fit.blocks, fit.free)
-        columns = []
+        positions = _compliance_positions(fit)
+        sizes = np.linalg.norm(by_fit[:, positions], axis=0)
+        columns, growths = [], []
         for number, variance in enumerate(np.diag(self.prior)):
             difference = DIFFERENCE * np.sqrt(variance)
             values = self.values.copy()
@@ -138,15 +147,26 @@ class MassFactors:
             masses = self._masses(values)
             cell = _of_masses(fit.cell, masses)
             blocks = prepare(cell, self.blocks(measured, masses))
-            changed, _ = fit.whitened_rows(cell, blocks, fit.free[:0])
+            changed, by_compliance = fit.whitened_rows(cell, blocks, fit.free[positions])
             # a residual is measured minus predicted
             columns.append((residual - changed) / difference)
-        return residual / noise, np.stack(columns, axis=1) / noise, by_fit / noise
+            growths.append((np.linalg.norm(by_compliance, axis=0) - sizes) / np.maximum(sizes, TINY) / difference)
+        by_masses = np.stack(columns, axis=1) / noise
+        # the prior of a compliance is one of its deflection: it narrows as the masses grow
+        prior = np.full(len(fit.free), np.inf) if fit.prior is None else fit.prior
+        in_sigmas = np.asarray(fit.estimate.values)[positions] / prior[positions]
+        widths = np.zeros((len(positions), len(fit.free)))
+        widths[np.arange(len(positions)), positions] = 1.0 / prior[positions]
+        residual = np.concatenate([residual / noise, -in_sigmas])
+        by_masses = np.concatenate([by_masses, in_sigmas[:, None] * np.stack(growths, axis=1)])
+        return residual, by_masses, np.concatenate([by_fit / noise, widths])
 
     def _doubt(
         self, fit: GeometricFit, measured: Sequence[PoseMeasurements], slope: np.ndarray, covariance: np.ndarray
     ) -> float:
         """Return the standard deviation of the deflection by a load at the fitted poses, as a share of it.
+
+        That of its logarithm is computed. The deflection is log-normal, and the share is that of its upper limit.
 
         Args:
             fit, measured: arguments of `step`.
@@ -162,11 +182,15 @@ class MassFactors:
             total += float(np.sum(np.einsum("k,kim->im", compliance, motions) ** 2))
             by_unknown = np.einsum("ku,kim->uim", slopes, motions).reshape(len(self.values), -1)
             doubtful += float(np.sum((covariance @ by_unknown) * by_unknown))
-        return float(np.sqrt(doubtful / max(total, 1e-300)))
+        of_logarithm = float(np.sqrt(doubtful / max(total, 1e-300)))
+        return float(np.expm1(LIMIT * of_logarithm)) / LIMIT
 
     def findings(self) -> list[Finding]:
-        """Return a finding if the masses together differ from those of the description."""
-        if not self.described:
+        """Return a finding if the masses together differ from those of a description of all bodies.
+
+        Neighbours share the moment of a body: gravity does not tell its mass where theirs are not described.
+        """
+        if not self.described.all():
             return []
         described = np.asarray(self.chain.inertias)[:, 9]
         masses = self.masses[:, 9]
@@ -197,15 +221,19 @@ def _compliance_slopes(fit: GeometricFit, slope: np.ndarray) -> tuple[np.ndarray
     numbers = layout(cell).index("deflection").tolist()
     compliance = np.zeros(len(chain.elements))
     slopes = np.zeros((len(chain.elements), slope.shape[1]))
-    for position, parameter in enumerate(fit.free.tolist()):
-        if parameter not in numbers:
-            continue
-        number = numbers.index(parameter)
-        term = cell.deflection.terms[number]
-        if term.basis in BY_TORQUE:
-            compliance[elements[term.element]] += np.asarray(cell.deflection.coefficients)[number]
-            slopes[elements[term.element]] += slope[position]
+    for position in _compliance_positions(fit):
+        number = numbers.index(fit.free[position])
+        element = elements[cell.deflection.terms[number].element]
+        compliance[element] += np.asarray(cell.deflection.coefficients)[number]
+        slopes[element] += slope[position]
     return compliance, slopes
+
+
+def _compliance_positions(fit: GeometricFit) -> np.ndarray:
+    """Return the positions (k,) of the coefficients of compliance by torques among a fit's parameters."""
+    numbers = layout(fit.cell).index("deflection")
+    by_torque = [term.basis in BY_TORQUE for term in fit.cell.deflection.terms]
+    return np.flatnonzero(np.isin(fit.free, numbers[by_torque]))
 
 
 def _of_masses(cell: Installation, masses: np.ndarray) -> Installation:
