@@ -2,12 +2,11 @@
 
 Gravity turns an element by c (m_load(q) + Σ_i m_i(q, f_i, Δ_i)): c is its compliance, m_load the moment
 of the stated load, m_i that of body i. f_i is the logarithm of the factor of its described mass, Δ_i [m] the change of
-its first moments over its described mass. Their prior is normal: all bodies have one factor in common, as descriptions
-of another arm of the family or without motors do, and each has one of its own. The estimate is the most probable one,
-by Gauss–Newton steps in which the parameters of the fit move along. Under a single load only the product of c and the
-masses is determined, and the prior remains. The fit's prior of c has a width estimated from the same rows. It is taken
-as the prior of that product, the deflection: a prior of c alone, fixed during a step, would draw c to zero and the
-masses to large values.
+its centre of mass. Their prior is normal: all bodies have one factor in common, as descriptions of another arm of the
+family or without motors do, and each has one of its own. The estimate is the most probable one, by Gauss–Newton steps
+in which the parameters of the fit move along. Under a single load only the product of c and the masses is determined,
+and the prior remains. The fit's prior of c has a width estimated from the same rows. It is taken as the prior of that
+product, the deflection: a prior of c alone, fixed during a step, would draw c to zero and the masses to large values.
 """
 
 from collections.abc import Sequence
@@ -52,7 +51,7 @@ TINY = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class MassFactors:
-    """Unknown masses of an arm of n bodies: logarithms of factors (n), then first moments per described mass (3 n) [m].
+    """Unknown masses of an arm of n bodies: logarithms of factors (n), then changes of centres of mass (3 n) [m].
 
     Attributes:
         chain: the nominal arm, with described masses; of bodies without, with those of a usual arm.
@@ -92,10 +91,9 @@ class MassFactors:
 
     def _masses(self, values: np.ndarray) -> np.ndarray:
         n = self.chain.n
-        described = np.asarray(self.chain.inertias)
-        result = described * np.exp(values[:n, None])
-        result[:, 6:9] += described[:, 9:] * values[n:].reshape(n, 3)
-        return result
+        result = np.array(self.chain.inertias)
+        result[:, 6:9] += result[:, 9:] * values[n:].reshape(n, 3)
+        return result * np.exp(values[:n, None])
 
     def change_from(self, earlier: "MassFactors") -> float:
         """Return the largest change of the unknowns since an earlier step, in standard deviations of the posterior."""

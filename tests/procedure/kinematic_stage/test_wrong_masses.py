@@ -1,6 +1,7 @@
 """Compliance from poses under two stated loads, without torques, with wrong or no masses; the arm is Pinocchio's."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,8 +9,10 @@ from loaded_arm import HEAD, GivingArm, urdf
 
 import calib
 from calib.geometry.static_torques.load_errors import DESCRIBED
+from calib.geometry.static_torques.mass_factors import MassFactors
 from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.procedure.kinematic_stage.inputs import gather
+from calib.robot.formats import urdf as urdf_format
 
 COLUMNS = [*HEAD[:10], "payload [kg]"]
 # noise of a position, all axes [m]
@@ -92,6 +95,18 @@ def test_nearly_equal_loads_leave_the_doubt_of_the_masses(tmp_path, factor):
     assert rows.intervals.covered >= 0.9
     assert fit.expected.discrepancy.mass_doubt > DESCRIBED
     assert "masses-scaled" not in codes(fit)
+
+
+def test_a_common_factor_leaves_changed_centres_of_mass():
+    """First moments kept their change: light masses were preferred, where centres were far from the described ones."""
+    before = MassFactors.before(urdf_format.parse(description(1.0), "arm.urdf"))
+    n = before.chain.n
+    centres = np.linspace(-0.1, 0.1, 3 * n)
+    moved, heavier = (
+        replace(before, values=np.concatenate([np.full(n, logarithm), centres])) for logarithm in (0.0, np.log(2.0))
+    )
+    assert not np.allclose(moved.masses, before.masses)
+    assert np.allclose(heavier.masses, 2.0 * moved.masses)
 
 
 def test_bodies_without_described_mass_are_unknown_beside_one_with(tmp_path):
