@@ -1,6 +1,7 @@
 """Result folders: whose files may be replaced, and what a killed run leaves."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -131,6 +132,41 @@ cli._spread = list
 cli.command_tree = lambda: lambda **arguments: write_staged(Path("out"), (), fill)
 cli.main()
 """
+
+
+LOSING = """
+import signal
+import time
+
+from calib import cli
+
+
+def compile_kernel():
+    print("compiling", flush=True)
+    try:
+        time.sleep(60.0)
+    except KeyboardInterrupt:  # as in a callback of ctypes
+        pass
+    raise RuntimeError("no compiled object yet")
+
+
+cli._spread = list
+cli.command_tree = lambda: lambda **arguments: compile_kernel()
+cli.main()
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows ends a process without a signal")
+def test_an_error_of_a_library_that_lost_ctrl_c_is_an_interruption(tmp_path: Path) -> None:
+    """As of Numba, when Ctrl-C meets the compilation of a kernel: no internal error, no bug report."""
+    command = subprocess.Popen(
+        [sys.executable, "-c", LOSING, "fit"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert command.stdout is not None and command.stdout.readline() == "compiling\n"
+    command.send_signal(signal.SIGINT)
+    _, errors = command.communicate(timeout=30)
+    assert command.returncode == 130 and "interrupted" in errors and "internal error" not in errors
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows ends a process without a signal")

@@ -51,6 +51,8 @@ TERMINATED_CODE = 143
 BROKEN_PIPE_CODE = 141
 # Time after which an exit by SIGTERM is repeated [s]; to remove temporary files takes less (our choice).
 EXIT_AGAIN = 5.0
+# Exit codes of the signals that this process has received.
+_heard: list[int] = []
 
 app = typer.Typer(
     cls=CommandGroup,
@@ -92,6 +94,9 @@ def main(arguments: list[str] | None = None) -> None:
     if owns_process:
         limit_process()
         signal.signal(signal.SIGTERM, _terminate)
+        # in the background of a shell it is ignored, and stays so
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, _interrupt)
     # What numpy and others say to programmers helps nobody at a cell.
     if not os.environ.get("CALIB_DEBUG"):
         warnings.filterwarnings("ignore")
@@ -109,11 +114,18 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(code)
 
 
+def _interrupt(number: int, frame: object) -> None:
+    """Raise KeyboardInterrupt, and note that it was: a library whose callback is running may turn it into an error."""
+    _heard.append(INTERRUPTED_CODE)
+    raise KeyboardInterrupt
+
+
 def _terminate(number: int, frame: object) -> None:
     """End the command as by an error, so that temporary files and worker processes go; further signals are ignored.
 
     A library whose callback is running may lose the exit. It is therefore repeated until the command has ended.
     """
+    _heard.append(TERMINATED_CODE)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if hasattr(signal, "setitimer"):
         signal.signal(signal.SIGALRM, _terminate)
@@ -185,6 +197,10 @@ def _failed(error: Exception, arguments: list[str]) -> int:
     if expected is not None:
         message, code = expected
         return _complain(message, code)
+    if _heard:
+        # a library lost the signal in a callback, and failed for that
+        _stop_repeating()
+        return _interrupted(arguments, _heard[-1])
     return _complain(bug_reports.report(error, arguments), bug_reports.CODE)
 
 
