@@ -113,6 +113,7 @@ import time
 from pathlib import Path
 
 from calib import cli
+from calib.cli import signals
 from calib.folders import write_staged
 
 
@@ -127,7 +128,7 @@ def fill(folder):
     time.sleep(60.0)
 
 
-cli.EXIT_AGAIN = 0.2
+signals.EXIT_AGAIN = 0.2
 cli._spread = list
 cli.command_tree = lambda: lambda **arguments: write_staged(Path("out"), (), fill)
 cli.main()

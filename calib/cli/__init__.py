@@ -9,7 +9,6 @@ import codecs
 import gc
 import io
 import os
-import signal
 import sys
 import warnings
 from functools import lru_cache
@@ -19,8 +18,9 @@ import typer
 from typer.main import get_command
 
 import calib
-from calib.cli import dynamics, geometry, session
+from calib.cli import dynamics, geometry, session, signals
 from calib.cli.help import CommandGroup, spelt
+from calib.cli.signals import INTERRUPTED_CODE, TERMINATED_CODE
 from calib.extensions import Point
 from calib.workers.threads import limit_process
 
@@ -44,15 +44,8 @@ RESUMED = {
     "study": GOES_ON,
     "demo": "calib next FOLDER goes on from here; calib demo --bring FOLDER simulates the files that it asks for",
 }
-# Exit code of an interrupted command, of a terminated one, and of one whose output nobody reads, as a shell says of
-# SIGINT, SIGTERM and SIGPIPE.
-INTERRUPTED_CODE = 130
-TERMINATED_CODE = 143
+# Exit code of a command whose output nobody reads, as a shell says of SIGPIPE.
 BROKEN_PIPE_CODE = 141
-# Time after which an exit by SIGTERM is repeated [s]; to remove temporary files takes less (our choice).
-EXIT_AGAIN = 5.0
-# Exit codes of the signals that this process has received.
-_heard: list[int] = []
 
 app = typer.Typer(
     cls=CommandGroup,
@@ -93,10 +86,7 @@ def main(arguments: list[str] | None = None) -> None:
     gc.set_threshold(*GARBAGE)
     if owns_process:
         limit_process()
-        signal.signal(signal.SIGTERM, _terminate)
-        # in the background of a shell it is ignored, and stays so
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, _interrupt)
+        signals.hear()
     # What numpy and others say to programmers helps nobody at a cell.
     if not os.environ.get("CALIB_DEBUG"):
         warnings.filterwarnings("ignore")
@@ -110,33 +100,8 @@ def main(arguments: list[str] | None = None) -> None:
         code = INTERRUPTED_CODE
     # A third would end as a signal what is over but for the exit.
     if owns_process:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        signals.ignore()
     sys.exit(code)
-
-
-def _interrupt(number: int, frame: object) -> None:
-    """Raise KeyboardInterrupt, and note that it was: a library whose callback is running may turn it into an error."""
-    _heard.append(INTERRUPTED_CODE)
-    raise KeyboardInterrupt
-
-
-def _terminate(number: int, frame: object) -> None:
-    """End the command as by an error, so that temporary files and worker processes go; further signals are ignored.
-
-    A library whose callback is running may lose the exit. It is therefore repeated until the command has ended.
-    """
-    _heard.append(TERMINATED_CODE)
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    if hasattr(signal, "setitimer"):
-        signal.signal(signal.SIGALRM, _terminate)
-        signal.setitimer(signal.ITIMER_REAL, EXIT_AGAIN)
-    raise SystemExit(TERMINATED_CODE)
-
-
-def _stop_repeating() -> None:
-    """Let no further exit follow a SIGTERM."""
-    if hasattr(signal, "setitimer"):
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 @lru_cache(maxsize=1)
@@ -174,7 +139,6 @@ def run(arguments: list[str] | None = None) -> int:
         return _interrupted(arguments)
     except SystemExit as stop:  # terminated, or Typer's: completion is done, or the output's reader has gone
         if stop.code == TERMINATED_CODE:
-            _stop_repeating()
             return _interrupted(arguments, TERMINATED_CODE)
         return BROKEN_PIPE_CODE if stop.code else 0
     except Exception as error:
@@ -197,10 +161,9 @@ def _failed(error: Exception, arguments: list[str]) -> int:
     if expected is not None:
         message, code = expected
         return _complain(message, code)
-    if _heard:
+    if signals.received:
         # a library lost the signal in a callback, and failed for that
-        _stop_repeating()
-        return _interrupted(arguments, _heard[-1])
+        return _interrupted(arguments, signals.received[-1])
     return _complain(bug_reports.report(error, arguments), bug_reports.CODE)
 
 
@@ -237,6 +200,7 @@ def _spread(arguments: list[str]) -> list[str]:
 
 
 def _interrupted(arguments: list[str], code: int = INTERRUPTED_CODE) -> int:
+    signals.stop_repeating()
     outcome = "the same command starts over"
     for word in arguments[:2]:
         outcome = RESUMED.get(word, outcome)
