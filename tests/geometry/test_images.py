@@ -23,7 +23,7 @@ from calib.geometry.fit import fit, placed_on
 from calib.geometry.installation import see
 from calib.geometry.observation import layout, observe, prepare, step
 from calib.geometry.weighing import Settings
-from calib.procedure.kinematic_stage.image_findings import image_notes
+from calib.procedure.kinematic_stage.verdict.image_findings import image_notes
 from calib.robot.calibrated import Deflection
 from calib.robot.library import load
 from calib.simulation import camera_cell as camera

@@ -11,7 +11,7 @@ from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import see
 from calib.geometry.observation import layout
 from calib.procedure.findings import level_of
-from calib.procedure.kinematic_stage.plausibility import of_range
+from calib.procedure.kinematic_stage.verdict.plausibility import of_range
 
 MIDDLE = np.array([0.2, -1.0, 1.4, -0.7, 0.9, 0.3])
 NOISE = 2e-5

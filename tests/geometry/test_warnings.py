@@ -19,7 +19,7 @@ from calib.geometry.fit import fit, polish_frames
 from calib.geometry.installation import Installation, see
 from calib.geometry.observability import PLACES, unidentified
 from calib.procedure.findings import lines_of
-from calib.procedure.kinematic_stage import plausibility
+from calib.procedure.kinematic_stage.verdict import plausibility
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 from calib.simulation.cell import measure as measured_by

@@ -29,14 +29,14 @@ from calib.geometry.static_torques.mass_factors import SETTLED, MassFactors, sev
 from calib.geometry.static_torques.sources import MODELLED, torques_used
 from calib.geometry.weighing import GeometricFit, Settings, calibrated_chain
 from calib.procedure.findings import Verdict, level_of, sentence, settle
-from calib.procedure.kinematic_stage import plausibility
-from calib.procedure.kinematic_stage.comparison import Comparison
-from calib.procedure.kinematic_stage.image_findings import image_notes
 from calib.procedure.kinematic_stage.inputs import Inputs, plain_reference
 from calib.procedure.kinematic_stage.metrics import Findings, Outlier
-from calib.procedure.kinematic_stage.plausibility import gross_rows, misfit, named_outliers
 from calib.procedure.kinematic_stage.settings import FitSettings
-from calib.procedure.kinematic_stage.validation import Arms, Assessment, assess
+from calib.procedure.kinematic_stage.verdict import plausibility
+from calib.procedure.kinematic_stage.verdict.comparison import Comparison
+from calib.procedure.kinematic_stage.verdict.image_findings import image_notes
+from calib.procedure.kinematic_stage.verdict.plausibility import gross_rows, misfit, named_outliers
+from calib.procedure.kinematic_stage.verdict.validation import Arms, Assessment, assess
 from calib.procedure.measuring.prediction import SelectionPrediction, compared_with_fit
 from calib.robot.calibrated import CalibratedChain
 

@@ -19,8 +19,8 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, layout, observe, positions, prepare
 from calib.geometry.residuals import inverse_right_jacobian
 from calib.geometry.weighing import GeometricFit
-from calib.procedure.kinematic_stage.comparison import INTERVAL, Comparison, interval_cells
 from calib.procedure.kinematic_stage.fit import Outcome
+from calib.procedure.kinematic_stage.verdict.comparison import INTERVAL, Comparison, interval_cells
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.transforms import invert, rotation_vector

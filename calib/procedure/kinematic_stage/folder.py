@@ -27,7 +27,7 @@ from calib.procedure.kinematic_stage import fit_tables, mastering
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import Inputs, plain_reference
 from calib.procedure.kinematic_stage.metrics import SCHEMA, Findings, FitMetrics, ValidationMetrics
-from calib.procedure.kinematic_stage.validation import Arms, Assessment
+from calib.procedure.kinematic_stage.verdict.validation import Arms, Assessment
 from calib.records import read_json, read_record, shielded
 from calib.robot import calibrated
 from calib.robot.calibrated import CorrectedChain

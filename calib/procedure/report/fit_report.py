@@ -14,14 +14,14 @@ from calib.data.poses import IMAGES
 from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import UsageError
 from calib.geometry.observation import layout, positions, prepare
-from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.fit_tables import estimate_table
 from calib.procedure.kinematic_stage.folder import metrics
-from calib.procedure.kinematic_stage.image_findings import image_coverage
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import FitMetrics, ImageCoverage, ValidationMetrics
-from calib.procedure.kinematic_stage.validation import ARM
+from calib.procedure.kinematic_stage.verdict.comparison import Comparison
+from calib.procedure.kinematic_stage.verdict.image_findings import image_coverage
+from calib.procedure.kinematic_stage.verdict.validation import ARM
 from calib.procedure.report.page import FileRow
 from calib.records import read_json
 from calib.transforms import invert

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.geometry.model_choice.ladder import ModelStep
-from calib.procedure.kinematic_stage.validation import ARM
+from calib.procedure.kinematic_stage.verdict.validation import ARM
 from calib.procedure.report.figures.charts import (
     Bars,
     Captioned,

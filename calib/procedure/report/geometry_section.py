@@ -10,10 +10,10 @@ from calib.geometry.accuracy import ErrorStatistics, rms_sigma
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL
 from calib.geometry.repeatability import RepeatedPose
 from calib.procedure.findings import as_notes
-from calib.procedure.kinematic_stage.comparison import iso9283_sentence
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics, Outlier
-from calib.procedure.kinematic_stage.validation import ARM
+from calib.procedure.kinematic_stage.verdict.comparison import iso9283_sentence
+from calib.procedure.kinematic_stage.verdict.validation import ARM
 from calib.procedure.report import page
 from calib.procedure.report.fit_report import CROSS_VALIDATED, Report, RowErrors
 from calib.units import ERRORS, SMALL

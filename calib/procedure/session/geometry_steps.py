@@ -41,7 +41,7 @@ from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs, selection
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
-from calib.procedure.kinematic_stage.validation import Assessment, assess
+from calib.procedure.kinematic_stage.verdict.validation import Assessment, assess
 from calib.procedure.measuring.constraints_file import VIEW_UNCHECKED
 from calib.procedure.measuring.measuring_run import same_turn, write_run
 from calib.procedure.measuring.pose_limits import read_limits

@@ -14,7 +14,7 @@ from calib.geometry import installation
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage import fit, inputs
 from calib.procedure.kinematic_stage.settings import FitSettings
-from calib.procedure.kinematic_stage.validation import Arms, assess
+from calib.procedure.kinematic_stage.verdict.validation import Arms, assess
 from calib.procedure.report import fit_report
 from calib.procedure.report.geometry_figures import captioned
 from calib.robot import calibrated

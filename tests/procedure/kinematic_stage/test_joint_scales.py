@@ -7,7 +7,7 @@ import pytest
 
 from calib.geometry.fit import fit
 from calib.procedure.findings import sentence
-from calib.procedure.kinematic_stage.plausibility import joint_scales
+from calib.procedure.kinematic_stage.verdict.plausibility import joint_scales
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 from calib.robot.formats import urdf

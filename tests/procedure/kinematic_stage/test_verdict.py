@@ -8,10 +8,10 @@ import pytest
 
 from calib.errors import finding
 from calib.geometry.accuracy import Errors
-from calib.procedure.kinematic_stage.comparison import Comparison
 from calib.procedure.kinematic_stage.metrics import Findings
 from calib.procedure.kinematic_stage.settings import FitSettings
-from calib.procedure.kinematic_stage.validation import judge, judge_deliverables
+from calib.procedure.kinematic_stage.verdict.comparison import Comparison
+from calib.procedure.kinematic_stage.verdict.validation import judge, judge_deliverables
 
 
 def rows(nominal, calibrated, proves=True, turned=None, alone=None, shares_frames=True) -> Comparison:

@@ -15,9 +15,9 @@ from calib.geometry.installation import Installation
 from calib.geometry.repeatability import ARMS, RepeatedPoses, repeated_poses
 from calib.geometry.static_torques.load_errors import load_masses
 from calib.geometry.weighing import Settings
-from calib.procedure.kinematic_stage.image_findings import reprojection
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count, pose_of_row
 from calib.procedure.kinematic_stage.metrics import ComparedRows, PoseIntervalCoverage
+from calib.procedure.kinematic_stage.verdict.image_findings import reprojection
 
 # Columns of unseen rows: the standard deviation that the fit expects of the calibrated arm's position error there, all
 # axes together; the radius within which 95 % of such errors are to be; 1 where a joint is outside the range learnt from

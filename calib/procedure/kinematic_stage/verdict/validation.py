@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.errors import Finding, finding, listing
 from calib.geometry.checks.file_change import changed_since_fit
-from calib.geometry.error_model import ErrorModel, outside
+from calib.geometry.error_model import ErrorModel
 from calib.geometry.fit import without_corrections
 from calib.geometry.installation import Installation
 from calib.geometry.model_choice.ladder import MIN_GAIN
@@ -22,11 +22,19 @@ from calib.geometry.static_torques.load_check import suspected_load
 from calib.geometry.static_torques.sources import load_changes
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import NOT_JUDGED, Verdict, catalogue, level_of, limit, lines_of, sentence
-from calib.procedure.kinematic_stage.comparison import MARGIN, MIN_UNSEEN, Comparison, compare, compare_unseen
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import Findings, ValidationMetrics
-from calib.procedure.kinematic_stage.plausibility import FLOOR, TOO_GOOD
 from calib.procedure.kinematic_stage.settings import FitSettings
+from calib.procedure.kinematic_stage.verdict.comparison import Comparison, compare, compare_unseen
+from calib.procedure.kinematic_stage.verdict.contradictions import (
+    TINY,
+    contradicted,
+    expected_error,
+    far_above_median,
+    far_off_with_both_arms,
+    small_files,
+)
+from calib.procedure.kinematic_stage.verdict.plausibility import FLOOR, TOO_GOOD
 from calib.robot.chain import Chain
 
 # ratio of errors from which the calibrated arm is the worse one
@@ -35,12 +43,6 @@ WORSE = limit("worse-than-nominal", "times")
 RIGID = ("rigid-misfit", "gross-rows", "earlier-misfit")
 # nominal errors this many times the fit's: the instrument must have stood elsewhere (our choice)
 ELSEWHERE = 20.0
-# times the median error: a row from which on is probably measured wrongly (our choice)
-OUTLIER_SIGMAS = 8.0
-# error [m] below which none is taken in a ratio
-TINY = 1e-300
-# share of a joint's fitted range by which a pose may be outside without being an extrapolation (our choice)
-RANGE_MARGIN = 0.1
 # share of errors that the fit states to be within the intervals
 NOMINAL_COVERAGE = 0.95
 # name of each deliverable in messages
@@ -94,11 +96,10 @@ def judge(
     6. ``rigid-misfit`` or ``gross-rows`` of the fit, ``refuted``, ``contradicted``, ``no-transfer``,
        ``intervals-too-narrow``, ``small-gain``, ``many-outliers``; without any of them: pass.
 
-    Three kinds of findings count in every group: the other findings on the fit
-    (`calib.procedure.kinematic_stage.plausibility`), ``gross-unseen-rows``, which replaces ``refuted``, and those on
-    files that prove nothing, but may contradict the fit: ``few-unseen-poses`` (fewer than `MIN_UNSEEN` poses),
-    ``placement-takes-all`` (few numbers beside the fitted placement), and ``contradicted``. Their gross rows are named,
-    and do not contradict it.
+    Three kinds of findings count in every group: the other findings on the fit (`plausibility` beside this module),
+    ``gross-unseen-rows``, which replaces ``refuted``, and those on files that prove nothing, but may contradict the
+    fit: ``few-unseen-poses`` (fewer than `MIN_UNSEEN` poses), ``placement-takes-all`` (few numbers beside the fitted
+    placement), and ``contradicted``. Their gross rows are named, and do not contradict it.
 
     Args:
         fit: errors of both arms on the fitted rows.
@@ -110,10 +111,10 @@ def judge(
         arm: name of the deliverable if there are several; otherwise empty.
     """
     unseen = {name: comparison for name, comparison in validation.items() if comparison.decides}
-    promised = _promised(fit, cross_validated)
-    few = [*_few(validation, promised), *_gross_of_few(validation, findings.reach)]
+    promised = expected_error(fit, cross_validated)
+    few = [*small_files(validation, promised), *_gross_of_few(validation, findings.reach)]
     small = {name: rows for name, rows in validation.items() if rows.may_contradict}
-    few += filter(level_of, _contradicted(fit, small, promised))
+    few += filter(level_of, contradicted(fit, small, promised))
     nominal_rms = fit.errors[0].rms
     fitted_rms = fit.errors[1].rms
     frames_only = findings.model == requested_model == "frames"
@@ -141,9 +142,9 @@ def judge(
         gross += filter(level_of, _gross(proof, findings.reach))
     common = [*gross, *few, *(noticed for noticed in findings.noticed if noticed.code not in RIGID)]
 
-    # The first group of rules that says something decides.
     # orientations contradict the fit on few poses, too
     sets = {"the fitted poses": fit} | {name: rows for name, rows in validation.items() if rows.proves}
+    # The first group of rules that says something decides.
     groups: list[Iterable[Finding]] = [_far_off(proofs, sets, tolerance, findings.reach)]
     if not frames_only:
         groups.append(_nothing_gained(proofs, findings))
@@ -170,90 +171,6 @@ def judge(
     if verdict.level == "pass":
         return Verdict("pass", _figures(worst, arm, tolerance))
     return verdict
-
-
-def _promised(fit: Comparison, cross_validated: float | None) -> float:
-    """Return the error [m] that a fit leads to expect on other poses: the cross-validated one, else the fitted one.
-
-    Args:
-        fit: errors of both arms on the fitted rows.
-        cross_validated: cross-validated error [m]; None if not computed.
-    """
-    return max(fit.errors[1].rms if cross_validated is None else cross_validated, TINY)
-
-
-def _few(validation: Mapping[str, Comparison], promised: float) -> Iterator[Finding]:
-    """Yield a finding on each validation file that proves nothing, but may contradict the fit.
-
-    Rows that are far off with both arms do not count (`_gross_of_few`). What a fitted placement leaves is a lower bound
-    of the error.
-
-    Args:
-        validation: name of a validation file -> errors of both arms.
-        promised: error that the fit leads to expect [m].
-    """
-    for name, rows in validation.items():
-        if not rows.may_contradict:
-            continue
-        rms = _rms(rows.errors[1].main[~_far_off_with_both_arms(rows)])
-        times = rms / promised
-        if rows.placed_by is not None:
-            measured, fitted = rows.placed_by
-            values = {"measured": measured, "fitted": fitted, "wanted": MARGIN * fitted}
-            yield finding("placement-takes-all", file=name, rms=rms, times=times, **values)
-        else:
-            yield finding("few-unseen-poses", where=name, poses=rows.few, least=MIN_UNSEEN, rms=rms, times=times)
-
-
-def _contradicted(fit: Comparison, validation: Mapping[str, Comparison], promised: float) -> Iterator[Finding]:
-    """Yield a finding on each validation file whose errors within the fitted range are far above the expected error.
-
-    Rows that are far off with both arms do not count, nor do poses at which the model extrapolates.
-
-    Args:
-        fit: errors of both arms on the fitted rows.
-        validation: name of a validation file -> errors of both arms.
-        promised: error that the fit leads to expect [m].
-    """
-    for name, rows in validation.items():
-        extrapolated = _extrapolated(fit, rows)
-        rms = _rms(rows.errors[1].main[~_far_off_with_both_arms(rows) & ~extrapolated])
-        within = ""
-        if np.any(extrapolated):
-            within = "within the fitted range"
-        remedy = ""
-        if rows.shares_frames:
-            remedy = catalogue()["placed-elsewhere"].advice
-        # a fit of exact simulated data promises less than any instrument measures
-        times = rms / max(promised, TOO_GOOD)
-        yield finding("contradicted", where=name, rms=rms, within=within, times=times, remedy=remedy)
-
-
-def _extrapolated(fit: Comparison, rows: Comparison) -> np.ndarray:
-    """Return flags (m,): whether each error of `rows` is of a pose outside the fitted joint ranges or loads.
-
-    The ranges are widened by `RANGE_MARGIN` on both sides. Where errors do not belong to single rows, none is flagged
-    by its joints.
-
-    Args:
-        fit: errors on the fitted rows.
-        rows: errors on other rows.
-    """
-    sizes = rows.errors[1].main
-    if load_changes(fit.blocks, rows.blocks):
-        return np.ones(len(sizes), dtype=bool)
-    if not fit.blocks or sum(len(block) for block in rows.blocks) != len(sizes):
-        return np.zeros(len(sizes), dtype=bool)
-    learnt = np.concatenate([block.q for block in fit.blocks])
-    margin = RANGE_MARGIN * np.ptp(learnt, axis=0)
-    widened = np.array([learnt.min(axis=0) - margin, learnt.max(axis=0) + margin])
-    q = np.concatenate([block.q for block in rows.blocks])
-    return np.any(outside(q, widened), axis=1)
-
-
-def _rms(sizes: np.ndarray) -> float:
-    """Return the root mean square of errors (m,); 0 without errors."""
-    return float(np.sqrt(np.sum(sizes**2) / max(len(sizes), 1)))
 
 
 def _gross_of_few(validation: Mapping[str, Comparison], reach: float) -> Iterator[Finding]:
@@ -349,26 +266,13 @@ def _gross(proof: _Proof, reach: float) -> Iterator[Finding]:
     if proof.rows is None:
         return
     after = proof.rows.errors[1].main
-    gross = _far_off_with_both_arms(proof.rows)
+    gross = far_off_with_both_arms(proof.rows)
     rows = _row_texts(proof.rows, gross)
     # errors of zero are of rows that determine themselves, such as three points of a plane
     if rows and np.any(after[~gross]):
         without = float(np.sqrt(np.mean(after[~gross] ** 2)))
         share = min(proof.before, proof.after) / reach
         yield finding("gross-unseen-rows", rows=rows, without=without, times=proof.after / without, share=share)
-
-
-def _far_off_with_both_arms(comparison: Comparison) -> np.ndarray:
-    """Return flags (m,): whether the errors of both arms are far above their medians in each row of a comparison."""
-    nominal, calibrated = comparison.errors
-    if not len(calibrated.main):
-        return np.zeros(0, dtype=bool)
-    return _far_above_median(nominal.main) & _far_above_median(calibrated.main)
-
-
-def _far_above_median(sizes: np.ndarray) -> np.ndarray:
-    """Return flags (m,): whether each of m errors `sizes` [m] is above `OUTLIER_SIGMAS` times the median error."""
-    return sizes > OUTLIER_SIGMAS * np.median(sizes)
 
 
 def _row_texts(comparison: Comparison, selected: np.ndarray) -> list[str]:
@@ -457,7 +361,7 @@ def _doubts(
     if unseen and cross_validated is not None and rigid_explains:
         times_promised = worst.after / max(cross_validated, TINY)
         yield finding("refuted", times=times, promised=times_promised, left=worst.ratio, remedy=remedy)
-    yield from _contradicted(fit, unseen, promised)
+    yield from contradicted(fit, unseen, promised)
     yield finding("no-transfer", times=times, errors=errors_of, remedy=remedy)
     for name, rows in unseen.items():
         if rows.intervals is None:
@@ -575,9 +479,9 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
     noticed += inputs.noticed
     if deliverable == "urdf" and fitted.alone is not None:
         of_urdf = {name: rows.of_urdf for name, rows in validation.items()}
-        noticed += _few(of_urdf, _promised(fitted.of_urdf, findings.rigid_cross_validated))
+        noticed += small_files(of_urdf, expected_error(fitted.of_urdf, findings.rigid_cross_validated))
     else:
-        noticed += _few(validation, _promised(fitted, findings.cross_validated))
+        noticed += small_files(validation, expected_error(fitted, findings.cross_validated))
     noticed += load_changes(inputs.fit, [rows.block for rows in inputs.unseen.values()])
     copies = _copies(inputs)
     if copies:
@@ -718,7 +622,7 @@ def _noticed(name: str, rows: Comparison, usual: float) -> Iterator[Finding]:
     intervals = rows.intervals
     if np.median(before) > ELSEWHERE * usual:
         yield finding("validation-elsewhere", file=name, rms=float(np.median(before)))
-    doubtful = _far_above_median(sizes)
+    doubtful = far_above_median(sizes)
     doubtful_rows = _row_texts(rows, doubtful)
     if doubtful_rows:
         outside = 0

@@ -8,7 +8,7 @@ import numpy as np
 from calib.config_types import Plots
 from calib.procedure.findings import sentence
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
-from calib.procedure.kinematic_stage.validation import ARM
+from calib.procedure.kinematic_stage.verdict.validation import ARM
 from calib.procedure.report.certificate.record import StageRecord
 from calib.procedure.report.fit_report import Report, RowErrors
 from calib.procedure.report.geometry_section import (

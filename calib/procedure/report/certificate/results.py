@@ -92,7 +92,7 @@ def tolerance(millimetres: float | None, metrics: FitMetrics) -> str:
         millimetres: requested tolerance of the position [mm]; None or 0: no tolerance.
         metrics: metrics of the fit.
     """
-    from calib.procedure.kinematic_stage.validation import ARM
+    from calib.procedure.kinematic_stage.verdict.validation import ARM
 
     condition = "none given: pass means better than the nominal robot on unseen poses, or no improvement possible"
     if millimetres:

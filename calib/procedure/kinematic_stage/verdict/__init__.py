@@ -1,0 +1,1 @@
+"""Errors of a fit on fitted and unseen rows, findings on them, and the verdict that follows."""
