@@ -16,8 +16,6 @@ import pytest
 
 from calib.robot.library import load
 
-pytestmark = pytest.mark.slow
-
 ROOT = Path(__file__).parents[1]
 LIMIT_SECONDS = 240
 STAGE = "calib/procedure/kinematic_stage"
@@ -31,6 +29,12 @@ class Edit:
     before: str
     after: str
 
+    def replaced_in(self, folder: Path) -> str:
+        """Return the file's text with the replacement."""
+        text = (folder / self.path).read_text(encoding="utf-8")
+        assert text.count(self.before) == 1, f"{self.path} has changed: say the recipe's step in its new words"
+        return text.replace(self.before, self.after)
+
 
 FINDING = (
     Edit(
@@ -41,7 +45,7 @@ FINDING = (
         "\n[joint-sign]\n",
     ),
     Edit(
-        f"{STAGE}/plausibility.py",
+        f"{STAGE}/verdict/plausibility.py",
         '        finding("measured-range", joints=ranges(measured_range), **values),\n',
         '        finding("measured-range", joints=ranges(measured_range), **values),\n'
         '        finding("joint-hardly-moved", joint=measured_range.joints[0], angle=0.0087),\n',
@@ -109,10 +113,7 @@ class Copy:
 
     def apply(self, edits: tuple[Edit, ...]) -> None:
         for edit in edits:
-            path = self.folder / edit.path
-            text = path.read_text(encoding="utf-8")
-            assert text.count(edit.before) == 1, f"{edit.path} has changed: say the recipe's step in its new words"
-            path.write_text(text.replace(edit.before, edit.after), encoding="utf-8")
+            (self.folder / edit.path).write_text(edit.replaced_in(self.folder), encoding="utf-8")
 
     def python(self, *arguments: str, code: int = 0) -> str:
         """Run a module in the copy; return what it printed."""
@@ -166,11 +167,18 @@ def recipe(title: str) -> str:
 
 NAMED_IN_WORDS = {
     # where it is noticed is for the author to say
-    f"{STAGE}/plausibility.py": "Where it is noticed",
+    f"{STAGE}/verdict/plausibility.py": "Where it is noticed",
     f"{STAGE}/settings.py": "`FitSettings`",
     "calib/data/poses/fit_options.py": "`fit_options.FORMATS`",
 }
 RECIPES = {"finding": FINDING, "an option": OPTION, "an effect of the geometry": EFFECT, "a file format": FORMAT}
+
+
+@pytest.mark.parametrize("title", RECIPES)
+def test_edits_stand_in_their_files(title: str) -> None:
+    """Each text that a recipe's step replaces stands once in the file that the recipe names."""
+    for edit in RECIPES[title]:
+        assert edit.replaced_in(ROOT)
 
 
 @pytest.mark.parametrize("title", RECIPES)
@@ -183,6 +191,7 @@ def test_recipe_names_files_that_change(title: str) -> None:
         assert path in text or NAMED_IN_WORDS.get(path, path) in text, f"{title}: {path} is not named"
 
 
+@pytest.mark.slow
 def test_a_finding(scratch: Copy, measured: Path) -> None:
     scratch.apply(FINDING)
     out = scratch.folder / "out"
@@ -193,6 +202,7 @@ def test_a_finding(scratch: Copy, measured: Path) -> None:
     scratch.holds("tests/procedure/test_findings.py")
 
 
+@pytest.mark.slow
 def test_an_option(scratch: Copy, measured: Path) -> None:
     scratch.apply(OPTION)
     assert re.search(r"--fewest-poses \w+ +smallest number of poses", scratch.calib("fit", "--help"))
@@ -201,6 +211,7 @@ def test_an_option(scratch: Copy, measured: Path) -> None:
     scratch.holds("tests/procedure/test_formats_command.py", "tests/test_architecture.py")
 
 
+@pytest.mark.slow
 def test_an_effect_of_the_geometry(scratch: Copy, measured: Path) -> None:
     scratch.apply(EFFECT)
     out = scratch.folder / "out"
@@ -213,6 +224,7 @@ def test_an_effect_of_the_geometry(scratch: Copy, measured: Path) -> None:
     scratch.holds("tests/test_architecture.py")
 
 
+@pytest.mark.slow
 def test_a_file_format(scratch: Copy, measured: Path) -> None:
     scratch.apply(FORMAT)
     rows = np.loadtxt(measured, delimiter=",", skiprows=1)
