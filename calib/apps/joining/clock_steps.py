@@ -1,7 +1,7 @@
 """Test for a step or a wandering of a clock within a stream, which a fit of offset and drift would take for drift.
 
 At a time T, the clocks' offset may change by an unknown size. The size is estimated by least squares, linearised about
-the fit of clock and arm (`calib.apps.joining.clocks.fitted`), together with all fitted parameters and the joints'
+the fit of clock and arm (`calib.apps.joining.clock_fit.fitted`), together with all fitted parameters and the joints'
 backlash. The size divided by its σ is largest at the true T. A clock that wanders smoothly (temperature) gives sizes at
 many T. A step is therefore accepted only if it explains more than a piecewise linear offset with `KNOTS` knots does, or
 if it is significant in addition to that. Where the time stamps of a file's rows are uneven by the size of the step, the

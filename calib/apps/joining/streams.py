@@ -16,8 +16,9 @@ from typing import NamedTuple, NoReturn
 
 import numpy as np
 
+from calib.apps.joining.clock_fit import begin, fitted
 from calib.apps.joining.clock_steps import Step, find_step
-from calib.apps.joining.clocks import Clock, Run, begin, fitted, residuals, velocities
+from calib.apps.joining.clocks import Clock, Run, residuals, velocities
 from calib.apps.joining.joined import Joined
 from calib.apps.joining.mapping import clock_names
 from calib.apps.joining.stream_files import Kind, Stream, read_stream
