@@ -225,34 +225,28 @@ def search_motion(
     problem, checked, notes = _excitation_problem(inputs, settings)
     condition = _condition_objective(inputs, settings)
     goals = read_goals(settings, inputs, condition)
-    search = partial(
-        design, evaluations=settings.evaluations, method=settings.solver, seed=settings.seed, map=map, report=report
-    )
     if picked is None:
-        motion, problem = _searched(problem, goals, settings.starts, search, show)
+        search = partial(
+            design, evaluations=settings.evaluations, method=settings.solver, seed=settings.seed, map=map, report=report
+        )
+        proposed, problem = _searched(problem, goals, settings.starts, search, show)
     else:
-        motion, problem = _picked(problem, goals, picked, inputs, settings)
-    proposed = motion
+        proposed, problem = _picked(problem, goals, picked, inputs, settings)
 
     show("verifying")
-    motion, problem = _with_whole_samples(motion, problem, settings.rate)
-    cut_short = False
+    motion, problem = _with_whole_samples(proposed, problem, settings.rate)
     with finishing() as ignored:
         motion, proof = ensured(problem, motion, checked)
-    stored = picked
+    verified = _Verified(motion, proof, picked)
     if picked is None and settings.front and not motion.interrupted:
-        # the motion exists: what follows may be cut short
-        try:
-            front = _front(problem, inputs, motion, goals, settings.front, settings.evaluations, report)
-            front, nearest, nearest_proof = _nearest_goals(front, problem, goals, inputs, (motion, proof), checked)
-            motions = [_periodic(result, inputs, settings, problem.family) for result in front.found]
-            motion, proof, stored = nearest, nearest_proof, StoredFront(front, tuple(motions))
-        except KeyboardInterrupt:
-            cut_short = True
+        verified = _with_front(verified, problem, inputs, settings, goals, checked, report)
+    motion = verified.motion
+
     with finishing() as ignored_later:
         playback = play(problem.family, motion, inputs, settings)
         condition_numbers = _condition_of(inputs, problem.family, motion, settings.repeat)
         values = _reached(problem, goals, motion, inputs)
+    cut_short = verified.cut_short or bool(ignored or ignored_later)
     outlook, predicted = None, ()
     try:
         show("predicting sigmas of other periods")
@@ -264,31 +258,92 @@ def search_motion(
     if goals and not problem.goals:
         goal_notes = ("interrupted before any motion met the goals",)
     goal_notes += missed(goals, values, inputs)
-    if picked is not None and not np.allclose(motion.x, proposed.x):
-        goal_notes += ("the motion of the front did not keep all limits between its samples, and was changed",)
     if picked is not None:
-        goal_notes += _other_values(picked, condition_numbers)
+        goal_notes += _changes_of_picked(picked, proposed, motion, condition_numbers)
     reached = []
     for goal, value in zip(goals, values):
         name, number = split_goal(goal.words)
         reached.append((name, number, goal.share, goal.stated(value)))
+    front = verified.front
     return Designed(
         inputs=inputs,
         settings=settings,
         problem=problem,
         found=motion,
-        proof=proof,
+        proof=verified.proof,
         condition=condition_numbers,
         goals=tuple(reached),
-        front=None if stored is None else stored.values,
+        front=None if front is None else front.values,
         playback=playback,
         notes=(*inputs.limits.notes, *inputs.model.notes, *notes, *inputs.columns.notes, *goal_notes, *playback.notes),
         outlook=outlook,
         predicted=predicted,
-        stored_front=stored,
+        stored_front=front,
         goal_notes=goal_notes,
-        cut_short=cut_short or bool(ignored or ignored_later),
+        cut_short=cut_short,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Verified:
+    """Motion that keeps the limits between its samples.
+
+    Attributes:
+        motion, proof: the motion, and its verified margins to the limits.
+        front: front of the goals with the motion; None without one.
+        cut_short: whether Ctrl-C was pressed before the front was complete.
+    """
+
+    motion: SearchResult
+    proof: Verification
+    front: StoredFront | None
+    cut_short: bool = False
+
+
+def _with_front(
+    verified: _Verified,
+    problem: ExcitationProblem,
+    inputs: ExcitationInputs,
+    settings: ExcitationSettings,
+    goals: Sequence[AttainmentGoal],
+    checked: tuple[MotionConstraint, ...],
+    report: Callable[[int, int, str], None],
+) -> _Verified:
+    """Return the motion of the front that is nearest to the goals, with the front; after Ctrl-C the motion as it was.
+
+    Args:
+        verified: the motion of the search.
+        problem: the optimisation problem, with the goals.
+        inputs: robot and model.
+        settings: settings of the design.
+        goals: the goals; empty: none.
+        checked: constraints of the verification.
+        report: called with (number, total, stage).
+    """
+    try:
+        front = _front(problem, inputs, verified.motion, goals, settings.front, settings.evaluations, report)
+        motion_and_proof = verified.motion, verified.proof
+        front, motion, proof = _nearest_goals(front, problem, goals, inputs, motion_and_proof, checked)
+        motions = [_periodic(result, inputs, settings, problem.family) for result in front.found]
+    except KeyboardInterrupt:
+        return replace(verified, cut_short=True)
+    return _Verified(motion, proof, StoredFront(front, tuple(motions)))
+
+
+def _changes_of_picked(
+    front: StoredFront, proposed: SearchResult, motion: SearchResult, condition: DesignCondition
+) -> tuple[str, ...]:
+    """Return notes on what differs from the front's designed motion as it was stored.
+
+    Args:
+        front: the front.
+        proposed, motion: the front's motion, and the motion after its verification.
+        condition: condition numbers of the motion with the present options.
+    """
+    notes: tuple[str, ...] = ()
+    if not np.allclose(motion.x, proposed.x):
+        notes = ("the motion of the front did not keep all limits between its samples, and was changed",)
+    return notes + _other_values(front, condition)
 
 
 def _picked(

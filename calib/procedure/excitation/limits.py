@@ -348,49 +348,85 @@ def read_motion_limits(
     sizes = velocity, acceleration, counted_torque
     bounds = _bounds(chain, str(source or chain.name), settings, where, sizes, default=not stated_path)
 
-    margin = None
-    if "margin" in settings.torque:
-        margin = number(settings.torque["margin"], f"{where}: torque.margin")
-    if margin is not None and not 0.0 <= margin < 1.0:
-        raise UsageError(f"{where}: torque.margin: expected a share of the limit, from 0 to below 1, found {margin:g}")
-    deviations = number(settings.torque.get("deviations", DEFAULT_DEVIATIONS), f"{where}: torque.deviations")
-    if not 0.0 <= deviations < np.inf:
-        raise UsageError(f"{where}: torque.deviations: expected 0 or more, found {deviations:g}")
+    margin, deviations = _torque_margins(settings.torque, where)
     noise = None
     if settings.noise:
-        noise = _per_joint(settings.noise, f"{where}: noise", chain, None, ("torque", "force"))
-        noise = np.where(np.isfinite(noise), noise, DEFAULT_NOISE * torque)
-        require((noise > 0.0).all(), f"{where}: noise: expected standard deviations above 0", UsageError)
-
+        noise = _torque_noise(settings.noise, chain, torque, where)
     points = _points(settings.point, chain, where)
     friction = _friction(settings.friction, chain, where)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     boxes = box_limits(pose_limits.lower, pose_limits.upper, velocity, bounds.acceleration, jerk, linear=linear)
-    constraints: list[MotionConstraint] = [*boxes, *_position_constraints(settings, pose_limits, points)]
-    notes = list(pose_limits.notes)
-    collision = pose_limits.collision
-    if collision is None:
-        notes.append(
-            "collisions and floor are NOT checked: state [collision], with floor = … at least, in a limits file"
-        )
-    else:
-        pairs = tuple(f"{link} - {obstacle}" for link, obstacle in collision.pairs)
-        constraints.append(Clearance(collision.distances, collision.gradients, pairs, pose_limits.clearance))
-        if pose_limits.checked:
-            notes.append(f"respected: {', '.join(pose_limits.checked)}")
-        if pose_limits.unchecked:
-            notes.append(f"NOT checked: {', '.join(pose_limits.unchecked)}")
+    clearances, collision_notes = _clearances(pose_limits)
     return MotionLimits(
-        constraints=tuple(constraints),
+        constraints=(*boxes, *_position_constraints(settings, pose_limits, points), *clearances),
         bounds=bounds,
         torque=torque,
         margin=margin,
         deviations=deviations,
         friction=friction,
         resonance=settings.frequency.resonance,
-        notes=tuple(notes),
+        notes=(*pose_limits.notes, *collision_notes),
         noise=noise,
     )
+
+
+def _torque_margins(table: Mapping[str, Numeric], where: str) -> tuple[float | None, float]:
+    """Return the share of the torque limits that stays free (None if not stated), and the number of σ that stay free.
+
+    Args:
+        table: torque table of the limits file.
+        where: name of the limits file for messages.
+
+    Raises:
+        UsageError: for values out of range.
+    """
+    margin = None
+    if "margin" in table:
+        margin = number(table["margin"], f"{where}: torque.margin")
+    if margin is not None and not 0.0 <= margin < 1.0:
+        raise UsageError(f"{where}: torque.margin: expected a share of the limit, from 0 to below 1, found {margin:g}")
+    deviations = number(table.get("deviations", DEFAULT_DEVIATIONS), f"{where}: torque.deviations")
+    if not 0.0 <= deviations < np.inf:
+        raise UsageError(f"{where}: torque.deviations: expected 0 or more, found {deviations:g}")
+    return margin, deviations
+
+
+def _torque_noise(table: Mapping[str, Numeric], chain: Chain, torque: np.ndarray, where: str) -> np.ndarray:
+    """Return the standard deviations (n,) of the torque errors [N m or N]; by default a share of the largest torques.
+
+    Args:
+        table: noise table of the limits file.
+        chain: the arm.
+        torque: (n,) torque limits [N m or N].
+        where: name of the limits file for messages.
+
+    Raises:
+        UsageError: for values that are not above 0.
+    """
+    noise = _per_joint(table, f"{where}: noise", chain, None, ("torque", "force"))
+    noise = np.where(np.isfinite(noise), noise, DEFAULT_NOISE * torque)
+    require((noise > 0.0).all(), f"{where}: noise: expected standard deviations above 0", UsageError)
+    return noise
+
+
+def _clearances(limits: Limits) -> tuple[list[MotionConstraint], list[str]]:
+    """Return the constraint on the distances of bodies, and notes on what is checked.
+
+    Args:
+        limits: limits of the poses, with their collision model.
+    """
+    collision = limits.collision
+    if collision is None:
+        return [], [
+            "collisions and floor are NOT checked: state [collision], with floor = … at least, in a limits file"
+        ]
+    pairs = tuple(f"{link} - {obstacle}" for link, obstacle in collision.pairs)
+    notes = []
+    if limits.checked:
+        notes.append(f"respected: {', '.join(limits.checked)}")
+    if limits.unchecked:
+        notes.append(f"NOT checked: {', '.join(limits.unchecked)}")
+    return [Clearance(collision.distances, collision.gradients, pairs, limits.clearance)], notes
 
 
 def located(error: NothingFeasible) -> NothingFeasible:

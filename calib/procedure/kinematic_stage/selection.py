@@ -182,75 +182,178 @@ def choose(
     else:
         jacobian = view.observation(limits.lower, limits.upper, settings.seed)
     space = limits.space(jacobian)
-
-    notes = list(limits.notes)
     possible, numbers, remarks = _possible_poses(candidates, chain, space, limits, settings, m, progress)
-    notes += remarks
-
-    # `select_poses` checks it
-    index = cast(Any, settings.index)
-    existing_jacobian = existing_value = existing_q = None
+    earlier = None
     if existing is not None:
-        existing_q = read_poses(existing, joints_of(chain))
-        existing_jacobian = jacobian(existing_q)
-        existing_value = observability(existing_jacobian, index) or None
-        infeasible = int((~is_feasible(space, existing_q)).sum())
-        if infeasible:
-            notes.append(f"{infeasible} of the {len(existing_q)} existing poses break the constraints")
-    search = _search_settings(settings)
-    pairs = None
+        earlier = _earlier_poses(read_poses(existing, joints_of(chain)), space, settings)
+    task = _Task(chain, m, jacobian, limits, space, possible, numbers is None, earlier, settings)
     if settings.loads:
-        _check_loads(settings, limits)
-        assert isinstance(jacobian, Observation)
-        pairs = loaded_candidates(jacobian, limits, possible, settings.loads, existing_q)
-        selection = select_poses(pairs.jacobians, m, search, existing=pairs.before, map=map, progress=progress)
+        result = _selected_with_loads(task, map, progress)
     else:
-        selection = select_poses(
-            None, m, search, q=possible, space=space, existing=existing_jacobian, map=map, progress=progress
-        )
-    # the selection without sight limits is not polished: the start of a polished one compares with it
-    comparable = selection.value
-    if settings.method == "polish":
-        comparable = float(selection.history[0])
-    if view is not None:
-        notes.append(view.assumed)
+        result = _selected(task, map, progress)
 
-    def progress_of_run(stage: str) -> None:
-        if progress:
-            progress(0, 1, stage)
-
-    exchange = Exchange(space.jacobian, possible, existing_jacobian, index)
-    if pairs is not None:
-        driven = loaded_run(chain, pairs, selection, limits, settings.run, settings.seed, progress_of_run)
-    else:
-        driven = drivable(chain, selection.joints, exchange, limits, settings.run, settings.seed, progress_of_run)
-    if driven.replaced:
-        notes.append(driven.words)
-    selection = _in_driving_order(selection, driven)
-    outlook = loads = None
-    if pairs is not None:
-        assert selection.indices is not None and isinstance(jacobian, Observation)
-        outlook, loads = _loaded_outlook(jacobian, limits, search, selection, pairs)
-        notes += _remarks_on_loads(chain, loads, existing_q is not None)
-        selection = replace(selection, indices=pairs.pose[selection.indices])
-    else:
-        outlook = _outlook(jacobian, limits, search, driven.q, exchange, comparable, numbers is None)
+    selection = result.selection
     if numbers is not None and selection.indices is not None:
         selection = replace(selection, indices=numbers[selection.indices])
+    notes = [*limits.notes, *remarks]
+    if earlier is not None:
+        notes += earlier.notes
+    if view is not None:
+        notes.append(view.assumed)
     return Chosen(
         chain=chain,
         selection=selection,
         parameters=len(jacobian.free),
-        existing=existing_value,
+        existing=earlier.value if earlier is not None else None,
         checked=limits.checked,
         unchecked=limits.unchecked,
-        notes=tuple(notes),
-        outlook=outlook,
-        run=driven.run,
+        notes=(*notes, *result.notes),
+        outlook=result.outlook,
+        run=result.run,
         driven=settings.run,
         by_images=view is not None,
-        loads=loads,
+        loads=result.loads,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _EarlierPoses:
+    """Poses that were measured earlier.
+
+    Attributes:
+        q: (k, n) joint values [rad or m].
+        jacobian: their observation Jacobians.
+        value: their observability index; None if it is 0.
+        notes: remarks for the user.
+    """
+
+    q: np.ndarray
+    jacobian: np.ndarray
+    value: float | None
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What is chosen from, and how.
+
+    Attributes:
+        chain: the arm.
+        m: number of poses to choose.
+        jacobian: observation Jacobian by the geometry.
+        limits: limits of poses.
+        space: search space with all constraints.
+        possible: (N, n) poses to choose from [rad or m].
+        drawn: whether these were drawn at random.
+        earlier: poses measured earlier; None without such poses.
+        settings: quantity to measure, index, method, seed.
+    """
+
+    chain: Chain
+    m: int
+    jacobian: Observation
+    limits: Limits
+    space: SearchSpace
+    possible: np.ndarray
+    drawn: bool
+    earlier: _EarlierPoses | None
+    settings: SelectionSettings
+
+
+@dataclass(frozen=True, eq=False)
+class _SelectedRun:
+    """Chosen poses in the order of a run through them.
+
+    Attributes:
+        selection: the poses; their indices count the poses to choose from.
+        run: the run.
+        outlook: predicted accuracy.
+        loads: the poses' loads; None without loads to choose from.
+        notes: remarks for the user.
+    """
+
+    selection: Selection
+    run: MeasuringRun
+    outlook: PoseOutlook
+    loads: LoadOutlook | None
+    notes: tuple[str, ...]
+
+
+def _earlier_poses(q: np.ndarray, space: SearchSpace, settings: SelectionSettings) -> _EarlierPoses:
+    """Return the poses q (k, n) [rad or m] that were measured earlier, with their index."""
+    jacobian = space.jacobian(q)
+    # `select_poses` checks the name of the index
+    value = observability(jacobian, cast(Any, settings.index)) or None
+    infeasible = int((~is_feasible(space, q)).sum())
+    notes: tuple[str, ...] = ()
+    if infeasible:
+        notes = (f"{infeasible} of the {len(q)} existing poses break the constraints",)
+    return _EarlierPoses(q, jacobian, value, notes)
+
+
+def _selected(task: _Task, map: Callable, progress: Progress | None) -> _SelectedRun:
+    """Return the poses that determine the geometry best, with a run through them.
+
+    Args:
+        task: what is chosen from, and how.
+        map: function that runs parallel work.
+        progress: called with (done, total, text); None: silent.
+    """
+    settings, limits = task.settings, task.limits
+    search = _search_settings(settings)
+    existing = None if task.earlier is None else task.earlier.jacobian
+    selection = select_poses(
+        None, task.m, search, q=task.possible, space=task.space, existing=existing, map=map, progress=progress
+    )
+    # the selection without sight limits is not polished: the start of a polished one compares with it
+    comparable = selection.value
+    if settings.method == "polish":
+        comparable = float(selection.history[0])
+    exchange = Exchange(task.space.jacobian, task.possible, existing, cast(Any, settings.index))
+    stages = _stages(progress)
+    driven = drivable(task.chain, selection.joints, exchange, limits, settings.run, settings.seed, stages)
+    outlook = _outlook(task.jacobian, limits, search, driven.q, exchange, comparable, task.drawn)
+    return _SelectedRun(_in_driving_order(selection, driven), driven.run, outlook, None, _replacements(driven))
+
+
+def _selected_with_loads(task: _Task, map: Callable, progress: Progress | None) -> _SelectedRun:
+    """Return the pairs of pose and load that determine geometry and compliance best, with a run through them.
+
+    Args:
+        task: what is chosen from, and how.
+        map: function that runs parallel work.
+        progress: called with (done, total, text); None: silent.
+    """
+    settings, limits = task.settings, task.limits
+    _check_loads(settings, limits)
+    search = _search_settings(settings)
+    unloaded_q = None if task.earlier is None else task.earlier.q
+    pairs = loaded_candidates(task.jacobian, limits, task.possible, settings.loads, unloaded_q)
+    selection = select_poses(pairs.jacobians, task.m, search, existing=pairs.before, map=map, progress=progress)
+    driven = loaded_run(task.chain, pairs, selection, limits, settings.run, settings.seed, _stages(progress))
+    selection = _in_driving_order(selection, driven)
+    outlook, loads = _loaded_outlook(task.jacobian, limits, search, selection, pairs)
+    assert selection.indices is not None
+    selection = replace(selection, indices=pairs.pose[selection.indices])
+    remarks = _remarks_on_loads(task.chain, loads, unloaded_q is not None)
+    return _SelectedRun(selection, driven.run, outlook, loads, (*_replacements(driven), *remarks))
+
+
+def _stages(progress: Progress | None) -> Callable[[str], None]:
+    """Return a function that shows the text of a stage by a progress function; silent for None."""
+
+    def show(stage: str) -> None:
+        if progress:
+            progress(0, 1, stage)
+
+    return show
+
+
+def _replacements(driven: Drivable) -> tuple[str, ...]:
+    """Return the note on the poses that were replaced for a run; empty if none was."""
+    if not driven.replaced:
+        return ()
+    return (driven.words,)
 
 
 def _possible_poses(
