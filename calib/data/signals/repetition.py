@@ -1,0 +1,252 @@
+"""Repetition of a motion within and between recordings.
+
+Robots are excited by periods of one motion. A time block of a later period tests nothing, since the same states were
+fitted in an earlier one: errors of the model that the motion repeats would be fitted there, too. A course is the part
+of the recordings in which the motion is new; every repetition is mapped to it.
+
+A lag at which a recording may repeat another (or itself) is a minimum of
+
+    D(L) = Σ ‖z(t + L) - z'(t)‖² / Σ (‖z(t + L) - z̄‖² + ‖z'(t) - z̄'‖²)
+
+with z the positions over their standard deviations, sums over the overlap, computed by FFT. A sample repeats another if
+all positions differ by less than `MAX_DISTANCE` in the rms. Thresholds are our choice.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+
+from calib.data.signals.motion import Motion
+from calib.data.signals.persistency import MAX_DISTANCE, MIN_TRAVEL
+
+# rate at which lags are searched [Hz]
+RATE = 100.0
+# largest number of samples that are read of a recording
+MAX_SAMPLES = 100_000
+# D(L) of a lag that is looked at closer: 1 on average for unlike motion
+ALIKE = 0.7
+# D(L) beyond which a motion has left its own neighbourhood
+LEFT = 0.2
+# difference of D(L) within which lags are about as good
+TIE = 0.1
+# number of lags that are looked at closer
+LAGS = 12
+# share of the moving samples that a repetition has to contain
+MIN_SHARE = 0.25
+# share of the moving samples of the overlap that has to be alike
+MIN_ALIKE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Recordings mapped to the part of them in which the motion is new.
+
+    Attributes:
+        place: for each recording, the place (N,) of its samples in the course, from 0 to `length` - 1.
+        length: number of places.
+        recording: (length,) number of the recording in which the motion is new.
+    """
+
+    place: tuple[np.ndarray, ...]
+    length: int
+    recording: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class _Path:
+    """Positions of a recording, read at every `step`-th sample.
+
+    Attributes:
+        q: (N, k) positions of the joints that move in any recording [rad or m].
+        scale: (k,) their standard deviations over all recordings.
+        moves: (M,) whether any joint moves, at every `step`-th sample.
+        step: samples per read sample.
+        rate: sampling rate [Hz].
+    """
+
+    q: np.ndarray
+    scale: np.ndarray
+    moves: np.ndarray
+    step: int
+    rate: float
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Indices (M,) of the samples that are read."""
+        return np.arange(0, len(self.q), self.step)
+
+    def at(self, rows: np.ndarray) -> np.ndarray:
+        """Return the positions (m, k) at samples (m,), in standard deviations."""
+        return self.q[rows] / self.scale
+
+
+def course(motions: Sequence[Motion]) -> Course:
+    """Return the course of recordings of one robot, in the order in which they are given."""
+    paths = _paths(motions)
+    places = list[np.ndarray]()
+    recordings = list[np.ndarray]()
+    length = 0
+    for number in range(len(paths)):
+        source, row = _sources(paths, number)
+        size = len(source)
+        place = np.zeros(size, dtype=int)
+        for other in range(number):
+            selected = source == other
+            place[selected] = places[other][row[selected]]
+        is_new = source < 0
+        place[is_new] = length + np.arange(int(is_new.sum()))
+        # a sample may repeat one that itself repeats an earlier one
+        origin = np.where(source == number, row, np.arange(size))
+        while (origin[origin] != origin).any():
+            origin = origin[origin]
+        place = place[origin]
+        length += int(is_new.sum())
+        places.append(place)
+        recordings.append(np.full(int(is_new.sum()), number))
+    full = []
+    for path, place in zip(paths, places):
+        full.append(np.repeat(place, path.step)[: len(path.q)])
+    return Course(tuple(full), length, np.concatenate(recordings))
+
+
+def _paths(motions: Sequence[Motion]) -> list[_Path]:
+    """Return the paths of all recordings."""
+    lowest = np.min([motion.q.min(axis=0) for motion in motions], axis=0)
+    highest = np.max([motion.q.max(axis=0) for motion in motions], axis=0)
+    moving = highest - lowest > MIN_TRAVEL
+    deviations = [motion.q.std(axis=0) for motion in motions]
+    scale = np.maximum(np.max(deviations, axis=0), MIN_TRAVEL)[moving]
+    paths = []
+    for motion in motions:
+        step = max(1, int(motion.rate / RATE), len(motion) // MAX_SAMPLES)
+        paths.append(_Path(motion.q[:, moving], scale, ~motion.standstill()[::step], step, motion.rate))
+    return paths
+
+
+def _sources(paths: Sequence[_Path], number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the recording (M,) that each read sample repeats, and the read sample there (M,); -1 where it is new.
+
+    Args:
+        paths: the recordings.
+        number: the recording.
+    """
+    path = paths[number]
+    size = len(path.moves)
+    source = np.full(size, -1)
+    row = np.full(size, -1)
+    if not path.q.shape[1]:
+        return source, row
+    for other in range(number + 1):
+        if (paths[other].rate, paths[other].step) != (path.rate, path.step):
+            continue
+        repeated = _repeated(path, paths[other], within=other == number)
+        fresh = (source < 0) & (repeated >= 0)
+        source[fresh] = other
+        row[fresh] = repeated[fresh]
+    return source, row
+
+
+def _repeated(path: _Path, other: _Path, within: bool) -> np.ndarray:
+    """Return the read samples (M,) of another recording that a recording repeats; -1 for none.
+
+    Args:
+        path: the recording.
+        other: the other recording.
+        within: whether both are the same; samples then repeat earlier ones.
+    """
+    rows = path.rows
+    moving = path.moves.sum()
+    z = path.at(rows)
+    for coarse in _lags(z, other.at(other.rows), within):
+        lag = _refined(path, other, coarse * path.step)
+        target = rows - lag
+        overlap = np.flatnonzero((target >= 0) & (target < len(other.q)))
+        difference = z[overlap] - other.at(target[overlap])
+        alike = overlap[np.sqrt(np.mean(difference**2, axis=1)) < MAX_DISTANCE]
+        count = path.moves[alike].sum()
+        if count >= MIN_SHARE * moving and count >= MIN_ALIKE * path.moves[overlap].sum():
+            result = np.full(len(rows), -1)
+            result[alike] = target[alike] // path.step
+            return result
+    return np.full(len(rows), -1)
+
+
+def _refined(path: _Path, other: _Path, lag: int) -> int:
+    """Return the lag with the smallest distance about a coarse one [samples].
+
+    Args:
+        path, other: the two recordings.
+        lag: the coarse lag [samples].
+    """
+    best, smallest = lag, np.inf
+    for candidate in range(lag - path.step + 1, lag + path.step):
+        first = max(0, candidate)
+        last = min(len(path.q), len(other.q) + candidate)
+        rows = np.arange(first, last, path.step)
+        difference = path.at(rows) - other.at(rows - candidate)
+        distance = float(np.median(np.sum(difference**2, axis=1)))
+        if distance < smallest:
+            best, smallest = candidate, distance
+    return best
+
+
+def _lags(z: np.ndarray, reference: np.ndarray, within: bool) -> list[int]:
+    """Return lags L with z(t) ≈ reference(t - L), the smallest first within a recording, else the most alike first.
+
+    Args:
+        z, reference: (N, n) and (M, n) positions.
+        within: whether both are the same recording; only lags after the motion has left its own neighbourhood count.
+    """
+    size, other_size = len(z), len(reference)
+    lags = np.arange(-(other_size - 1), size)
+    ratio = _unlikeness(z, reference, lags)
+    # too short overlaps cannot contain enough of the motion
+    overlap = np.minimum(size, lags + other_size) - np.maximum(0, lags)
+    usable = overlap >= MIN_SHARE * size
+    if within:
+        forward = lags > 0
+        left = np.flatnonzero(forward & (ratio > LEFT))
+        if not len(left):
+            return []
+        usable &= lags > lags[left[0]]
+    inner = np.zeros(len(lags), dtype=bool)
+    inner[1:-1] = (ratio[1:-1] <= ratio[:-2]) & (ratio[1:-1] <= ratio[2:])
+    candidates = np.flatnonzero(usable & inner & (ratio < ALIKE))
+    if within:
+        # the shortest of lags that are about as good: multiples of a period are periods, too
+        limit = ratio[candidates].min(initial=np.inf) + TIE
+        best = candidates[ratio[candidates] <= limit]
+    else:
+        best = candidates[np.argsort(ratio[candidates], kind="stable")]
+    return lags[best[:LAGS]].tolist()
+
+
+def _unlikeness(z: np.ndarray, reference: np.ndarray, lags: np.ndarray) -> np.ndarray:
+    """Return D(L) of the module's docstring for every lag from -(M - 1) to N - 1.
+
+    Args:
+        z, reference: (N, n) and (M, n) positions.
+        lags: the lags, N + M - 1 of them.
+    """
+    size, other_size = len(z), len(reference)
+    first = np.maximum(0, lags)
+    last = np.minimum(size, lags + other_size)
+    count = last - first
+    length = next_fast_len(size + other_size - 1, real=True)
+    product = np.zeros(len(lags))
+    spread = np.zeros(len(lags))
+    squares = np.zeros(len(lags))
+    for column, other_column in zip(z.T, reference.T):
+        spectrum = rfft(column, length) * np.conj(rfft(other_column, length))
+        correlation = irfft(spectrum, length)
+        product += np.concatenate([correlation[length - (other_size - 1) :], correlation[:size]])
+        for series, shift in ((column, 0), (other_column, lags)):
+            sums = np.concatenate([[0.0], np.cumsum(series)])
+            square_sums = np.concatenate([[0.0], np.cumsum(series**2)])
+            total = sums[last - shift] - sums[first - shift]
+            square = square_sums[last - shift] - square_sums[first - shift]
+            squares += square
+            spread += square - total**2 / count
+    return (squares - 2.0 * product) / np.maximum(spread, 1e-12)
