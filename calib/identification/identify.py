@@ -7,7 +7,8 @@ from typing import Generic, TypeGuard, cast
 
 import numpy as np
 
-from calib.data.signals.filtering import Decimator, design_decimator
+from calib.data.signals.filtering import Decimator, design_decimator, kept
+from calib.data.signals.repetition import course
 from calib.dynamics import base as bases
 from calib.dynamics.base import Base
 from calib.dynamics.bodies import standard_parameters
@@ -349,7 +350,9 @@ def _observed(
         MeasurementError: if there are fewer rows than twice the number of base parameters.
     """
     rows = [observe(model, base.kept, case, decimator) for case in cases]
-    rows = with_blocks(rows, settings.folds)
+    samples = [kept(case.motion.segment, decimator) for case in cases]
+    repetition = course([case.motion for case in cases]).at(samples)
+    rows = with_blocks(rows, settings.folds, repetition)
     if model.torque_rows == POWER and len(cases) > 1:
         rows = [part.by_recording(number, len(cases)) for number, part in enumerate(rows)]
     rows_as_moving = rows

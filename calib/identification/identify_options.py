@@ -29,7 +29,7 @@ TOML; every key is optional, and a key that is none of these is refused. SI unit
     drop = ["offl3"]                 # parameters left out first
     prior = "auto"                   # auto, none, cad: regularise what is not identified towards CAD values;
                                      # auto: where there are none, to rods between the joints
-    folds = 6                        # time blocks of the cross-validation
+    folds = 6                        # parts of the motion, with their repetitions, that are held out in turn
     samples = 20000                  # largest number of rows per torque; beyond it every second, third … row
     deflections = true               # joint corrections of the fit (compliance, gears, encoders) move the links
     with_geometry = false            # joint offsets, lengths and gravity's direction together with the dynamics: poses

@@ -14,6 +14,7 @@ import numpy as np
 
 from calib.data.signals.filtering import Decimator, decimate, decimate_blocks, kept, slope
 from calib.data.signals.motion import Motion
+from calib.data.signals.repetition import Course
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.regressor_model import RegressorModel
@@ -26,6 +27,8 @@ BLOCK = 4096
 """Samples of the full rate at a time."""
 CUT_MARGIN = 2
 """Decimated samples beside a cut between time blocks that share a filter window with it."""
+MIN_REPEATED_BLOCK = 12
+"""Decimated samples of a block of a repeated motion, at least: those beside its cuts are lost (our choice)."""
 DIFFERENCE_REACH = 4
 """Samples beside a block that differences of its energies reach."""
 
@@ -430,30 +433,33 @@ def segments(segment: np.ndarray) -> list[tuple[int, int]]:
     return list(pairwise(edges.tolist()))
 
 
-def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[ObservationRows]:
-    """Return the rows with time blocks numbered over all cases.
+def with_blocks(
+    all_rows: Sequence[ObservationRows], count: int, repetition: Course | None = None
+) -> list[ObservationRows]:
+    """Return the rows with blocks numbered over all cases, as folds of a cross-validation.
 
-    Blocks are contiguous, about `count` in all, with at least one per case. Samples within `CUT_MARGIN` of a cut
-    between blocks get -1, since the filter's window extends across the cut.
+    Blocks are contiguous in time, about `count` in all, with at least one per case. Where a motion is repeated, they
+    are contiguous parts of the motion, each with all its repetitions: a block of a later period would test nothing.
+    There are then fewer of them if the motion is short. Samples within `CUT_MARGIN` of a cut between blocks get -1,
+    since the filter's window extends across the cut.
 
     Args:
         all_rows: rows of all cases.
         count: approximate number of blocks.
+        repetition: the course of the rows' samples; None: blocks are contiguous in time.
     """
-    total = sum(len(rows.target) for rows in all_rows)
+    course = Course.without_repetition([len(rows.target) for rows in all_rows])
+    if repetition is not None:
+        fresh_rows = sum(int(fresh.sum()) for fresh in repetition.fresh)
+        possible = fresh_rows // MIN_REPEATED_BLOCK
+        if repetition.repeats and possible >= 2:
+            course, count = repetition, min(count, possible)
     numbered = []
-    first = 0
-    for rows in all_rows:
-        size = len(rows.target)
-        case_blocks = 1
-        if len(all_rows) < count:
-            case_blocks = max(1, round(count * size / max(total, 1)))
-        number = first + (np.arange(size) * case_blocks) // max(size, 1)
-        cuts = np.flatnonzero(np.diff(number)) + 1
-        distances = np.abs(np.arange(size)[:, None] - cuts[None, :])
-        distance = distances.min(axis=1, initial=size)
-        numbered.append(replace(rows, block=np.where(distance <= CUT_MARGIN, -1, number)))
-        first += case_blocks
+    for rows, block in zip(all_rows, course.blocks(count)):
+        beside_cut = np.zeros(len(block), dtype=bool)
+        for cut in (np.flatnonzero(np.diff(block)) + 1).tolist():
+            beside_cut[max(0, cut - CUT_MARGIN) : cut + CUT_MARGIN + 1] = True
+        numbered.append(replace(rows, block=np.where(beside_cut, -1, block)))
     return numbered
 
 

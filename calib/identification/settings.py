@@ -94,7 +94,7 @@ class Choices:
             not at all (``none``).
         gravity: gravity in the base frame [m/s²]; None: the robot's.
         samples: largest number of rows per torque; longer recordings use only every second, third, ... row.
-        folds: number of time blocks for cross-validation.
+        folds: number of parts of the motion, with their repetitions, for cross-validation.
         deflections: whether joint corrections of the fit (compliance, gears, encoders) move the links; never where the
             closed loop is simulated.
         with_geometry: whether the geometry is estimated again together with the dynamics (calib identify

@@ -80,3 +80,18 @@ def test_single_loud_moment_is_incoherent():
     orders = np.array([16, 32, 101, 640])
     whole = ripple.coherence(learnt, 0, steady)
     assert np.allclose(ripple.coherence_at(learnt, 0, steady, orders), whole[orders], rtol=0, atol=1e-9 * whole.max())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_residual_that_repeats_with_the_motion_is_no_ripple(seed):
+    """What every period repeats is no proof of waves: a part of the motion is held out with all its repetitions."""
+    random = np.random.default_rng(seed)
+    case = planted_motion.case("once", seed, duration=4.0)
+    once = case.motion.part(slice(0, round(3.0 * case.motion.rate)))
+    # the same three seconds four times, with a fast residual that is the same in each
+    repeated = np.tile(np.arange(len(once)), 4)
+    series = {name: frozen(getattr(once, name)[repeated]) for name in ("q", "v", "a", "effort", "weight")}
+    t = np.arange(len(repeated)) / once.rate
+    motion = replace(once, t=t, segment=np.zeros(len(t), dtype=int), **series)
+    residual = random.normal(size=once.q.shape)[repeated]
+    assert ripple.find_all([replace(case, motion=motion)], [residual]) == []

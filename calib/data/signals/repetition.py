@@ -13,13 +13,15 @@ all positions differ by less than `MAX_DISTANCE` in the rms. Thresholds are our 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
+from scipy.spatial import KDTree
 
 from calib.data.signals.motion import Motion
 from calib.data.signals.persistency import MAX_DISTANCE, MIN_TRAVEL
+from calib.records import evenly
 
 # rate at which lags are searched [Hz]
 RATE = 100.0
@@ -33,6 +35,8 @@ LEFT = 0.2
 TIE = 0.1
 # number of lags that are looked at closer
 LAGS = 12
+# positions of a recording that are looked up in the others, and the distance there in `MAX_DISTANCE`
+PROBES, NEIGHBOURS = 60, 1.25
 # share of the moving samples that a repetition has to contain
 MIN_SHARE = 0.25
 # share of the moving samples of the overlap that has to be alike
@@ -44,14 +48,58 @@ class Course:
     """Recordings mapped to the part of them in which the motion is new.
 
     Attributes:
-        place: for each recording, the place (N,) of its samples in the course, from 0 to `length` - 1.
-        length: number of places.
-        recording: (length,) number of the recording in which the motion is new.
+        course_index: for each recording, the number (N,) of each sample along the course.
+        fresh: for each recording, whether the motion is new at its samples (N,).
+        recording: (K,) for each of these numbers, the recording in which the motion is new.
     """
 
-    place: tuple[np.ndarray, ...]
-    length: int
+    course_index: tuple[np.ndarray, ...]
+    fresh: tuple[np.ndarray, ...]
     recording: np.ndarray
+
+    @classmethod
+    def without_repetition(cls, sizes: Sequence[int]) -> "Course":
+        """Return the course of recordings with these numbers of samples, all of them new."""
+        starts = np.cumsum([0, *sizes])
+        course_indices = tuple(start + np.arange(size) for start, size in zip(starts, sizes))
+        fresh = tuple(np.ones(size, dtype=bool) for size in sizes)
+        return cls(course_indices, fresh, np.repeat(np.arange(len(sizes)), sizes))
+
+    @property
+    def repeats(self) -> bool:
+        """Whether any motion is repeated."""
+        return not all(fresh.all() for fresh in self.fresh)
+
+    def at(self, rows: Sequence[np.ndarray]) -> "Course":
+        """Return the course of some samples.
+
+        Args:
+            rows: for each recording, the indices (M,) of its samples.
+        """
+        course_indices = tuple(course_index[index] for course_index, index in zip(self.course_index, rows))
+        fresh = tuple(is_new[index] for is_new, index in zip(self.fresh, rows))
+        return replace(self, course_index=course_indices, fresh=fresh)
+
+    def blocks(self, count: int) -> list[np.ndarray]:
+        """Return for each recording the number (N,) of the block of each sample.
+
+        Blocks are contiguous parts of the course, of about equal length, with their repetitions; at least one begins
+        in each recording that has new motion.
+
+        Args:
+            count: number of blocks, about.
+        """
+        size = len(self.recording)
+        number = np.zeros(size, dtype=int)
+        first = 0
+        for recording in np.unique(self.recording).tolist():
+            course_indices = np.flatnonzero(self.recording == recording)
+            blocks = 1
+            if len(self.course_index) < count:
+                blocks = max(1, round(count * len(course_indices) / size))
+            number[course_indices] = first + (np.arange(len(course_indices)) * blocks) // len(course_indices)
+            first += blocks
+        return [number[course_index] for course_index in self.course_index]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,30 +133,33 @@ class _Path:
 def course(motions: Sequence[Motion]) -> Course:
     """Return the course of recordings of one robot, in the order in which they are given."""
     paths = _paths(motions)
-    places = list[np.ndarray]()
-    recordings = list[np.ndarray]()
+    met = _met_recordings(paths)
+    course_indices, news, recordings = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
     length = 0
     for number in range(len(paths)):
-        source, row = _sources(paths, number)
+        source, row = _sources(paths, number, met[number])
         size = len(source)
-        place = np.zeros(size, dtype=int)
-        for other in range(number):
-            selected = source == other
-            place[selected] = places[other][row[selected]]
+        course_index = np.zeros(size, dtype=int)
+        for earlier in range(number):
+            selected = source == earlier
+            course_index[selected] = course_indices[earlier][row[selected]]
         is_new = source < 0
-        place[is_new] = length + np.arange(int(is_new.sum()))
+        course_index[is_new] = length + np.arange(int(is_new.sum()))
         # a sample may repeat one that itself repeats an earlier one
         origin = np.where(source == number, row, np.arange(size))
         while (origin[origin] != origin).any():
             origin = origin[origin]
-        place = place[origin]
+        course_index = course_index[origin]
         length += int(is_new.sum())
-        places.append(place)
+        # samples between those that are read count as their predecessors
+        path = paths[number]
+        course_indices.append(course_index)
+        news.append(np.repeat(is_new, path.step)[: len(path.q)])
         recordings.append(np.full(int(is_new.sum()), number))
-    full = []
-    for path, place in zip(paths, places):
-        full.append(np.repeat(place, path.step)[: len(path.q)])
-    return Course(tuple(full), length, np.concatenate(recordings))
+    full_indices = tuple(
+        np.repeat(course_index, path.step)[: len(path.q)] for course_index, path in zip(course_indices, paths)
+    )
+    return Course(full_indices, tuple(news), np.concatenate(recordings))
 
 
 def _paths(motions: Sequence[Motion]) -> list[_Path]:
@@ -125,12 +176,35 @@ def _paths(motions: Sequence[Motion]) -> list[_Path]:
     return paths
 
 
-def _sources(paths: Sequence[_Path], number: int) -> tuple[np.ndarray, np.ndarray]:
+def _met_recordings(paths: Sequence[_Path]) -> list[list[int]]:
+    """Return for each recording the earlier ones that pass through enough of its positions, and the recording itself.
+
+    Only these are searched for lags, which takes long for many recordings.
+    """
+    if len(paths) == 1 or not paths[0].q.shape[1]:
+        return [[number] for number in range(len(paths))]
+    positions = [path.at(path.rows[path.moves]) for path in paths]
+    recording = np.repeat(np.arange(len(paths)), [len(moving) for moving in positions])
+    tree = KDTree(np.concatenate(positions))
+    radius = NEIGHBOURS * MAX_DISTANCE * np.sqrt(positions[0].shape[1])
+    result = []
+    for number, moving in enumerate(positions):
+        probes = moving[evenly(len(moving), PROBES)]
+        counts = np.zeros(len(paths))
+        for neighbours in tree.query_ball_point(probes, radius):
+            counts[np.unique(recording[neighbours])] += 1
+        enough = np.flatnonzero(counts >= 0.8 * MIN_SHARE * len(probes))
+        result.append([*enough[enough < number].tolist(), number])
+    return result
+
+
+def _sources(paths: Sequence[_Path], number: int, candidates: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the recording (M,) that each read sample repeats, and the read sample there (M,); -1 where it is new.
 
     Args:
         paths: the recordings.
         number: the recording.
+        candidates: numbers of the recordings that it may repeat.
     """
     path = paths[number]
     size = len(path.moves)
@@ -138,32 +212,32 @@ def _sources(paths: Sequence[_Path], number: int) -> tuple[np.ndarray, np.ndarra
     row = np.full(size, -1)
     if not path.q.shape[1]:
         return source, row
-    for other in range(number + 1):
-        if (paths[other].rate, paths[other].step) != (path.rate, path.step):
+    for earlier in candidates:
+        if (paths[earlier].rate, paths[earlier].step) != (path.rate, path.step):
             continue
-        repeated = _repeated(path, paths[other], within=other == number)
+        repeated = _repeated(path, paths[earlier], within=earlier == number)
         fresh = (source < 0) & (repeated >= 0)
-        source[fresh] = other
+        source[fresh] = earlier
         row[fresh] = repeated[fresh]
     return source, row
 
 
-def _repeated(path: _Path, other: _Path, within: bool) -> np.ndarray:
-    """Return the read samples (M,) of another recording that a recording repeats; -1 for none.
+def _repeated(path: _Path, reference: _Path, within: bool) -> np.ndarray:
+    """Return the read samples (M,) of a reference that a recording repeats; -1 for none.
 
     Args:
         path: the recording.
-        other: the other recording.
+        reference: the recording that it may repeat.
         within: whether both are the same; samples then repeat earlier ones.
     """
     rows = path.rows
     moving = path.moves.sum()
     z = path.at(rows)
-    for coarse in _lags(z, other.at(other.rows), within):
-        lag = _refined(path, other, coarse * path.step)
+    for coarse in _lags(z, reference.at(reference.rows), within):
+        lag = _refined(path, reference, coarse * path.step)
         target = rows - lag
-        overlap = np.flatnonzero((target >= 0) & (target < len(other.q)))
-        difference = z[overlap] - other.at(target[overlap])
+        overlap = np.flatnonzero((target >= 0) & (target < len(reference.q)))
+        difference = z[overlap] - reference.at(target[overlap])
         alike = overlap[np.sqrt(np.mean(difference**2, axis=1)) < MAX_DISTANCE]
         count = path.moves[alike].sum()
         if count >= MIN_SHARE * moving and count >= MIN_ALIKE * path.moves[overlap].sum():
@@ -173,19 +247,19 @@ def _repeated(path: _Path, other: _Path, within: bool) -> np.ndarray:
     return np.full(len(rows), -1)
 
 
-def _refined(path: _Path, other: _Path, lag: int) -> int:
+def _refined(path: _Path, reference: _Path, lag: int) -> int:
     """Return the lag with the smallest distance about a coarse one [samples].
 
     Args:
-        path, other: the two recordings.
+        path, reference: the recording, and the one that it may repeat.
         lag: the coarse lag [samples].
     """
     best, smallest = lag, np.inf
     for candidate in range(lag - path.step + 1, lag + path.step):
         first = max(0, candidate)
-        last = min(len(path.q), len(other.q) + candidate)
+        last = min(len(path.q), len(reference.q) + candidate)
         rows = np.arange(first, last, path.step)
-        difference = path.at(rows) - other.at(rows - candidate)
+        difference = path.at(rows) - reference.at(rows - candidate)
         distance = float(np.median(np.sum(difference**2, axis=1)))
         if distance < smallest:
             best, smallest = candidate, distance
@@ -199,18 +273,18 @@ def _lags(z: np.ndarray, reference: np.ndarray, within: bool) -> list[int]:
         z, reference: (N, n) and (M, n) positions.
         within: whether both are the same recording; only lags after the motion has left its own neighbourhood count.
     """
-    size, other_size = len(z), len(reference)
-    lags = np.arange(-(other_size - 1), size)
+    size, reference_size = len(z), len(reference)
+    lags = np.arange(-(reference_size - 1), size)
     ratio = _unlikeness(z, reference, lags)
     # too short overlaps cannot contain enough of the motion
-    overlap = np.minimum(size, lags + other_size) - np.maximum(0, lags)
+    overlap = np.minimum(size, lags + reference_size) - np.maximum(0, lags)
     usable = overlap >= MIN_SHARE * size
     if within:
         forward = lags > 0
-        left = np.flatnonzero(forward & (ratio > LEFT))
-        if not len(left):
+        distant = np.flatnonzero(forward & (ratio > LEFT))
+        if not len(distant):
             return []
-        usable &= lags > lags[left[0]]
+        usable &= lags > lags[distant[0]]
     inner = np.zeros(len(lags), dtype=bool)
     inner[1:-1] = (ratio[1:-1] <= ratio[:-2]) & (ratio[1:-1] <= ratio[2:])
     candidates = np.flatnonzero(usable & inner & (ratio < ALIKE))
@@ -230,19 +304,19 @@ def _unlikeness(z: np.ndarray, reference: np.ndarray, lags: np.ndarray) -> np.nd
         z, reference: (N, n) and (M, n) positions.
         lags: the lags, N + M - 1 of them.
     """
-    size, other_size = len(z), len(reference)
+    size, reference_size = len(z), len(reference)
     first = np.maximum(0, lags)
-    last = np.minimum(size, lags + other_size)
+    last = np.minimum(size, lags + reference_size)
     count = last - first
-    length = next_fast_len(size + other_size - 1, real=True)
+    length = next_fast_len(size + reference_size - 1, real=True)
     product = np.zeros(len(lags))
     spread = np.zeros(len(lags))
     squares = np.zeros(len(lags))
-    for column, other_column in zip(z.T, reference.T):
-        spectrum = rfft(column, length) * np.conj(rfft(other_column, length))
+    for column, reference_column in zip(z.T, reference.T):
+        spectrum = rfft(column, length) * np.conj(rfft(reference_column, length))
         correlation = irfft(spectrum, length)
-        product += np.concatenate([correlation[length - (other_size - 1) :], correlation[:size]])
-        for series, shift in ((column, 0), (other_column, lags)):
+        product += np.concatenate([correlation[length - (reference_size - 1) :], correlation[:size]])
+        for series, shift in ((column, 0), (reference_column, lags)):
             sums = np.concatenate([[0.0], np.cumsum(series)])
             square_sums = np.concatenate([[0.0], np.cumsum(series**2)])
             total = sums[last - shift] - sums[first - shift]

@@ -28,6 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.data.signals.filtering import low_pass
+from calib.data.signals.repetition import course
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import TermMotion
 from calib.identification.rows import Case, segments
@@ -304,7 +305,7 @@ class _WaveCrossValidation:
     def __init__(self, track: GearTravel, residual: np.ndarray) -> None:
         self._track = track
         self.residual = residual
-        self._blocks = [slice(start, stop) for start, stop in segments(track.block)]
+        self._blocks = [np.flatnonzero(track.block == number) for number in np.unique(track.block)]
         self._columns: dict[tuple[Wave, tuple[float, ...]], np.ndarray] = {}
 
     def columns(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> np.ndarray:
@@ -537,15 +538,11 @@ def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
 
 
 def _blocks(cases: Sequence[Case]) -> list[np.ndarray]:
-    """Return the time block of each sample of each case, about `TIME_BLOCKS` in all; -1 at the start of a recording."""
-    total = sum(len(case.motion) for case in cases)
-    min_count = 1 if len(cases) > 1 else 2
+    """Return the block of each sample of each case, about `TIME_BLOCKS` in all; -1 at the start of a recording.
+
+    A block is a part of the motion with all its repetitions, since the residual repeats with the motion.
+    """
     numbers = []
-    first = 0
-    for case in cases:
-        size = len(case.motion)
-        count = max(min_count, round(TIME_BLOCKS * size / total))
-        number = first + np.arange(size) * count // size
-        numbers.append(np.where(case.motion.t < SKIPPED_START, -1, number))
-        first += count
+    for case, block in zip(cases, course([case.motion for case in cases]).blocks(TIME_BLOCKS)):
+        numbers.append(np.where(case.motion.t < SKIPPED_START, -1, block))
     return numbers
