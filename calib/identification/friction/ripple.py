@@ -412,8 +412,8 @@ def coherence_at(track: GearTravel, gear: int, residual: np.ndarray, orders: np.
     """
     cell, speed_bin = _cells(track, gear)
     in_block = np.unique(track.block)[:, None] == track.block
-    phase = np.outer(cell, orders) % CELLS * (2.0 * np.pi / CELLS)
-    waves = residual[:, None] * np.exp(-1j * phase)
+    roots_of_unity = np.exp(-2j * np.pi / CELLS * np.arange(CELLS))
+    waves = residual[:, None] * roots_of_unity[np.outer(cell, orders) % CELLS]
     result = np.zeros(len(orders))
     for selected in _speed_bins(speed_bin):
         spectrum = in_block[:, selected].astype(float) @ waves[selected]
