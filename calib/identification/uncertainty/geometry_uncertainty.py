@@ -493,7 +493,8 @@ def _differences(
 
     neighbours = [bodies for pair in pairs for bodies in pair]
     factors = (0.5 / STEP, -0.5 / STEP)
-    change = np.zeros((len(pairs), n, len(q)))
+    # in the memory order in which `decimate` filters without a copy
+    change = np.zeros((n, len(pairs), len(q)))
     pull = np.zeros((inertial, len(pairs)))
     for start in range(0, len(q), BLOCK):
         part = slice(start, start + BLOCK)
@@ -502,10 +503,10 @@ def _differences(
         for number, (torque, sums) in enumerate(products):
             k = number // 2
             factor = factors[number % 2]
-            change[k, :, part] += factor * torque
+            change[:, k, part] += factor * torque
             pull[:, k] += factor * sums
     acts = (BODIES,) * len(pairs)
-    rows = torque_rows.observe(change.transpose(2, 1, 0), acts, q, v)
+    rows = torque_rows.observe(change.transpose(2, 0, 1), acts, q, v)
     of_bodies = base.kept < inertial
     base_pull = np.zeros((base.b, len(pairs)))
     base_pull[of_bodies] = (pull * onboard[:, None])[base.kept[of_bodies]]
