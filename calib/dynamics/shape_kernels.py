@@ -150,8 +150,12 @@ def shape(code, acts, t, x, v, state):
             rising = -first * sin(first * x)
         return fading * wave, fading * rising, -2.0 * v / (second * second) * fading * fading * wave
     if code in (SINE_BAND, COSINE_BAND):
+        gain = _band(acts, t, x, v)
+        # at most speeds, and in the other direction: no sine is needed
+        if gain == 0.0:
+            return 0.0, 0.0, 0.0
         wave = sin(first * x) if code == SINE_BAND else cos(first * x)
-        return _band(acts, t, x, v) * wave, 0.0, 0.0
+        return gain * wave, 0.0, 0.0
     if code == DEAD:
         if not second > 0.0:
             return smooth_sign(v, 0.0) if abs(v) > first else 0.0, 0.0, 0.0

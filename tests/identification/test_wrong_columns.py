@@ -93,6 +93,13 @@ def test_shares_do_not_depend_on_rounding(robot):
     assert shares == pytest.approx(without_offsets(samples), rel=1e-9)
 
 
+def test_robot_that_stands_without_noise_accuses_nothing():
+    """Where no drive has an effect nothing is fitted: SciPy's solver ends the process without columns."""
+    samples = recorded("tx40", 0)
+    standing = np.zeros_like(samples.q)
+    assert wrong_joints(replace(samples, q=samples.q[:1] + standing, v=standing, a=standing)) is None
+
+
 def test_corrected_columns_are_those_that_were_recorded():
     sound = recorded("tx40", 1)
     for _, _, mistake in mistakes(6, 2)[2::2]:

@@ -18,7 +18,7 @@ from scipy.optimize import fminbound, nnls
 from calib.column_changes import Change, Explanation, best_changes, coupling, couplings, exchange, reversal
 from calib.dynamics.bodies import REVOLUTE, Bodies, bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics
-from calib.identification.checks.recorded_motion import MotionSamples, basis, drive_columns, spanning
+from calib.identification.checks.recorded_motion import MotionSamples, base_columns, basis, drive_columns, spanning
 from calib.robot.chain import Chain
 from calib.robot.library import load, names
 
@@ -254,7 +254,8 @@ def _unexplained_function(samples: MotionSamples, offsets: bool = True) -> Calla
 
     # A column is a row of the arrays, joint after joint: samples are contiguous, as the regressor writes them.
     # Bodies and offsets are free, the drives' other parameters not negative.
-    weighted = samples.inertial.transpose(2, 1, 0) * scale[:, None]
+    columns = samples.inertial.transpose(2, 1, 0)[base_columns(samples.bodies)]
+    weighted = columns * scale[:, None]
     free = weighted.reshape(-1, n * m)
     if offsets:
         free = np.concatenate([free, np.repeat(np.diag(scale), m, axis=1)])
@@ -268,15 +269,21 @@ def _unexplained_function(samples: MotionSamples, offsets: bool = True) -> Calla
     positive = without_free(positive)
     # what bodies and offsets explain wholly leaves rounding, which as a column would explain some noise
     is_independent = np.linalg.norm(positive, axis=1) > ROUNDING * size
-    positive = positive[is_independent].T
-    orthonormal, triangle = np.linalg.qr(positive)
+    positive = positive[is_independent]
+    # coordinates in an orthonormal basis of these columns
+    square = positive @ positive.T
+    orthonormal = spanning(square)
+    coordinates = orthonormal.T @ square
 
     def unexplained(mixing: np.ndarray) -> np.ndarray:
         torque = (scale * (samples.torque @ mixing.T)).T.ravel()
         power = torque.reshape(n, m).var(axis=1)
         torque = without_free(torque)
-        values, _ = nnls(triangle, orthonormal.T @ torque)
-        residual = torque - positive @ values
+        values = np.zeros(len(positive))
+        # without a column, SciPy's solver ends the process
+        if len(positive):
+            values, _ = nnls(coordinates, orthonormal.T @ (positive @ torque))
+        residual = torque - values @ positive
         mean_square = (residual.reshape(n, m) ** 2).mean(axis=1)
         return np.maximum(mean_square / np.maximum(power, 1e-300), 1e-9)
 

@@ -7,7 +7,7 @@ torques that a set of columns explains.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -16,6 +16,7 @@ from calib.column_changes import Change, assigned, best_changes, coupling, coupl
 from calib.data.recordings.recording import Recording
 from calib.dynamics.bodies import Bodies, bodies_of, standard_parameters
 from calib.dynamics.rigid_body import inverse_dynamics, regressor
+from calib.estimation.base_columns import split_columns
 from calib.identification.rows import Case, segments
 from calib.records import interpolated
 from calib.robot.chain import Chain
@@ -46,6 +47,10 @@ HALF_WIDTH = 10
 """Half width of the window for derivatives, in steps of the coarse grid."""
 SEGMENT_EDGE = 0.3
 """Time omitted at both ends of a segment, so that shifted torques are still recorded ones [s]."""
+RANDOM_STATES = 100
+"""Random states of a robot at which the columns of its bodies are compared."""
+CACHED = 4
+"""Number of robots whose independent columns are kept."""
 TORQUE_WINDOW = 0.02
 """Window of a moving average of the torques [s]: else a shift between samples smooths, and seems to help."""
 
@@ -364,6 +369,18 @@ class MotionSamples:
         return columns.reshape(m, n, -1)
 
 
+@lru_cache(maxsize=CACHED)
+def base_columns(bodies: Bodies) -> np.ndarray:
+    """Return the indices of independent columns of the bodies' regressor, in any motion a basis of all columns.
+
+    Args:
+        bodies: rigid bodies of a robot.
+    """
+    q, v, a = np.random.default_rng(0).standard_normal((3, RANDOM_STATES, bodies.n))
+    columns = regressor(bodies, q, v, a)
+    return split_columns(columns.reshape(-1, columns.shape[2])).kept
+
+
 def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None:
     """Return about `count` samples of a recording of motor torques; None if too few are usable.
 
@@ -410,12 +427,12 @@ def spanning(square: np.ndarray) -> np.ndarray:
         square: WᵀW of the columns W (N, p); k is their rank.
     """
     size = np.sqrt(np.diag(square))
-    nonzero = np.flatnonzero(size > 1e-9 * size.max())
+    nonzero = np.flatnonzero(size > 1e-9 * size.max(initial=0.0))
     nonzero_size = size[nonzero]
     block = square[np.ix_(nonzero, nonzero)]
     scale = nonzero_size[:, None] * nonzero_size
     values, vectors = np.linalg.eigh(block / scale)
-    independent = values > 1e-9 * values[-1]
+    independent = values > 1e-9 * values.max(initial=0.0)
     result = np.zeros((len(size), int(independent.sum())))
     unit_directions = vectors[:, independent] / np.sqrt(values[independent])
     result[nonzero] = unit_directions / nonzero_size[:, None]

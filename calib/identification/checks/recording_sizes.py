@@ -25,6 +25,7 @@ from calib.estimation.whiteness import inflation
 from calib.identification.checks.mistaken_columns import rearranged, wrong_joints
 from calib.identification.checks.recorded_motion import (
     MotionSamples,
+    base_columns,
     basis,
     bodies_under,
     share_of_nominal,
@@ -109,8 +110,9 @@ def _ratio_to(robot: np.ndarray, samples: MotionSamples) -> ClockRatio | None:
     """
     of_gravity = samples.at_rest
     of_motion = samples.inertial - of_gravity
-    beside_motion = np.concatenate([of_gravity, samples.drives], axis=2)
-    beside_gravity = np.concatenate([of_motion, samples.drives], axis=2)
+    independent = base_columns(samples.bodies)
+    beside_motion = np.concatenate([of_gravity[:, :, independent], samples.drives], axis=2)
+    beside_gravity = np.concatenate([of_motion[:, :, independent], samples.drives], axis=2)
     inertia, inertia_sigma = common_factor(samples.torque, of_motion @ robot, beside_motion)
     mass, mass_sigma = common_factor(samples.torque, of_gravity @ robot, beside_gravity)
     if inertia < MIN_FACTOR_SIGMAS * inertia_sigma or mass < MIN_FACTOR_SIGMAS * mass_sigma:

@@ -22,8 +22,9 @@ choice: neither noise nor a single short disturbance contributes). Held-out time
 are regularised towards zero, how finely frequency is resolved, and whether an order is kept.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -142,6 +143,29 @@ class GearTravel:
     v: np.ndarray
     block: np.ndarray
     moving: tuple[int, ...]
+
+    @cached_property
+    def blocks(self) -> tuple[int, np.ndarray]:
+        """Number of time blocks, and the index (N,) of each sample's block among them."""
+        numbers, index = np.unique(self.block, return_inverse=True)
+        return len(numbers), index
+
+    @cached_property
+    def cells(self) -> dict[int, tuple[np.ndarray, list[np.ndarray]]]:
+        """For each joint that moves enough, the cell of the turn (N,) of each sample, and the masks (N,) of all bins.
+
+        A bin is a range of speeds in one direction; the slowest tenth of the samples is in none.
+        """
+        result = {}
+        for gear in self.moving:
+            speed = np.abs(self.v[:, gear])
+            edges = np.quantile(speed, np.linspace(0.1, 1.0, SPEED_BINS + 1))[:-1]
+            direction = np.where(self.v[:, gear] > 0.0, 1, -1)
+            speed_bin = np.searchsorted(edges, speed, side="right") * direction
+            masks = [speed_bin == number for number in np.unique(speed_bin[speed_bin != 0])]
+            turns = self.q[:, gear] / (2.0 * np.pi) * CELLS
+            result[gear] = (np.floor(turns).astype(int) % CELLS, masks)
+        return result
 
 
 def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Ripple]:
@@ -391,13 +415,13 @@ def coherence(track: GearTravel, gear: int, residual: np.ndarray) -> np.ndarray:
         gear: joint of the gear, from 0.
         residual: (N,) high-frequency part of an unexplained torque.
     """
-    cell, speed_bin = _cells(track, gear)
-    numbers, block = np.unique(track.block, return_inverse=True)
+    cell, bins = track.cells[gear]
+    count, block = track.blocks
     result = np.zeros(CELLS // 2 + 1)
-    for selected in _speed_bins(speed_bin):
+    for selected in bins:
         index = block[selected] * CELLS + cell[selected]
-        sums = np.bincount(index, residual[selected], len(numbers) * CELLS)
-        spectrum = np.fft.rfft(sums.reshape(len(numbers), CELLS), axis=1)
+        sums = np.bincount(index, residual[selected], count * CELLS)
+        spectrum = np.fft.rfft(sums.reshape(count, CELLS), axis=1)
         result += _between_blocks(spectrum) / selected.sum()
     return result
 
@@ -411,39 +435,16 @@ def coherence_at(track: GearTravel, gear: int, residual: np.ndarray, orders: np.
         residual: (N,) high-frequency part of an unexplained torque.
         orders: (K,) orders k per turn.
     """
-    cell, speed_bin = _cells(track, gear)
-    in_block = np.unique(track.block)[:, None] == track.block
-    phase = np.outer(cell, orders) % CELLS * (2.0 * np.pi / CELLS)
-    waves = residual[:, None] * np.exp(-1j * phase)
+    cell, bins = track.cells[gear]
+    count, block = track.blocks
+    in_block = (np.arange(count)[:, None] == block).astype(float)
+    roots_of_unity = np.exp(-2j * np.pi / CELLS * np.arange(CELLS))
+    waves = residual[:, None] * roots_of_unity[np.outer(cell, orders) % CELLS]
     result = np.zeros(len(orders))
-    for selected in _speed_bins(speed_bin):
-        spectrum = in_block[:, selected].astype(float) @ waves[selected]
+    for selected in bins:
+        spectrum = in_block[:, selected] @ waves[selected]
         result += _between_blocks(spectrum) / selected.sum()
     return result
-
-
-def _cells(track: GearTravel, gear: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cell of the turn (N,) and the bin of the velocity (N,) of each sample; bin 0 is the slowest tenth.
-
-    Args:
-        track: motion of the gears.
-        gear: joint of the gear, from 0.
-    """
-    q = track.q[:, gear]
-    v = track.v[:, gear]
-    speed = np.abs(v)
-    edges = np.quantile(speed, np.linspace(0.1, 1.0, SPEED_BINS + 1))[:-1]
-    direction = np.where(v > 0.0, 1, -1)
-    speed_bin = np.searchsorted(edges, speed, side="right") * direction
-    turns = q / (2.0 * np.pi) * CELLS
-    cell = np.floor(turns).astype(int) % CELLS
-    return cell, speed_bin
-
-
-def _speed_bins(speed_bin: np.ndarray) -> Iterator[np.ndarray]:
-    """Yield the mask (N,) of the samples of each bin but bin 0, the slowest tenth, which is left out."""
-    for number in np.unique(speed_bin[speed_bin != 0]):
-        yield speed_bin == number
 
 
 def _between_blocks(spectrum: np.ndarray) -> np.ndarray:

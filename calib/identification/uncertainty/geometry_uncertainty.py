@@ -492,20 +492,19 @@ def _differences(
     joint_residual = unprojected.fold(joint_residual, (BODIES,))[:, :, 0]
 
     neighbours = [bodies for pair in pairs for bodies in pair]
-    factors = (0.5 / STEP, -0.5 / STEP)
-    change = np.zeros((len(pairs), n, len(q)))
+    # in the memory order in which `decimate` filters without a copy
+    change = np.empty((n, len(pairs), len(q)))
     pull = np.zeros((inertial, len(pairs)))
     for start in range(0, len(q), BLOCK):
         part = slice(start, start + BLOCK)
         states = (q[part], v[part], a[part])
         products = rigid_body.regressor_products(neighbours, parameters, *states, joint_residual[part])
-        for number, (torque, sums) in enumerate(products):
-            k = number // 2
-            factor = factors[number % 2]
-            change[k, :, part] += factor * torque
-            pull[:, k] += factor * sums
+        # the iterator twice: the two neighbours of a pair follow each other
+        for k, ((torque_up, sums_up), (torque_down, sums_down)) in enumerate(zip(products, products)):
+            change[:, k, part] = (torque_up - torque_down) / (2.0 * STEP)
+            pull[:, k] += (sums_up - sums_down) / (2.0 * STEP)
     acts = (BODIES,) * len(pairs)
-    rows = torque_rows.observe(change.transpose(2, 1, 0), acts, q, v)
+    rows = torque_rows.observe(change.transpose(2, 0, 1), acts, q, v)
     of_bodies = base.kept < inertial
     base_pull = np.zeros((base.b, len(pairs)))
     base_pull[of_bodies] = (pull * onboard[:, None])[base.kept[of_bodies]]

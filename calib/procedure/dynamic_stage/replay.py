@@ -84,20 +84,14 @@ def replay(
     reference, periods = _reference(take(case, part), rate)
     robot, inertia_added = _with_inertia(robot, reference)
     feedback = _default(robot, reference) if controller is None else replace(controller, ahead=None)
-    samples = np.arange(part.stop - part.start)
-
-    def at_control_rate(torque: np.ndarray) -> np.ndarray:
-        spline = CubicSpline(samples, torque[part, -n:])
-        return spline(np.arange(len(reference.t)) / periods)
-
-    measured = at_control_rate(np.asarray(case.target))
+    measured = _at_control_rate(case.target[part, -n:], periods)
     feedforwards: dict[str, np.ndarray | None] = {FEEDBACK: None}
     if chain.inertias is not None:
         bodies = standard_parameters(chain)
         values = np.zeros(model.inertial)
         values[: len(bodies)] = bodies
         feedforwards[CAD] = feed_forward(Plant(model.bodies, (), values), reference)
-    feedforwards[IDENTIFIED] = at_control_rate(predicted)
+    feedforwards[IDENTIFIED] = _at_control_rate(predicted[part, -n:], periods)
     feedforwards[FLOOR] = measured
     disturbance = feed_forward(robot, reference) - measured
     rms = {}
@@ -148,11 +142,21 @@ def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
     """
     motion = part.motion
     periods = periods_per_sample(motion, rate)
-    samples = np.arange(len(motion))
-    # the control instants, in samples
-    instants = np.arange(int((len(motion) - 1) * periods + 1e-9) + 1) / periods
-    q, v, a = (CubicSpline(samples, series)(instants) for series in (motion.q, motion.v, motion.a))
-    return Reference(instants / motion.rate, q, v, a), periods
+    q, v, a = (_at_control_rate(series, periods) for series in (motion.q, motion.v, motion.a))
+    return Reference(np.arange(len(q)) / periods / motion.rate, q, v, a), periods
+
+
+def _at_control_rate(series: np.ndarray, periods: float) -> np.ndarray:
+    """Return samples (N, k) of a series interpolated at the control instants (M, k).
+
+    Args:
+        series: the samples.
+        periods: control periods per sample; with 1, the samples are the values at the instants.
+    """
+    if periods == 1:
+        return np.array(series, order="C")
+    instants = np.arange(int((len(series) - 1) * periods + 1e-9) + 1) / periods
+    return CubicSpline(np.arange(len(series)), series)(instants)
 
 
 def _with_inertia(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray]:
