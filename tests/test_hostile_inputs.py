@@ -113,6 +113,7 @@ def test_hostile_input_is_refused_or_read(name: str, room: Path, capsys) -> None
     refused_or_done(code, command, room, capsys)
 
 
+@pytest.mark.slow
 def test_session_damage_is_named(room: Path, capsys) -> None:
     """What is damaged in a session is named."""
     assert run("new", "cell", "--robot", "arm.urdf", "--instrument", "tracker", "--geometry-only") == 0

@@ -94,6 +94,7 @@ def test_view_separates_rows_by_station(points, tmp_path):
     assert all(np.sqrt(np.mean(sizes**2)) < 10 * SIGMA for sizes in errors)
 
 
+@pytest.mark.slow
 def test_unestimated_arms_are_not_tested(points, tmp_path):
     """Calibrations that estimated nothing of the arm are not tested."""
     frames = calib.fit_geometry("tx40", points[0], calib.FitSettings(model="frames"))
@@ -105,6 +106,7 @@ def test_unestimated_arms_are_not_tested(points, tmp_path):
     assert "not tested" not in calib.diff(geometry, geometry).verdict.reason
 
 
+@pytest.mark.slow
 def test_fit_on_fit_knows_nominal_placement(points, fitted, tmp_path):
     """A fit on a fit knows where the nominal robot stands."""
     again = calib.fit_geometry(fitted, points[1], calib.FitSettings(model="geometry")).save(tmp_path / "b", plots=False)
@@ -115,6 +117,7 @@ def test_fit_on_fit_knows_nominal_placement(points, fitted, tmp_path):
         assert own == pytest.approx(other, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_compliance_takes_masses_from_folder(truth, tmp_path):
     """A compliance takes its masses from its folder."""
     stiff = load("lwr4plus")
@@ -168,6 +171,7 @@ def test_power_model_is_a_result_like_others(powered, tmp_path):
         calib.design_excitation(robot, calib.ExcitationSettings(period=4.0, starts=1), after=folder)
 
 
+@pytest.mark.slow
 def test_friction_step_without_terms_is_said(tmp_path):
     """A friction step without terms is said."""
     robot = description.write(tmp_path / "planted.toml", planted_motion.arm())

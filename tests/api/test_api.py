@@ -112,6 +112,7 @@ def test_numpy_scalars_and_arrays_accepted():
     assert calib.SelectionSettings(tools=tool, seconds=2).tools == ((0.1, 0.0, 0.0),)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_data_frame_is_refused_by_its_name():
     frame = pytest.importorskip("pandas").DataFrame({"q1": [0.0]})
     with pytest.raises(UsageError, match=r"measured: .*found a DataFrame: write it"):
@@ -157,6 +158,7 @@ def test_a_fit_is_what_the_command_writes(fitted, cell, tmp_path, capsys):
     assert all(line.strip() in " ".join(said.split()) for line in [f"verdict: {fitted.verdict.level}"])
 
 
+@pytest.mark.slow
 def test_measurements_and_robots_in_memory(fitted, cell):
     """Measurements and robots in memory give what their files give."""
     robot = calib.load("ur5")
@@ -182,6 +184,7 @@ def test_measurements_in_memory_are_checked(fitted, cell):
             calib.fit_geometry("ur5", [wrong, cell / "other.csv"], fitted.settings)
 
 
+@pytest.mark.slow
 def test_readers_results_stand_among_files(fitted, cell):
     """What readers return may stand among files."""
     both = [calib.read_poses(cell / "measured.csv", "ur5"), cell / "other.csv"]
@@ -306,6 +309,7 @@ def test_designed_motion_is_sampled_exactly(tmp_path):
     assert np.allclose(np.gradient(fine[1], fine[0], axis=0)[1:-1], fine[2][1:-1], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_geometry_noise_reaches_the_dynamics(logs):
     """Σ = Σ_torque + S Σ_geometry Sᵀ, without a file between fit and identification."""
     chain = description.read(logs / "robot.toml")
@@ -319,6 +323,7 @@ def test_geometry_noise_reaches_the_dynamics(logs):
     assert (unsure.estimate.sigma > 1.01 * exact.estimate.sigma).any()
 
 
+@pytest.mark.slow
 def test_recordings_in_memory_and_validation(model, logs):
     """Recordings in memory are taken, and validation may come later."""
     robot = calib.load(logs / "robot.toml")

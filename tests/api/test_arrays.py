@@ -15,6 +15,7 @@ OFFSETS = calib.FitSettings(model="offsets")
 Q = np.random.default_rng(0).uniform(-2.0, 2.0, (60, 6))
 
 
+@pytest.mark.slow
 def test_fit_of_arrays_restores_their_robot():
     """A fit of arrays brings back the robot that made them."""
     robot = calib.load("ur5")

@@ -66,6 +66,7 @@ def soft_l1(z: np.ndarray) -> np.ndarray:
     return np.array([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3])
 
 
+@pytest.mark.slow
 def test_a_loss_of_scipy_withstands_gross_rows(robot):
     """Three rows off by 35 mm; the result names the loss, and can be judged on further rows."""
     rng = np.random.default_rng(2)

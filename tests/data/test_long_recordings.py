@@ -72,7 +72,10 @@ def test_a_short_recording_is_used_whole(recording):
     assert notes == []
 
 
-@pytest.mark.parametrize("save", [np.savez, np.savez_compressed, "csv"])
+@pytest.mark.parametrize(
+    "save",
+    [np.savez, pytest.param(np.savez_compressed, marks=pytest.mark.slow), pytest.param("csv", marks=pytest.mark.slow)],
+)
 def test_files_share_their_pieces(recording, save, tmp_path):
     """Every file is read in the same pieces."""
     if save == "csv":

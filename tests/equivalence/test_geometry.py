@@ -152,6 +152,7 @@ def test_corrections_stay_as_the_nominal(files: Path, tmp_path: Path) -> None:
     assert nominal < 1.5 * calibrated  # it is calibrated already
 
 
+@pytest.mark.slow
 def test_odd_file_names_are_allowed(files: Path, tmp_path: Path) -> None:
     """A file's name may hold commas, quotes and line breaks."""
     robot, fit, unseen = named_oddly(files, tmp_path)

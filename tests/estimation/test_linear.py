@@ -49,6 +49,7 @@ def test_group_sigmas_reproduce_themselves():
     assert fit.estimate.residual_std == pytest.approx(1.0, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_settled_sigmas_are_unbiased():
     """Settled standard deviations are unbiased where parameters are many."""
     found = []

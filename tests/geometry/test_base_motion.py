@@ -149,6 +149,7 @@ def test_no_base_frame_no_finding(tmp_path):
     assert not base_motion([measured(tmp_path, 1e-3, 0, "ignored")])
 
 
+@pytest.mark.slow
 def test_predicted_sigma_counts_both_frames(tmp_path):
     """Errors from the base frame at unseen poses are as large as the pose plan predicts."""
     q = study_poses(40, 5)

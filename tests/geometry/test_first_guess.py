@@ -84,7 +84,7 @@ def weighed_alike(found, judge) -> float:
 
 
 @pytest.mark.parametrize("seeds", [[0], pytest.param([1, 2], marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", ["pose", "position", "sockets"])
+@pytest.mark.parametrize("kind", [pytest.param("pose", marks=pytest.mark.slow), "position", "sockets"])
 def test_guess_leads_to_best_of_many_starts(kind, seeds):
     """With arm errors of millimetres the guess leads to the best of many random starts."""
     for seed in seeds:

@@ -85,6 +85,7 @@ def test_residual_slope_is_minus_jacobian(mounting, lens):
     assert residual @ residual == pytest.approx(values @ values, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_whitening_is_of_full_covariance():
     """Rᵀ R of the reduced rows equals Jᵀ (f² σ² I + G S Gᵀ)⁻¹ J over all corners of an image."""
     cell, block = study(count=6)
@@ -173,6 +174,7 @@ def test_two_cameras_see_one_board():
     assert position_errors(cell.cell, own, found.cell.chain)[2] < 0.03
 
 
+@pytest.mark.slow
 def test_worse_corners_are_said():
     """Corners that are detected worse than stated are said."""
     cell, block = study()
@@ -269,6 +271,7 @@ def test_board_of_other_square_is_refused():
         complete_camera(cell.cell.nominal, wrong)
 
 
+@pytest.mark.slow
 def test_one_direction_hides_focal_length():
     """Images from one direction do not tell the focal length."""
     cell, _ = study()

@@ -90,7 +90,7 @@ def test_offsets_cost_no_more_than_geometry():
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_planted_compliance_is_found(seed, known):
     """With gravity torques as compliances, near the planted ones; without, as moments fitted with the geometry."""
     truth, nominal = sagging(seed), load("lwr4plus")
@@ -121,6 +121,7 @@ def climbed(seed: int) -> tuple:
     return climb(load("ur5"), measured), climb(load("ur5"), measured, "geometry")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_planted_harmonics_are_found(seed):
     truth, nominal = wavy(seed), load("ur5")

@@ -94,7 +94,7 @@ def test_errors_follow_stated_covariance(name):
     assert abs(squares - freedom) < 4 * np.sqrt(2 * freedom)  # the stated sigmas are those of the residuals
 
 
-@pytest.mark.parametrize("robot", ["lwr4plus", "ur5"])
+@pytest.mark.parametrize("robot", ["lwr4plus", pytest.param("ur5", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["pose", "position"])
 def test_predictions_beat_one_measurement(robot, kind):
     """Error of the prediction: sigma sqrt(p / rows), about; the nominal arm is 20 times off."""
@@ -213,6 +213,7 @@ def test_row_order_does_not_matter():
     assert position_error(one.cell, aligned, q).max() < 1e-3 * SIGMA
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [pytest.param("huber", marks=pytest.mark.slow), "cauchy"])
 def test_planted_outliers_are_named(loss):
     """Planted outliers are named with file and row, and hardly any others."""

@@ -47,6 +47,7 @@ def nearby(truth: Installation, centres: int, each: int, seed: int, sigma: float
     return Positions(q, truth.chain.joint_names, position=position, file="cluster.csv")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3, 4))])
 def test_noise_alone_gives_no_warning(seed):
     for measured in (
@@ -142,7 +143,7 @@ def test_confusion_of_tool_and_base_is_said(seed):
     assert not any(one.code == "loose-tool" for one in unidentified(calibrate(free)))
 
 
-@pytest.mark.parametrize(("turned", "most"), [((), 1), ((1,), 8), ((2, 5), 10)])
+@pytest.mark.parametrize(("turned", "most"), [((), 1), ((1,), 8), pytest.param((2, 5), 10, marks=pytest.mark.slow)])
 def test_unplaceable_reversal_not_searched(monkeypatch, turned, most):
     """Trying every joint fits placements 7, 12 and 16 times."""
     cell, placed = perturbed_cell(load("ur5"), seed=1), []
@@ -157,7 +158,10 @@ def test_unplaceable_reversal_not_searched(monkeypatch, turned, most):
     assert len(placed) <= most
 
 
-@pytest.mark.parametrize(("joint", "end"), [(5, "--tip "), (0, "--base "), (2, None)])
+@pytest.mark.parametrize(
+    ("joint", "end"),
+    [(5, "--tip "), pytest.param(0, "--base ", marks=pytest.mark.slow), pytest.param(2, None, marks=pytest.mark.slow)],
+)
 def test_joint_without_effect_is_named(joint, end):
     """A gripper's column beside the arm's, a track that carries the instrument, too."""
     cell = perturbed_cell(load("ur5"), seed=2)

@@ -35,6 +35,7 @@ def away(found: dict[str, tuple[float, float]], sigma: dict[str, tuple[float, fl
     return float(np.sqrt(np.mean([((found[name][0] - x) / sigma[name][1]) ** 2 for name, x in truth.items()])))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [*(pytest.param(method, marks=pytest.mark.slow) for method in ("ols", "tls")), "irls"]
 )

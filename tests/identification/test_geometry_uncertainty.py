@@ -197,6 +197,7 @@ def test_command_carries_covariance_of_fit(tmp_path, capsys):
     assert kept is not None and kept[1, 1] == pytest.approx(1e-6), "the identified robot carries it on"
 
 
+@pytest.mark.slow
 def test_geometry_taken_as_exact_is_said(tmp_path, capsys):
     """The command says where the geometry is taken as exact."""
     found, rows, out = run(fitted_folder(tmp_path, None), tmp_path, "--no-plots")

@@ -64,6 +64,7 @@ def test_other_mounting_is_found_with_vector(mount):
     assert hypotheses.direction @ gravity > 9.81**2 * np.cos(np.radians(5.0))
 
 
+@pytest.mark.slow
 def test_torques_without_gravity_are_named():
     """Torques without gravity are named as such."""
     assert 1 in said(np.zeros(3), masses=True).absent

@@ -32,6 +32,7 @@ def geometry(model: str) -> kinematic.Outcome:
     return kinematic.run(Inputs(cell.nominal, Path("planted.toml"), (block,)), settings=FitSettings(model=model))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["geometry", pytest.param("harmonics", marks=pytest.mark.slow)])
 def test_one_process_equals_way_by_files(model, tmp_path):
     """Fit and identification in one process equal the way through files."""

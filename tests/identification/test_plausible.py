@@ -105,7 +105,14 @@ def test_torques_of_another_robot_are_told(factor: float, level: str | None) -> 
 
 
 @pytest.mark.parametrize(
-    "clock, level", [(1.01, None), (1.03, "marginal"), (1.1, "marginal"), (2.0, "fail"), (0.5, "fail")]
+    "clock, level",
+    [
+        (1.01, None),
+        (1.03, "marginal"),
+        pytest.param(1.1, "marginal", marks=pytest.mark.slow),
+        pytest.param(2.0, "fail", marks=pytest.mark.slow),
+        (0.5, "fail"),
+    ],
 )
 def test_velocities_unlike_slopes_are_told(clock: float, level: str | None) -> None:
     """Velocities that are no slopes are told."""
@@ -114,7 +121,18 @@ def test_velocities_unlike_slopes_are_told(clock: float, level: str | None) -> N
     assert all(one.values["size"] == pytest.approx(max(clock, 1 / clock), rel=2e-3) for one in told)
 
 
-@pytest.mark.parametrize("late", [0.0, 0.005, 0.02, 0.05, -0.05, 0.1, 0.2])
+@pytest.mark.parametrize(
+    "late",
+    [
+        0.0,
+        0.005,
+        0.02,
+        pytest.param(0.05, marks=pytest.mark.slow),
+        pytest.param(-0.05, marks=pytest.mark.slow),
+        pytest.param(0.1, marks=pytest.mark.slow),
+        pytest.param(0.2, marks=pytest.mark.slow),
+    ],
+)
 def test_lag_of_all_torques_is_taken_back(late: float) -> None:
     """A lag of all torques is found and taken back."""
     sizes = compare_sizes(case_of(recorded(late)), ARM)
@@ -252,7 +270,16 @@ def test_tared_torques_are_named(kind):
     assert tare_findings(inputs_of(recorded()), None) == []
 
 
-@pytest.mark.parametrize("clock, level", [(1.0, None), (1.2, None), (2.0, "fail"), (0.5, "fail"), (3.0, "fail")])
+@pytest.mark.parametrize(
+    "clock, level",
+    [
+        (1.0, None),
+        pytest.param(1.2, None, marks=pytest.mark.slow),
+        (2.0, "fail"),
+        (0.5, "fail"),
+        pytest.param(3.0, "fail", marks=pytest.mark.slow),
+    ],
+)
 def test_a_clock_is_told_without_velocities(clock: float, level: str | None) -> None:
     """Of a robot whose masses are not known, too: lengths suffice."""
     stamped = replace(recorded(clock=clock), v=None)
@@ -284,7 +311,16 @@ def test_right_angle_at_zero_is_no_exchange() -> None:
     assert told.values["angle"] == pytest.approx(-np.pi / 2)
 
 
-@pytest.mark.parametrize("reverse", [(), (0,), (1,), (2,), (0, 2)])
+@pytest.mark.parametrize(
+    "reverse",
+    [
+        (),
+        pytest.param((0,), marks=pytest.mark.slow),
+        pytest.param((1,), marks=pytest.mark.slow),
+        pytest.param((2,), marks=pytest.mark.slow),
+        (0, 2),
+    ],
+)
 def test_reversed_joints_alone_are_named(reverse: tuple[int, ...]) -> None:
     """Whether the robot's own masses are known or not."""
     signs = np.where(np.isin(np.arange(3), reverse), -1.0, 1.0)
@@ -335,7 +371,17 @@ def logged(clock: float = 1.0, speed: float | np.ndarray = 1.0) -> Recording:
     )
 
 
-@pytest.mark.parametrize("clock, speed", [(1.0, 0.9), (1.0, 1.1), (1.0, 2.0), (2.0, 1.0), (0.9, 1.0), (0.1, 1.0)])
+@pytest.mark.parametrize(
+    "clock, speed",
+    [
+        (1.0, 0.9),
+        pytest.param(1.0, 1.1, marks=pytest.mark.slow),
+        pytest.param(1.0, 2.0, marks=pytest.mark.slow),
+        pytest.param(2.0, 1.0, marks=pytest.mark.slow),
+        pytest.param(0.9, 1.0, marks=pytest.mark.slow),
+        (0.1, 1.0),
+    ],
+)
 def test_contradicting_dates_have_both_rates(clock: float, speed: float) -> None:
     """Counted dates that contradict the stamps are told with both rates."""
     case = case_of(logged(clock, speed)) if clock != 0.1 else make_case("log", make_motion(logged(clock, speed)))
@@ -446,7 +492,9 @@ def test_impossible_description_cannot_pass():
     assert Verdict.of("good", settle(wrong, ["description"])).level == "pass"
 
 
-@pytest.mark.parametrize("clock, level", [(1.0, None), (0.5, "fail"), (3.0, "fail")])
+@pytest.mark.parametrize(
+    "clock, level", [(1.0, None), pytest.param(0.5, "fail", marks=pytest.mark.slow), (3.0, "fail")]
+)
 def test_masses_tell_clock_beyond_lengths(clock: float, level: str | None) -> None:
     """BIRDy's TX40 has half the inertia that rods of its lengths would have."""
     arm = load("tx40")

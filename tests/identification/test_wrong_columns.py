@@ -93,6 +93,7 @@ def test_shares_do_not_depend_on_rounding(robot):
     assert shares == pytest.approx(without_offsets(samples), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_corrected_columns_are_those_that_were_recorded():
     sound = recorded("tx40", 1)
     for _, _, mistake in mistakes(6, 2)[2::2]:
@@ -104,6 +105,7 @@ def test_corrected_columns_are_those_that_were_recorded():
     assert corrected(sound, None) is sound
 
 
+@pytest.mark.slow
 def test_log_of_another_robot_names_that_robot():
     panda = load("panda")
     log = recorded("lwr4plus", 3)

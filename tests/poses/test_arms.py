@@ -62,7 +62,7 @@ def starts(space: SearchSpace, count: int, seed: int = 0) -> np.ndarray:
     ("name", "index"),
     [
         ("4 joints", "cond"),
-        ("6 joints", "O1"),
+        pytest.param("6 joints", "O1", marks=pytest.mark.slow),
         pytest.param("4 joints", "O1", marks=pytest.mark.slow),
         pytest.param("6 joints", "cond", marks=pytest.mark.slow),
         pytest.param("7 joints", "O1", marks=pytest.mark.slow),

@@ -36,7 +36,7 @@ def log_det_of(jacobians):
     [
         pytest.param(library_arm.jacobian, 17, marks=pytest.mark.slow),
         (library_arm.point_jacobian, 17),
-        (library_arm.jacobian, 30),
+        pytest.param(library_arm.jacobian, 30, marks=pytest.mark.slow),
         pytest.param(library_arm.point_jacobian, 30, marks=pytest.mark.slow),
     ],
 )
@@ -65,6 +65,7 @@ def test_bound_is_tight_and_feasible():
     assert bound(ARM, 120, tolerance=1e-4).upper < 0.999 * bound(ARM, 120, capped=False, tolerance=1e-4).upper
 
 
+@pytest.mark.slow
 def test_any_weights_certify_a_valid_bound():
     """However bad the weights, no relaxed design may beat the bound they give, nor any real selection."""
     generator = np.random.default_rng(0)
@@ -136,7 +137,16 @@ def spectra_of_all_sets(jacobians, m):
     return np.linalg.svd(stacked, compute_uv=False)
 
 
-@pytest.mark.parametrize("index", ["O2", "O3", "O4", "O5", "cond"])
+@pytest.mark.parametrize(
+    "index",
+    [
+        pytest.param("O2", marks=pytest.mark.slow),
+        "O3",
+        pytest.param("O4", marks=pytest.mark.slow),
+        pytest.param("O5", marks=pytest.mark.slow),
+        "cond",
+    ],
+)
 def test_every_index_finds_the_best_set(index):
     """Without restarts half of these searches end at a local optimum; with few of them none does."""
     for seed in range(4):
@@ -162,6 +172,7 @@ def test_arm_optimum_is_reached(index):
     assert chosen.value == pytest.approx(np.exp(best), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_o1_selection_does_not_see_units():
     scale = 10.0 ** np.random.default_rng(1).uniform(-3, 3, ARM.shape[2])
     one, other = of_the_arm(), select_poses(ARM * scale, 17)
@@ -169,6 +180,7 @@ def test_o1_selection_does_not_see_units():
     assert other.efficiency == pytest.approx(one.efficiency, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_known_information_is_counted():
     """What is known before is taken into account."""
     before = ARM[:30]

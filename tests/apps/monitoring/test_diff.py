@@ -56,6 +56,7 @@ def test_tolerance_near_fits_is_marginal(fits):
     assert found.verdict == "marginal" and "near the poses of the fits" in str(found)
 
 
+@pytest.mark.slow
 def test_base_and_tool_count_only_where_told(fits):
     """A base that moved is no change of the arm, unless instrument and target were left as they were."""
     moved = fits / "moved"

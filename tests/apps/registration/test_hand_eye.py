@@ -165,7 +165,7 @@ def opencv(path: Path, robot, seen, in_hand: bool):
     storage.release()
 
 
-@pytest.mark.parametrize("in_hand", [True, False])
+@pytest.mark.parametrize("in_hand", [pytest.param(True, marks=pytest.mark.slow), False])
 @pytest.mark.parametrize(
     ("write", "name"),
     [(easy_handeye, "s.yaml"), (moveit, "s.yaml"), (opencv, "s.yml"), (opencv, "s.xml"), (opencv, "s.json")],
@@ -208,6 +208,7 @@ def test_closed_form_agrees(tmp_path):
     assert np.abs(off(fit.transforms[0], park_martin(robot, seen))).max() < 1.5e-3
 
 
+@pytest.mark.slow
 def test_camera_turned_halfway_is_named_with_its_row(tmp_path):
     """A camera that was turned by 180° between two rows is named, with the rows."""
     robot, seen = sampled(6, 14)
@@ -255,6 +256,7 @@ def test_drift_and_errors_of_the_arm_are_no_steps():
         assert small_step(bent, inv(seen[order])) is None
 
 
+@pytest.mark.slow
 def test_first_of_two_turns_is_named(tmp_path):
     """Of two turns, the first is named with its rows."""
     robot, camera = turned_later(3, 24, np.pi / 2, 8, 16)
@@ -262,7 +264,7 @@ def test_first_of_two_turns_is_named(tmp_path):
     assert "rows 1–8 and 9–" in text
 
 
-@pytest.mark.parametrize(("lag", "first"), [(3, 0), (-1, 8)])
+@pytest.mark.parametrize(("lag", "first"), [pytest.param(3, 0, marks=pytest.mark.slow), (-1, 8)])
 def test_rows_that_lag_are_named_with_the_first_of_them(tmp_path, lag, first):
     """Camera rows that lag behind the robot's, or lead them, are named with lag and row, whichever the mounting."""
     robot, seen = sampled(10, 24, in_hand=lag > 0)
@@ -296,6 +298,7 @@ def test_too_few_pairs_are_refused(tmp_path):
             calib.hand_eye(None, table(tmp_path / "pairs.csv", robot[:count], seen[:count]))
 
 
+@pytest.mark.slow
 def test_failed_frames_are_not_for_use(tmp_path, capsys):
     """With the verdict fail no frame is written for a controller or into a URDF; the verdict states an error once."""
     robot, seen = sampled(6, 14)
@@ -326,6 +329,7 @@ def test_turns_about_one_axis_leave_positions_open(tmp_path, capsys):
         assert np.isnan(frame.sigma[:3]).all()
 
 
+@pytest.mark.slow
 def test_pass_prints_no_error_above_the_tolerance(tmp_path):
     """Held-out poses within the tolerance do not make a pass of fitted poses above it."""
     robot, seen = sampled(8, 36)
@@ -357,7 +361,9 @@ def test_result_is_written_into_a_urdf(tmp_path, capsys):
 
 
 @pytest.mark.skipif(not CASE.is_dir(), reason=f"no data: {CASE}")
-@pytest.mark.parametrize("name", ["pairs.csv", "samples.yaml", "joints_cam_in_board.csv"])
+@pytest.mark.parametrize(
+    "name", ["pairs.csv", "samples.yaml", pytest.param("joints_cam_in_board.csv", marks=pytest.mark.slow)]
+)
 def test_reported_case(name):
     """The public reports' pairs give the camera at 30, -60, 45 mm."""
     carried, _ = calib.hand_eye(CASE / "arm.urdf", CASE / name).transforms

@@ -26,6 +26,7 @@ def measured(seed: int, count: int = 12, noise: float = 1e-4) -> Poses:
     return Poses(q, ARM.joint_names, position, turns.as_quat())
 
 
+@pytest.mark.slow
 def test_frames_are_recovered_within_sigma():
     """Frames are recovered within their sigma."""
     truths = {"tool": TOOL, "base": STATION, "instrument": invert(STATION)}

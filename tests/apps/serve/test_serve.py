@@ -460,6 +460,7 @@ def test_in_a_browser_nothing_is_lost(session: Session, browser: Any) -> None:
         served.process.wait(20)
 
 
+@pytest.mark.slow
 def test_the_view_is_of_this_computer_only(session: Session, client: TestClient) -> None:
     """Rerun's viewer and its data listen here alone; another computer is told so, and a session without a recording."""
     rerun = pytest.importorskip("rerun")

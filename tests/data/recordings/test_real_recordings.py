@@ -44,6 +44,7 @@ def test_lwr_repeats_at_one_frequency(data):
     assert repeats(*halves) > 0.8
 
 
+@pytest.mark.slow
 def test_panda_and_ur10e_do_not_repeat(data):
     """The Panda and the UR10e do not repeat, but a loaded run does."""
     first, rest = (make_motion(read_recording(f"{data / PANDA}@{part}")) for part in ("0:9.4", "9.4:"))

@@ -94,6 +94,7 @@ def test_instruments_are_right_unlike_ols():
     assert all(result.verdict.biased() and result.valid for result in results)
 
 
+@pytest.mark.slow
 def test_mean_of_noisy_sign_is_restored(monkeypatch):
     """A velocity noise of many widths of the Coulomb sign shrinks its column of W: IV makes up by too much Fc."""
     case = log(3e-3, 0, 0.02)
@@ -133,6 +134,7 @@ def test_exact_positions_clear_least_squares(runs, accused):
         assert error(result.fit.estimate) < 1e-2
 
 
+@pytest.mark.slow
 def test_didim_agrees_with_constraints():
     """DIDIM and constraints come to the same."""
     case = log(1e-3, 3)
@@ -143,6 +145,7 @@ def test_didim_agrees_with_constraints():
     assert error(plain.ordinary.estimate) > 2.0 * error(plain.fit.estimate)
 
 
+@pytest.mark.slow
 def test_binding_bound_removes_spread():
     """A bound that binds leaves no spread of its parameter, and less of the others."""
     case = log(1e-3, 3, np.inf)
@@ -158,7 +161,7 @@ def test_binding_bound_removes_spread():
     assert held.constrained is not None and held.constrained.findings[0].code == "on-its-bound"
 
 
-@pytest.mark.parametrize("method", ["iv", "didim"])
+@pytest.mark.parametrize("method", ["iv", pytest.param("didim", marks=pytest.mark.slow)])
 def test_curved_constraint_holds_in_rounds(method):
     """A curved constraint holds in every round."""
     case = log(1e-3, 3)
@@ -172,13 +175,16 @@ def test_curved_constraint_holds_in_rounds(method):
     assert held.constrained is not None and [one.name for one in held.constrained.binding] == ["Fv1 * Fv2 >= 0.7"]
 
 
-@pytest.mark.parametrize("wrong", [PD.slower(3.0), controllers.pd(1.4 * PD.kp, 0.7 * PD.kd)])
+@pytest.mark.parametrize(
+    "wrong", [PD.slower(3.0), pytest.param(controllers.pd(1.4 * PD.kp, 0.7 * PD.kd), marks=pytest.mark.slow)]
+)
 def test_wrong_controller_still_serves(wrong):
     """A wrong controller, down to a third of the bandwidth, still serves."""
     result = found(log(1e-3, 4), Loop(wrong, motion(), EVERY))
     assert error(result.fit.estimate) < 0.05 < error(result.ordinary.estimate)
 
 
+@pytest.mark.slow
 def test_loop_ends_soon_wherever_it_starts():
     """The loop ends in few rounds, wherever it starts."""
     case = log(1e-3, 2)
@@ -187,6 +193,7 @@ def test_loop_ends_soon_wherever_it_starts():
     assert np.allclose(near.fit.estimate.values, far.fit.estimate.values, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_gains_of_other_inertia_follow():
     """Half the gains, stated for half the inertia, are the robot's own once the estimate is."""
 

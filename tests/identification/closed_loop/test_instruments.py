@@ -106,6 +106,7 @@ def test_noise_in_columns_is_cured_too():
     assert np.abs(np.mean(cured, axis=0)).max() < 4 * np.std(cured) / np.sqrt(60)
 
 
+@pytest.mark.slow
 def test_durbin_wu_hausman_keeps_its_level():
     """The Durbin-Wu-Hausman test keeps its level where least squares is right."""
     verdicts = [exogeneity(instrument(*planted(seed, miss=0.3))) for seed in range(400)]
@@ -135,6 +136,7 @@ def test_explained_columns_go_untested():
     assert exogeneity(instrument(z, w, y)).degrees[0] == 2
 
 
+@pytest.mark.slow
 def test_autocorrelation_needs_inflation():
     """Autocorrelated noise needs the inflation to keep the level."""
 

@@ -91,6 +91,7 @@ def test_loop_explaining_too_little_is_named():
     assert [row[-10:] for row in said.values["rows"]] == ["at joint 1", "at joint 2"]
 
 
+@pytest.mark.slow
 def test_weak_instruments_are_named():
     """Positions of 1.5 mrad noise: Cragg-Donald 8.8; of 2 mrad the estimate does not settle."""
     _, test = judged("iv", 1.5e-3, 0.05)

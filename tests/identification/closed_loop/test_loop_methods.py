@@ -143,6 +143,7 @@ def test_constraints_hold_in_every_round(robot, tmp_path, capsys, method):
     assert np.isfinite(read.factor).all() and read.best >= 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["iv", pytest.param("pc-iv", marks=pytest.mark.slow)])
 def test_user_function_holds_in_every_round(robot, tmp_path, capsys, method):
     """A file of CVXPY constraints; `iv` satisfies it alone, without the constraints of `pc-iv`."""
@@ -178,6 +179,7 @@ def test_exact_positions_confirm_ols(robot, tmp_path):
     assert not any("method 'iv'" in line for line in found["warnings"])
 
 
+@pytest.mark.slow
 def test_controller_may_come_from_the_log(robot, tmp_path, capsys):
     """The controller may be read from the log."""
     train = log(tmp_path, "train.csv", 1, noise=1e-5, form="q_des_{}")
@@ -189,6 +191,7 @@ def test_controller_may_come_from_the_log(robot, tmp_path, capsys):
     assert "controller identified from train.csv" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["csv", pytest.param("npz", marks=pytest.mark.slow)])
 def test_reference_may_be_a_separate_file(robot, tmp_path, kind):
     """The reference may be a file of its own."""
@@ -204,7 +207,10 @@ def test_reference_may_be_a_separate_file(robot, tmp_path, kind):
     assert code == 0 and max(json.loads((out / "metrics.json").read_text())["loop"]["distance_percent"]) < 1.0
 
 
-@pytest.mark.parametrize(("timing", "code"), [("", "loop-test-failed"), ('timing = "stated"\n', "loop-not-followed")])
+@pytest.mark.parametrize(
+    ("timing", "code"),
+    [("", "loop-test-failed"), pytest.param('timing = "stated"\n', "loop-not-followed", marks=pytest.mark.slow)],
+)
 def test_wrong_gains_are_noticed(robot, tmp_path, capsys, timing, code):
     """At a hundredth of the stiffness the simulated robot is another robot; the tool says so and trusts no test.
 

@@ -70,6 +70,7 @@ def test_better_models_track_better():
     assert errors[0] > errors[1] > errors[2]
 
 
+@pytest.mark.slow
 def test_impossible_model_gets_inertia_added():
     """Motor inertia off the last joint until its own is negative: errors of the true robot's are met within a third."""
     _, push, case = recorded()
@@ -88,6 +89,7 @@ def test_impossible_model_gets_inertia_added():
     assert not sound.inertia_added.any()
 
 
+@pytest.mark.slow
 def test_the_command_reports_it(robot, tmp_path, capsys):
     train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
     out = tmp_path / "out"

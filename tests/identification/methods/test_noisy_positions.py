@@ -44,6 +44,7 @@ def errors(name: str, problem: IdentificationProblem) -> tuple[np.ndarray, np.nd
     return found.values - problem.base.transform @ planted.truth(), found.sigma
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [*(pytest.param(noise, marks=pytest.mark.slow) for noise in (0.0, 1e-4)), 3e-4])
 def test_maximum_likelihood_sigma_covers(noise):
     """Least squares' own is missed by several sigmas at the last level."""
@@ -122,6 +123,7 @@ def test_neuron_minimises_along_the_gradient(problem):
     assert np.allclose(moved[1], 0.5 * moved[0])
 
 
+@pytest.mark.slow
 def test_neuron_gains_nothing_from_more_data():
     """The survey's variance above ten times that of least squares: so it is with enough samples, the neuron's stays."""
     rng, truth, spread = np.random.default_rng(0), np.array([1.0, -2.0, 0.5, 3.0]), {}
@@ -149,7 +151,7 @@ def test_network_rests_at_least_squares(problem):
     assert np.allclose(rest / norms, size.values, atol=0.01 * size.sigma.min()) and steps < 200_000
 
 
-@pytest.mark.parametrize("name", ["adaline", "hopfield"])
+@pytest.mark.parametrize("name", ["adaline", pytest.param("hopfield", marks=pytest.mark.slow)])
 def test_network_sigma_covers_training_error(name):
     """The stated sigma of the networks covers their error of training."""
     for seed in range(3):

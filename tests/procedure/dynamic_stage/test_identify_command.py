@@ -55,6 +55,7 @@ def test_the_folder_keeps_its_contract(robot, tmp_path, capsys):
     assert not (out / "plot_torque_3.svg").exists(), "plots of the earlier run are gone"
 
 
+@pytest.mark.slow
 def test_a_repeat_is_no_evidence(robot, tmp_path, capsys):
     train = planted.write(tmp_path, "train.npz", 0)
     out = tmp_path / "out"
@@ -66,7 +67,10 @@ def test_a_repeat_is_no_evidence(robot, tmp_path, capsys):
     assert "is no evidence" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("options", "said"), [("rows = 'power'", False), ("[payload.tool]\nmass = 2.0", True)])
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [("rows = 'power'", False), pytest.param("[payload.tool]\nmass = 2.0", True, marks=pytest.mark.slow)],
+)
 def test_uncarried_payload_is_said(robot, tmp_path, options, said):
     """Power is explained, and a payload that is never carried is said."""
     train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
@@ -78,6 +82,7 @@ def test_uncarried_payload_is_said(robot, tmp_path, options, said):
     assert ("payload-never" in {one["code"] for one in found["noticed"]}) is said
 
 
+@pytest.mark.slow
 def test_calibrated_folder_serves(tmp_path):
     """The calibrated robot's folder serves, and the nominal one chooses columns."""
     from calib.robot import description
@@ -123,6 +128,7 @@ def test_reversed_torques_are_refused(robot, tmp_path, capsys):
     assert "friction of joint 3 adds energy" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_unlike_units_are_pointed_at(robot, tmp_path, capsys):
     """Columns in different units are pointed at."""
     good = planted.series(0)
@@ -212,7 +218,9 @@ def test_model_reads_back_and_predicts_alike(robot, tmp_path):
         read_dynamics(out)
 
 
-@pytest.mark.parametrize("kind", ["mcap", pytest.param("sqlite3", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", [pytest.param("mcap", marks=pytest.mark.slow), pytest.param("sqlite3", marks=pytest.mark.slow)]
+)
 def test_two_publisher_bag_equals_archive(robot, tmp_path, kind):
     """A bag of two publishers tells what the archive tells."""
     from rosbags.rosbag2 import StoragePlugin, Writer

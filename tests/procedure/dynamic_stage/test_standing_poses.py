@@ -137,6 +137,7 @@ def test_payload_from_two_files(tmp_path, arm, monkeypatch, capsys):
     assert abs(values[3] - 2.5) < 0.1
 
 
+@pytest.mark.slow
 def test_a_log_that_stands_is_averaged_and_one_that_moves_is_not(tmp_path, arm):
     urdf, _, model = arm
     q = drawn(60)

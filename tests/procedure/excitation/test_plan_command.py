@@ -81,6 +81,7 @@ def test_model_and_stated_drives_plan_alike(room):
     assert bare.track.duration < one.track.duration and "friction unknown" in bare.notes[1]
 
 
+@pytest.mark.slow
 def test_lines(room):
     points = WAYPOINTS[0] + 0.3 * (WAYPOINTS - WAYPOINTS[0])
     write_waypoints(points)
@@ -92,6 +93,7 @@ def test_lines(room):
     assert np.linalg.norm(tool - corner, axis=1).min() < 1e-4
 
 
+@pytest.mark.slow
 def test_shapes(room):
     shaped = planning.plan("lwr4plus", room / "way.csv", PlanSettings(shorten=4, stray=0.1), model=room / "model")
     found = motion_folder.plan_metrics(shaped)["shortened"]
@@ -242,7 +244,14 @@ def test_impossible_robot_gets_no_plan(room, capsys, change, message):
         assert planning.plan(CalibratedChain(wrong), Path("way.csv"), limits=limits).limits.velocity[3] == np.pi / 2
 
 
-@pytest.mark.parametrize("stated", ["", '[velocity]\nall = "30 deg/s"\n', "[acceleration]\nq1 = 5.0\n"])
+@pytest.mark.parametrize(
+    "stated",
+    [
+        pytest.param("", marks=pytest.mark.slow),
+        pytest.param('[velocity]\nall = "30 deg/s"\n', marks=pytest.mark.slow),
+        "[acceleration]\nq1 = 5.0\n",
+    ],
+)
 def test_plan_needs_acceleration_limits(room, capsys, stated):
     """Masses are not known of a UR10e, so nothing but the limits file can say how fast its joints may gather speed."""
     write_waypoints([[0, -1.6, 1.6, -1.6, -1.6, 0], [0.7, -1.2, 1.4, -1.7, -1.6, 0.3]], header="q1,q2,q3,q4,q5,q6")

@@ -67,6 +67,7 @@ def test_design_without_front_is_refused(tmp_path: Path) -> None:
         calib.design_excitation("tx40", SETTINGS, pick=(tmp_path, 1))
 
 
+@pytest.mark.slow
 def test_locked_joint_is_read_again(tmp_path: Path) -> None:
     """A motion whose joint 4 is locked is written and read."""
     settings = ExcitationSettings(

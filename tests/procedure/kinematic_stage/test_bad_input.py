@@ -152,6 +152,7 @@ def test_full_disk_leaves_nothing(cell, calib, monkeypatch):
     assert [path.name for path in cell.folder.iterdir()] == ["a.csv"]
 
 
+@pytest.mark.slow
 def test_a_killed_fit_leaves_no_folder(cell):
     file = cell.write("a.csv", cell.measure(400))
     command = [sys.executable, "-m", "calib", "fit", "ur5", str(file), "--out", "done"]
@@ -173,6 +174,7 @@ def test_infinite_number_is_never_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_poses_copied_ten_times_are_twenty(cell, calib):
     """Poses copied ten times are twenty poses."""
     rows = cell.measure(20)

@@ -175,6 +175,7 @@ def test_the_robots_file_is_parsed_once(cell, fitted, here, calib, monkeypatch):
     assert parsed == [(fitted / "robot.toml").read_text()]
 
 
+@pytest.mark.slow
 def test_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
     """Placed where it fits best, the nominal robot is off by what the fit reports as its error, and by no more."""
     write(here / "t.csv", Q, drawn(cell, 200, 7))
@@ -189,6 +190,7 @@ def test_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
     assert f"({own} from the arm itself" in " ".join(said["base"].split()) and "the arm itself" not in said["nominal"]
 
 
+@pytest.mark.slow
 def test_positions_are_sought_near_a_start(cell, fitted, here, calib):
     """Positions alone are sought near a start."""
     q = drawn(cell, 8, 8) * 0.3 + np.array([0.0, -1.2, 1.5, -1.0, -1.4, 0.3])
@@ -203,6 +205,7 @@ def test_positions_are_sought_near_a_start(cell, fitted, here, calib):
     assert all(row["left [mrad]"] == "" for row in rows)
 
 
+@pytest.mark.slow
 def test_tool_in_numbers_is_the_flange_moved(cell, fitted, here, calib):
     """A tool given by numbers is the flange moved."""
     q = drawn(cell, 30, 9)
@@ -291,6 +294,7 @@ def test_unsuited_folders_and_words_fail(fitted, here, calib):
     assert code == 2 and "t.csv is an input and would be overwritten" in err
 
 
+@pytest.mark.slow
 def test_one_or_repeated_targets_are_targets(fitted, here, calib):
     """One target, and the same one twice, are targets."""
     for count in (1, 3):

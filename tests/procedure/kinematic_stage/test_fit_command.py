@@ -129,6 +129,7 @@ def test_holdout_is_end_of_the_permutation(cell, calib):
     assert {out for *_, out in unseen} <= {0.0, 1.0} and all(0 < sigma < radius for _, sigma, radius, _ in unseen)
 
 
+@pytest.mark.slow
 def test_other_station_needs_refitted_frames(cell, calib):
     """A pose file from another station needs refitted frames."""
     elsewhere = from_xyz_rpy([-2.0, 1.0, 0.0], [0.0, 0.4, 1.0])
@@ -181,6 +182,7 @@ def test_repeated_rows_prove_nothing(cell, calib):
     assert "with the numbers" not in calib("fit", "ur5", cell.write("b.csv", cell.measure(40, 5)), *start[3:])[1]
 
 
+@pytest.mark.slow
 def test_validation_files_share_an_option(cell, calib):
     """Validation files may follow one option, or each its own."""
     file = cell.write("a.csv", cell.measure(40))
@@ -197,6 +199,7 @@ def test_validation_files_share_an_option(cell, calib):
     assert found["three"]["fit"] == found["one"]["fit"]
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_numbers(cell, calib):
     """The same seed gives the same numbers."""
     file = cell.write("a.csv", cell.measure(40))
@@ -206,6 +209,7 @@ def test_same_seed_gives_the_same_numbers(cell, calib):
     assert Path("one/estimate.csv").read_bytes() == Path("two/estimate.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_calibrated_folder_is_a_robot(cell, calib):
     """A calibrated folder is a robot, and a worse arm fails."""
     file = cell.write("a.csv", cell.measure(60))
@@ -225,7 +229,7 @@ def test_calibrated_folder_is_a_robot(cell, calib):
     ) and "verdict: fail" in out
 
 
-@pytest.mark.parametrize("deliverable", ["urdf", "corrections"])
+@pytest.mark.parametrize("deliverable", [pytest.param("urdf", marks=pytest.mark.slow), "corrections"])
 def test_deliverable_comes_first_everywhere(cell, calib, deliverable):
     """The deliverable's figure comes first in each, the alternative's has its words; plots show the deliverable."""
     file = cell.write("a.csv", cell.measure(90))
@@ -286,6 +290,7 @@ def test_deflection_table_comes_back(cell, calib):
     assert not Path("done/robot_for_corrections.urdf").exists()
 
 
+@pytest.mark.slow
 def test_fixed_parameters_stay(cell, calib):
     file = cell.write("a.csv", cell.measure(60))
     Path("o.toml").write_text('fix = ["theta2", "theta3"]\n')
@@ -315,6 +320,7 @@ def test_gross_rows_stay_out_of_deliverables(cell, calib):
     assert alone[1] < 1.2 * alone[0] and radius[1] < 1.5 * radius[0]
 
 
+@pytest.mark.slow
 def test_refitting_own_folder_is_no_failure(cell, calib):
     """Refitting a fit's own folder is no failure."""
     file = cell.write("a.csv", cell.measure(60))
@@ -336,6 +342,7 @@ def test_tolerance_is_tested_on_unseen_rows(cell, calib):
     assert calib(*start, "--tolerance", "-1")[0] == 2
 
 
+@pytest.mark.slow
 def test_orientations_are_tested_on_the_arm(cell, calib):
     """Orientations are held against the arm."""
     rows = cell.measure(40)
@@ -355,6 +362,7 @@ def test_orientations_are_tested_on_the_arm(cell, calib):
         assert (code, words in err) == (2 if words else 0, True), err
 
 
+@pytest.mark.slow
 def test_turned_orientations_fail(cell, calib):
     """Ten degrees about changing axes: not another convention, and no orientation of an arm."""
     rows, columns = cell.measure(60), list(cell.measure(1)[0])
@@ -465,6 +473,7 @@ def test_unfinished_placement_proves_nothing(monkeypatch: pytest.MonkeyPatch) ->
     assert name not in again.verdict.reason and "cross-validation" in again.verdict.reason
 
 
+@pytest.mark.slow
 def test_self_explaining_file_proves_nothing(cell, calib) -> None:
     """Six positions are eighteen numbers, base and tool nine parameters; twelve positions leave enough."""
     file, other = cell.write("a.csv", cell.measure(60)), cell.measure(12, 1)
@@ -475,7 +484,10 @@ def test_self_explaining_file_proves_nothing(cell, calib) -> None:
         assert ("on few.csv, unseen" in out) is scored
 
 
-@pytest.mark.parametrize(("count", "frames"), [(6, ["--refit-frames"]), (7, []), (8, [])])
+@pytest.mark.parametrize(
+    ("count", "frames"),
+    [pytest.param(6, ["--refit-frames"], marks=pytest.mark.slow), (7, []), pytest.param(8, [], marks=pytest.mark.slow)],
+)
 def test_unseen_poses_of_a_changed_arm_contradict_the_fit(cell, calib, count, frames) -> None:
     """Joint 3 moved by 4 mrad since the fit: few poses fail as many do, also where the placement is fitted to them."""
     file = cell.write("a.csv", cell.measure(60))

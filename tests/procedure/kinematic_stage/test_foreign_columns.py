@@ -310,7 +310,9 @@ def test_numbered_columns_of_a_torso_with_two_arms(tmp_path):
         load_robot(tmp_path / "two.urdf", path, FitOptions())
 
 
-@pytest.mark.parametrize(("per_turn", "zero"), [(4096, 2048), (10_000, 0), (2**20, 0)])
+@pytest.mark.parametrize(
+    ("per_turn", "zero"), [(4096, 2048), pytest.param(10_000, 0, marks=pytest.mark.slow), (2**20, 0)]
+)
 def test_encoder_counts_are_told_by_the_arm(arm, tmp_path, per_turn, zero):
     """Whole numbers too large for deg are read by the usual encoder that agrees with the arm, or asked for."""
     chain, q, position, _ = arm

@@ -145,6 +145,7 @@ def test_fit_states_iso_beside_its_errors(files, capsys):
     assert len(table.rows) == 5 and "100 or more" in table.note
 
 
+@pytest.mark.slow
 def test_validation_at_fit_joints_is_void(files, capsys):
     """A validation at the fit's joints proves nothing."""
     code = cli.run(

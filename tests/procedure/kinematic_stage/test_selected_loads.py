@@ -39,6 +39,7 @@ def chosen(folder):
     return choose
 
 
+@pytest.mark.slow
 def test_compliance_is_told_better_with_loads_than_without(chosen):
     loads = chosen().loads
     assert loads.share < 0.9 * loads.unloaded_share < 0.9
@@ -55,6 +56,7 @@ def test_each_load_is_attached_once(chosen):
     assert len(chosen().run.ways) == 13
 
 
+@pytest.mark.slow
 def test_a_single_load_is_carried_in_all_poses(chosen):
     assert chosen(loads=(2.5,)).loads.masses.tolist() == [2.5] * 14
 
@@ -72,6 +74,7 @@ def test_the_csv_states_the_load_of_each_pose_and_is_no_measurement(chosen, tmp_
     assert filled_in(path, 7)
 
 
+@pytest.mark.slow
 def test_a_load_that_the_joints_cannot_hold_is_left_out_or_refused(chosen):
     assert chosen(loads=(0.0, 25.0)).loads.excluded > 0
     with pytest.raises(UsageError, match="500 kg: more than such an arm carries"):

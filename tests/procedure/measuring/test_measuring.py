@@ -64,6 +64,7 @@ def test_candidates_are_seen_and_keep_clear(name, tmp_path):
     assert not is_feasible(space, random_joints(chain, 300)).all()
 
 
+@pytest.mark.slow
 def test_several_reflectors_show_more_poses(tmp_path):
     """Several reflectors let more poses be seen, and only seen rows count."""
     sides = "[target]\nfacing = [[0, 0, 1], [1, 0, 0], [-1, 0, 0]]\n" + CELL
@@ -250,6 +251,7 @@ def poses(count: int, seed: int, side: float) -> np.ndarray:
     return q
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", ["O1", pytest.param("O3", marks=pytest.mark.slow)])
 def test_hidden_poses_are_replaced_cheaply(index):
     """Poses behind a wall are replaced by those that cost least."""

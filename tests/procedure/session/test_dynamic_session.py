@@ -284,6 +284,7 @@ def test_recordings_keep_their_plan(recorded: Session) -> None:
     assert recorded.path("6-excitation/training/trajectory.csv").read_text() == before
 
 
+@pytest.mark.slow
 def test_guided_demo_stops_for_an_engineer(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """A guided demonstration stops where an engineer would."""
     out = str(tmp_path / "cell")

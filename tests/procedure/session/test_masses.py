@@ -57,6 +57,7 @@ def test_masses_have_true_gravity_torques(identified):
     assert np.abs(found - true).max() < 0.05 < 1.0 < np.abs(wrong - true).max()
 
 
+@pytest.mark.slow
 def test_identified_masses_fix_compliance(identified, tmp_path):
     """Compliance is right with identified masses, and wrong with those of the data sheet."""
     poses = measured(1, 50)

@@ -141,6 +141,7 @@ def test_report_numbers_are_those_of_the_fit(finished_folder: Path) -> None:
     assert found.noise["position"] == pytest.approx(60e-6 * np.sqrt(3))
 
 
+@pytest.mark.slow
 def test_fit_certificate_names_its_files(finished_folder: Path, tmp_path: Path) -> None:
     """A fit's own certificate names its files."""
     given = ("1-robot/robot.toml", "3-measured/measured.csv")
@@ -220,7 +221,15 @@ def test_figures_are_drawn_from_plain_arrays(tmp_path: Path) -> None:
     assert sorted(path.suffix for path in tmp_path.iterdir()) == [".png"] * len(drawn)
 
 
-@pytest.mark.parametrize("name", ["$q_1$", "5 $", "gelenk_€ $\\frac{1}$", "a^b_c$$"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "$q_1$",
+        pytest.param("5 $", marks=pytest.mark.slow),
+        "gelenk_€ $\\frac{1}$",
+        pytest.param("a^b_c$$", marks=pytest.mark.slow),
+    ],
+)
 def test_a_dollar_in_a_name_is_a_dollar(name: str) -> None:
     """Matplotlib would read what stands between two of them as mathematics, and fail where it is none."""
     changes, units = np.array([1e-3, 2e-3]), ["m", "rad"]

@@ -47,6 +47,7 @@ def test_redundancy_stays_near_the_start():
     assert abs(null @ (q[0] - start)) < 1e-8
 
 
+@pytest.mark.slow
 def test_line_out_of_reach_says_where():
     """A line out of reach says where and by how much."""
     goal = forward(CHAIN, WAYPOINTS[:1])[0].copy()

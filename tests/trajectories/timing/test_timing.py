@@ -63,7 +63,10 @@ def test_planned_torques_reach_the_limits():
     np.testing.assert_allclose(np.diff(motion.q, axis=0) * 1000, (motion.v[1:] + motion.v[:-1]) / 2, atol=5e-3)
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(0, marks=pytest.mark.slow), 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))],
+)
 def test_any_path_is_timed_at_a_limit(seed):
     """Strong friction and accelerations limited, by turns; the sampling is other than that of the search."""
     from calib.trajectories.timing.profile import dense
