@@ -82,6 +82,7 @@ def test_certificate_names_what_was_measured(pointless):
     assert f"{words}, rms" in page and "position, rms" not in page
 
 
+@pytest.mark.slow
 def test_view_separates_rows_by_station(points, tmp_path):
     """View separates the rows of another station."""
     settings = calib.FitSettings(model="geometry", refit_frames=True)
@@ -239,7 +240,7 @@ def test_wrong_list_length_is_refused(given):
         parse(_Table, {"sigmas": given}, "t.toml")
 
 
-@pytest.mark.parametrize("arm", ["tx40", "ur5"])
+@pytest.mark.parametrize("arm", [pytest.param("tx40", marks=pytest.mark.slow), "ur5"])
 @pytest.mark.parametrize("kind", ["position", *KINDS])
 def test_computed_measurements_are_fitted(kind, arm):
     """Exact but for the rounding of a file: what they do not determine lies in valleys too narrow to follow."""

@@ -364,6 +364,7 @@ def test_export_and_compensation_in_memory(fitted, model, cell, logs, tmp_path, 
     assert commands.save(tmp_path / "commands.csv").is_file()
 
 
+@pytest.mark.slow
 def test_session_in_python_is_the_commands(logs, tmp_path, monkeypatch, capsys):
     """A session in Python is the command's session."""
     monkeypatch.chdir(tmp_path)

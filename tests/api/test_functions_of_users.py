@@ -27,6 +27,7 @@ def chosen(robot, candidates) -> calib.PoseSelection:
     return calib.select_poses(robot, 12, candidates=candidates)
 
 
+@pytest.mark.slow
 def test_poses_are_chosen_of_the_candidates_given(robot, candidates, chosen, tmp_path: Path):
     """Of an array, a function and a file; those that break the constraints are left out, and said."""
     np.testing.assert_allclose(candidates[chosen.selection.indices], chosen.q, atol=1e-12)

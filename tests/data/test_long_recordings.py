@@ -98,6 +98,7 @@ def test_a_cut_is_taken_before_the_pieces(recording, tmp_path):
     assert len(found) == 20_000 and found.t[0] >= 600.0 and 1180.0 < found.t[-1] < 1200.0
 
 
+@pytest.mark.slow
 def test_pieces_become_silent_segments(recording):
     """Pieces become segments without a line each."""
     used = in_pieces(recording, 20_000)

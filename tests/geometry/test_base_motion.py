@@ -85,6 +85,7 @@ def only(block: Positions) -> Finding:
     return found
 
 
+@pytest.mark.slow
 def test_motion_is_stated_beside_its_noise(tmp_path):
     """Motion of 1 mm is found in all series; a still base is taken for one that moves in hardly any."""
     codes = [only(measured(tmp_path, 1e-3, seed)).code for seed in range(8)]

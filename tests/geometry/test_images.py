@@ -212,6 +212,7 @@ def test_bad_corners_and_images_are_named():
     assert position_errors(cell.cell, found.cell, found.cell.chain)[1] < 0.08
 
 
+@pytest.mark.slow
 def test_gross_corners_and_images_left_out():
     """Without a robust loss, too: one corner that is another one's, images turned by a program, joints exchanged."""
     cell, block = study()

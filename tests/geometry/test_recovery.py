@@ -73,6 +73,7 @@ def calibrate(nominal, measured, settings=None):
     return fit(start.cell, measured, settings=settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in SCENES]
 )

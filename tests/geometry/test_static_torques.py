@@ -339,7 +339,7 @@ def turn_few(torque):
         pytest.param(turn_few, 80, marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.parametrize("files", [("odd", "good"), ("good", "odd")])
+@pytest.mark.parametrize("files", [("odd", "good"), pytest.param(("good", "odd"), marks=pytest.mark.slow)])
 def test_of_two_files_the_one_that_shows_gravity_stays(arm, chain, tmp_path, change, count, files):
     """The odd file has as many rows as the good one or more; it is motor friction, or turned where it has torques."""
     good = block(arm.write(tmp_path / "good.csv", arm.table(40, 5)))
@@ -350,6 +350,7 @@ def test_of_two_files_the_one_that_shows_gravity_stays(arm, chain, tmp_path, cha
     assert len(fit.loads) == 1
 
 
+@pytest.mark.slow
 def test_of_three_files_two_without_gravity_are_named(arm, chain, tmp_path):
     tables = [block(arm.write(tmp_path / f"{seed}.csv", arm.table(40, seed))) for seed in (5, 6, 7)]
     fit, agreeing, findings = agreeing_torques(chain, [changed(tables[0], rub), changed(tables[1], shuffle), tables[2]])

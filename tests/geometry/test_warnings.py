@@ -143,7 +143,10 @@ def test_confusion_of_tool_and_base_is_said(seed):
     assert not any(one.code == "loose-tool" for one in unidentified(calibrate(free)))
 
 
-@pytest.mark.parametrize(("turned", "most"), [((), 1), ((1,), 8), pytest.param((2, 5), 10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("turned", "most"),
+    [((), 1), pytest.param((1,), 8, marks=pytest.mark.slow), pytest.param((2, 5), 10, marks=pytest.mark.slow)],
+)
 def test_unplaceable_reversal_not_searched(monkeypatch, turned, most):
     """Trying every joint fits placements 7, 12 and 16 times."""
     cell, placed = perturbed_cell(load("ur5"), seed=1), []
@@ -195,7 +198,9 @@ def real_positions(folder: Path) -> tuple[Chain, PoseMeasurements]:
     return arm, take(block, np.arange(0, len(block), max(1, len(block) // 100)))
 
 
-@pytest.mark.parametrize("folder", REAL)
+@pytest.mark.parametrize(
+    "folder", [pytest.param(name, marks=[pytest.mark.slow] * (name != "ur5_gts3800")) for name in REAL]
+)
 @pytest.mark.parametrize("way", [0.0, 1.0])
 def test_real_poses_are_sound(data, folder, way):
     """Real poses are sound unless a joint counts from the one before."""

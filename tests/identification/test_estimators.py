@@ -103,6 +103,7 @@ def test_joint_error_widens_all_sigmas(robot: Path, tmp_path: Path):
     assert "autocorrelated-residual" in {one.code for one in model_findings(inputs.cases, found["tls"])}
 
 
+@pytest.mark.slow
 def test_parameter_on_bound_has_no_sigma(robot: Path, tmp_path: Path):
     """Certainty would be the bound's, not the data's: the cell is empty, the others have theirs, readers get NaN."""
     options, out = tmp_path / "o.toml", tmp_path / "out"

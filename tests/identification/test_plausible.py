@@ -493,7 +493,8 @@ def test_impossible_description_cannot_pass():
 
 
 @pytest.mark.parametrize(
-    "clock, level", [(1.0, None), pytest.param(0.5, "fail", marks=pytest.mark.slow), (3.0, "fail")]
+    "clock, level",
+    [(1.0, None), pytest.param(0.5, "fail", marks=pytest.mark.slow), pytest.param(3.0, "fail", marks=pytest.mark.slow)],
 )
 def test_masses_tell_clock_beyond_lengths(clock: float, level: str | None) -> None:
     """BIRDy's TX40 has half the inertia that rods of its lengths would have."""

@@ -42,7 +42,9 @@ def judged(found: Identification, model: TorqueErrorModel, case: Case) -> Torque
     return intervals(model, found.dynamics, case, predict(found.dynamics, case))
 
 
-@pytest.mark.parametrize("outside", [pytest.param(0.0, marks=pytest.mark.slow), 1.0])
+@pytest.mark.parametrize(
+    "outside", [pytest.param(0.0, marks=pytest.mark.slow), pytest.param(1.0, marks=pytest.mark.slow)]
+)
 def test_interval_holds_95_of_100_errors(outside):
     """Over 2 x 5 pairs of motions, 20 s to learn from and to judge by; a single pair is known to a few percent only."""
     shares, unseen = [], [recorded(seed, outside) for seed in range(20, 25)]

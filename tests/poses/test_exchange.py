@@ -53,6 +53,7 @@ def test_sandwich(function, m):
     assert len(set(chosen.indices.tolist())) == m
 
 
+@pytest.mark.slow
 def test_bound_is_tight_and_feasible():
     """The bound is tight, and its weights are feasible."""
     for capped, most in ((True, 1.0), (False, 17.0)):
@@ -141,7 +142,7 @@ def spectra_of_all_sets(jacobians, m):
     "index",
     [
         pytest.param("O2", marks=pytest.mark.slow),
-        "O3",
+        pytest.param("O3", marks=pytest.mark.slow),
         pytest.param("O4", marks=pytest.mark.slow),
         pytest.param("O5", marks=pytest.mark.slow),
         "cond",

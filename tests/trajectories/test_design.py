@@ -131,6 +131,7 @@ def test_a_hard_goal_out_of_reach_is_named():
         design(spot, starts=1, evaluations=60)
 
 
+@pytest.mark.slow
 def test_free_period_is_shortened_to_limit():
     """A free period is shortened down to a limit."""
     spot = problem(

@@ -199,6 +199,7 @@ def planned(tmp_path: Path, q: np.ndarray) -> Session:
     return session
 
 
+@pytest.mark.slow
 def test_session_takes_points_alone(planned, arm, q):
     """A session takes points alone with the planned joints."""
     path = write(planned.path("3-measured/points.csv"), POINT, seen(arm, q)[SHUFFLED])

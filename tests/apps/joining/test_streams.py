@@ -358,7 +358,10 @@ REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", REFUSED)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=[pytest.mark.slow] * (case in ("too short", "a jump of the clock"))) for case in REFUSED],
+)
 def test_unjoinable_is_refused_with_cause(tmp_path, files, case):
     """What cannot be joined is refused with the cause."""
     change, header, says = REFUSED[case]

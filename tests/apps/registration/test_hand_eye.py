@@ -264,6 +264,7 @@ def test_first_of_two_turns_is_named(tmp_path):
     assert "rows 1–8 and 9–" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lag", "first"), [pytest.param(3, 0, marks=pytest.mark.slow), (-1, 8)])
 def test_rows_that_lag_are_named_with_the_first_of_them(tmp_path, lag, first):
     """Camera rows that lag behind the robot's, or lead them, are named with lag and row, whichever the mounting."""

@@ -156,6 +156,7 @@ def halves_of_a_log() -> tuple[bytes, bytes]:
     return contents[0], contents[1]
 
 
+@pytest.mark.slow
 def test_two_logs_of_one_motion_are_joined_in_the_page(tmp_path: Path) -> None:
     """Half a recording waits for the other half; both are paired by time, shown, and taken under the awaited name."""
     payloads = stated_payloads(["load=3.28 at 0,0,0.05"])

@@ -244,6 +244,7 @@ def test_what_cannot_be_done_is_said():
     assert instrumental_variables.settled(found(case).fit, found(case).fit)
 
 
+@pytest.mark.slow
 def test_unexcited_parameters_are_named():
     """Instruments that do not excite a parameter are named."""
     still = controllers.Reference(motion().t, motion().q * [1.0, 0.0], motion().v * [1.0, 0.0], motion().a * [1.0, 0.0])

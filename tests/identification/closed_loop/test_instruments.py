@@ -77,6 +77,7 @@ def test_columns_as_instruments_give_ols():
     assert found.covariance == pytest.approx(ordinary.covariance, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_instruments_are_unbiased_unlike_ols():
     """Instruments are unbiased where least squares is not, and their covariance is true."""
     errors, sizes, naive = [], [], []

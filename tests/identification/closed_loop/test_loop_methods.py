@@ -128,6 +128,7 @@ def test_didim_is_a_method_of_its_own(robot, tmp_path):
     assert friction_error(named) < 0.15
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["pc-iv", pytest.param("pc-didim", marks=pytest.mark.slow)])
 def test_constraints_hold_in_every_round(robot, tmp_path, capsys, method):
     """Constraints hold in every round, and the folder stays readable."""

@@ -61,7 +61,7 @@ def test_correlated_joints_tell_more():
     assert np.all(gain > 2.0)  # 1 / (1 - 0.9²) = 5.3 where no other joint tells the same
 
 
-@pytest.mark.parametrize("seeds", [50, pytest.param(120, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [pytest.param(50, marks=pytest.mark.slow), pytest.param(120, marks=pytest.mark.slow)])
 def test_covariance_is_true_on_normal_noise(seeds):
     """The covariance of the estimate is true on normal noise."""
     sizes = []

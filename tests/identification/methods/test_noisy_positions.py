@@ -60,6 +60,7 @@ def test_maximum_likelihood_beats_ols():
     assert size["ml"] < 0.5 * min(size["wls"], size["tls"])
 
 
+@pytest.mark.slow
 def test_generalised_tls_cures_column_noise():
     """Nearer the truth than least squares and TLS, within its sigma; the same as wls where positions are exact."""
     away = {name: [errors(name, noisy(seed, 3e-4)) for seed in range(3)] for name in ("wls", "tls", "gtls")}
@@ -151,7 +152,9 @@ def test_network_rests_at_least_squares(problem):
     assert np.allclose(rest / norms, size.values, atol=0.01 * size.sigma.min()) and steps < 200_000
 
 
-@pytest.mark.parametrize("name", ["adaline", pytest.param("hopfield", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", [pytest.param("adaline", marks=pytest.mark.slow), pytest.param("hopfield", marks=pytest.mark.slow)]
+)
 def test_network_sigma_covers_training_error(name):
     """The stated sigma of the networks covers their error of training."""
     for seed in range(3):

@@ -59,7 +59,7 @@ def test_sound_payload_recordings_are_clear(robot, tmp_path, capsys):
     ("stated", "code"),
     [
         pytest.param("mass = 2.0\ncom = [0.05, 0.025, 0.1]", None, marks=pytest.mark.slow),
-        ("mass = 3.0", "payload-mass"),
+        pytest.param("mass = 3.0", "payload-mass", marks=pytest.mark.slow),
         pytest.param("mass = 2.0\ncom = [0.05, 0.025, 0.3]", "payload-centre", marks=pytest.mark.slow),
     ],
 )

@@ -51,8 +51,8 @@ all = 12.0
 Fv = [14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6]
 Fc = [11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04]
 """
-QUICK = ("--starts", 1, "--evaluations", 60, "--period", 16, "--harmonics", 4, "--rate", 100, "--no-outlook")
-SHORT = ExcitationSettings(starts=1, evaluations=45, period=16.0, harmonics=4, rate=100.0, samples=120)
+QUICK = ("--starts", 1, "--evaluations", 30, "--period", 16, "--harmonics", 4, "--rate", 100, "--no-outlook")
+SHORT = ExcitationSettings(starts=1, evaluations=20, period=16.0, harmonics=4, rate=100.0, samples=120)
 
 
 @pytest.mark.slow
@@ -432,7 +432,12 @@ def test_design_is_for_the_model_to_identify():
 
 
 @pytest.mark.parametrize(
-    "solver", ["mma", pytest.param("ccsaq", marks=pytest.mark.slow), pytest.param("auglag", marks=pytest.mark.slow)]
+    "solver",
+    [
+        pytest.param("mma", marks=pytest.mark.slow),
+        pytest.param("ccsaq", marks=pytest.mark.slow),
+        pytest.param("auglag", marks=pytest.mark.slow),
+    ],
 )
 def test_other_solvers_keep_the_limits_too(solver):
     """Other solvers end within the limits, too."""
@@ -480,6 +485,7 @@ def test_identification_of_other_arm_fails(tmp_path):
             use()
 
 
+@pytest.mark.slow
 def test_a_goal_out_of_reach_is_named():
     found = design.excite("lwr4plus", replace(SHORT, goals=("raw=300", "joint7=0.5"), evaluations=12, outlook=False))
     said = " ".join(found.notes)

@@ -359,6 +359,7 @@ LIN {{X {6:.6f}, Y {7:.6f}, Z {8:.6f}, A {9:.6f}, B {10:.6f}, C {11:.6f}, S 2, T
 """
 
 
+@pytest.mark.slow
 def test_targets_in_a_program_are_rewritten(cell, fitted, here, calib):
     """A joint target becomes the command that meets it, a pose the one that the nominal robot has there."""
     q = drawn(cell, 20, 5)[:1]

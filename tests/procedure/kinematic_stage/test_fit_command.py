@@ -169,6 +169,7 @@ def test_one_station_of_a_moved_instrument(cell, calib):
     assert "with stations 'each'" not in calib(*start)[1]
 
 
+@pytest.mark.slow
 def test_repeated_rows_prove_nothing(cell, calib):
     """Rows that count twice are said, and copies prove nothing."""
     rows = cell.measure(40)
@@ -448,6 +449,7 @@ def test_a_kind_calibrates(cell, calib, measure, count, nature, poses):
         assert unseen["calibrated"]["distance_mm"] is None
 
 
+@pytest.mark.slow
 def test_unfinished_placement_proves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The optimiser gets one linearisation for the file's own frames: what it leaves there means nothing."""
     cell = perturbed_cell(load("ur10"), 0, SimulatedInstrument("6-D probe", 30e-6, 1e-4), hidden=0.3)

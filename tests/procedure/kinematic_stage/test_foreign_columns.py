@@ -119,7 +119,13 @@ def test_every_form_is_read_with_some_separator():
     assert {name for name, _, _ in READ} == set(FORMS)
 
 
-@pytest.mark.parametrize(("name", "separator", "mark"), READ)
+@pytest.mark.parametrize(
+    ("name", "separator", "mark"),
+    [
+        pytest.param(*form, marks=[pytest.mark.slow] * (form[0] in DECIDED_BY_ARM and form[0] != "kuka"))
+        for form in READ
+    ],
+)
 def test_one_reading_is_taken_and_said(arm, tmp_path, name, separator, mark):
     chain, q, position, rotation = arm
     path = written(tmp_path / "m.csv", *FORMS[name](q, position, rotation), separator, mark)
@@ -131,6 +137,7 @@ def test_one_reading_is_taken_and_said(arm, tmp_path, name, separator, mark):
     assert block.notes
 
 
+@pytest.mark.slow
 def test_what_is_not_told_is_asked_by_a_line_to_paste(arm, tmp_path):
     chain, q, position, _ = arm
     path = written(tmp_path / "a.csv", [*numbered("M{}"), "x", "y", "z"], [q, position])

@@ -129,6 +129,7 @@ def files(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_fit_states_iso_beside_its_errors(files, capsys):
     """The fit states the figures of ISO 9283 beside its own errors."""
     arguments = ["fit", "ur5", "fit.csv", "--validate", "iso.csv", "--model", "geometry", "--out", "done", "--no-plots"]

@@ -109,7 +109,12 @@ def test_angles_of_another_convention_named(cell, calib):
 @pytest.mark.parametrize(
     ("change", "code", "values"),
     [
-        ({"q3": ("q3", "q2", 1.0)}, "joint-coupled", {"joint": "elbow_joint", "way": "-", "rival": None}),
+        pytest.param(
+            {"q3": ("q3", "q2", 1.0)},
+            "joint-coupled",
+            {"joint": "elbow_joint", "way": "-", "rival": None},
+            marks=pytest.mark.slow,
+        ),
         pytest.param(
             {"q3": ("q3", "q2", -1.0)},
             "joint-coupled",
@@ -164,7 +169,7 @@ def test_joint_from_another_zero_is_told(cell, calib):
     ("first", "way"),
     [
         pytest.param(1, "down", marks=pytest.mark.slow),
-        (1, "up"),
+        pytest.param(1, "up", marks=pytest.mark.slow),
         pytest.param(20, "down", marks=SLOW),
         pytest.param(20, "up", marks=SLOW),
     ],

@@ -81,6 +81,7 @@ def test_a_load_that_the_joints_cannot_hold_is_left_out_or_refused(chosen):
         chosen(loads=(0.0, 500.0))
 
 
+@pytest.mark.slow
 def test_an_arm_without_masses_is_said_to_need_torques(chosen):
     assert any("has no masses" in note for note in chosen("unweighed").notes)
     assert not any("has no masses" in note for note in chosen().notes)

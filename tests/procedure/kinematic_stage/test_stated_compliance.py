@@ -69,6 +69,7 @@ def contradicted(fit):
     return [note for note in fit.outcome.findings.noticed if note.code == "compliance-contradicted"]
 
 
+@pytest.mark.slow
 def test_few_poses_and_the_table_predict_better_than_the_poses_alone(folder, arm, stated):
     alone = fitted(folder, "few.csv")
     assert unseen_rms(stated) < 0.7 * unseen_rms(alone)

@@ -124,6 +124,7 @@ def test_answers_that_cannot_be(answers, words):
         cell_tables(**answers)
 
 
+@pytest.mark.slow
 def test_selection_is_drawn_beside_its_poses(tmp_path, capsys):
     """A selection is drawn beside its poses, never onto what is read."""
     given = ["select", "lwr4plus", "-m", "12", "--candidates", "150", "--out"]
@@ -280,6 +281,7 @@ def test_pose_on_another_turn_is_kept():
     assert found.value[0] == pytest.approx(found.value[1], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_replaced_is_told():
     room, seen = walls(2.8), observation(targets_of(CHAIN))
     q = np.concatenate([poses(5, 1, 1.0), poses(1, 2, -1.0)])

@@ -49,6 +49,7 @@ def identified(tmp_path_factory) -> Path:
     return calib.identify_dynamics(robot, log, settings).save(folder / "out", plots=False)
 
 
+@pytest.mark.slow
 def test_masses_have_true_gravity_torques(identified):
     """Identified masses have the true gravity torques."""
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (50, planted.N))

@@ -192,6 +192,7 @@ def changed(names, units, changes, sigmas) -> list[fit_report.FittedParameter]:
     ]
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_from_plain_arrays(tmp_path: Path) -> None:
     """Every figure is drawn from plain arrays."""
     rng = np.random.default_rng(0)

@@ -130,6 +130,7 @@ def test_redo_repeats_a_step_and_all_behind(finished: Session) -> None:
         steps.find(finished, "identify")
 
 
+@pytest.mark.slow
 def test_killed_session_goes_on_from_there(measured: Session, finished_folder: Path) -> None:
     """Killed at any step, it goes on from there."""
     for name in ("measure", "fit", "validate", "certificate"):

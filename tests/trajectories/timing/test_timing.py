@@ -26,6 +26,7 @@ def test_double_integrator_is_time_optimal(velocity, expected):
     assert found.active_share > 0.999
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("viscous", "coulomb"),
     [
