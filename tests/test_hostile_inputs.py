@@ -105,7 +105,9 @@ def refused_or_done(code: int, command: tuple[str, ...], room: Path, capsys: pyt
     assert code == 0 or after == before
 
 
-@pytest.mark.parametrize("name", HOSTILE)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "a gap of eleven days")) for name in HOSTILE]
+)
 def test_hostile_input_is_refused_or_read(name: str, room: Path, capsys) -> None:
     """A hostile input is refused in one line, or read."""
     spoil, command, code = HOSTILE[name]

@@ -37,7 +37,9 @@ def truth():
     return planted.cell(planted.perturb(load("tx40"), 3, 5e-5, 1e-4), 1)
 
 
-@pytest.fixture(scope="module", params=KINDS)
+@pytest.fixture(
+    scope="module", params=[pytest.param(kind, marks=[pytest.mark.slow] * (kind != "sockets")) for kind in KINDS]
+)
 def pointless(request, truth, tmp_path_factory) -> tuple[str, Path]:
     """Folder of a fit by what measures no position."""
     out = tmp_path_factory.mktemp("pointless") / request.param

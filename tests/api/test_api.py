@@ -215,6 +215,7 @@ def test_impossible_time_in_memory_is_told(logs, stamps, words):
         calib.identify_dynamics(logs / "robot.toml", replace(given, t=stamps(np.array(given.t))))
 
 
+@pytest.mark.slow
 def test_later_validation_equals_immediate(fitted, cell):
     """Validation afterwards is validation at once."""
     robot, other = "ur5", cell / "other.csv"

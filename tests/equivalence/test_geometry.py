@@ -202,6 +202,7 @@ def test_promise_of_poses_is_checked(fitted: Path, tmp_path: Path) -> None:
     assert "not found" in command(*words, "--selection", tmp_path / "nothing.csv")
 
 
+@pytest.mark.slow
 def test_the_same_poses_are_chosen(fitted: Path, files: Path, tmp_path: Path) -> None:
     out, session = tmp_path / "poses.csv", open_session(shutil.copytree(fitted, tmp_path / "cell"))
     planned(session)

@@ -147,7 +147,7 @@ def test_orientation_residuals_of_every_size(angle):
 
 
 @pytest.mark.parametrize("kind", ["plane", "bar", "sockets", "distance"])
-@pytest.mark.parametrize("size", [1e-4, 1e-2])
+@pytest.mark.parametrize("size", [pytest.param(1e-4, marks=pytest.mark.slow), 1e-2])
 def test_cost_gradient_is_exact(kind, size):
     """Kaufman's Jacobian is not the slope of the residuals, but Jᵀr is the slope of half the squared cost."""
     truth = cell(load("lwr4plus"), 4)

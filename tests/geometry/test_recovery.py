@@ -112,7 +112,15 @@ def test_predictions_beat_one_measurement(robot, kind):
         assert np.sqrt(np.mean(position_error(start.cell, truth, q) ** 2)) > 10 * error
 
 
-@pytest.mark.parametrize("name", ["pose", "position", "sockets", "distance"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "pose",
+        pytest.param("position", marks=pytest.mark.slow),
+        "sockets",
+        pytest.param("distance", marks=pytest.mark.slow),
+    ],
+)
 def test_exact_rows_give_the_truth(name):
     """Without noise the truth is found to rounding."""
     scene = SCENES[name][0]
@@ -124,7 +132,10 @@ def test_exact_rows_give_the_truth(name):
 
 @pytest.mark.parametrize(
     ("name", "seeds"),
-    [("position", 6), *(pytest.param(name, SEEDS, marks=pytest.mark.slow) for name in ("pose", "position"))],
+    [
+        pytest.param("position", 6, marks=pytest.mark.slow),
+        *(pytest.param(name, SEEDS, marks=pytest.mark.slow) for name in ("pose", "position")),
+    ],
 )
 def test_unstated_sigmas_are_estimated(name, seeds):
     """Position and orientation each get their own, within the scatter that so many rows allow."""

@@ -210,10 +210,14 @@ def test_loads_by_row_of_one_file_are_those_of_several_files(arm, chain, folder,
 @pytest.mark.parametrize(
     "change, says",
     [
-        (lambda torque: np.negative(torque, out=torque), "the other one than in empty.csv"),
+        pytest.param(
+            lambda torque: np.negative(torque, out=torque), "the other one than in empty.csv", marks=pytest.mark.slow
+        ),
         (lambda torque: np.multiply(torque, 1000.0, out=torque), "times the gravity of empty.csv"),
         (lambda torque: torque.fill(0.0), "zero in every row"),
-        (lambda torque: np.multiply(torque, 0.5, out=torque), "no load explains them"),
+        pytest.param(
+            lambda torque: np.multiply(torque, 0.5, out=torque), "no load explains them", marks=pytest.mark.slow
+        ),
         (lambda torque: np.negative(torque[:, 1], out=torque[:, 1]), "with tau2 reversed"),
     ],
 )
@@ -294,7 +298,9 @@ def changed(measured, change):
         (lambda torque: np.multiply(torque, 1000.0, out=torque), "kg"),
         (exchange, "tau2 and tau4 exchanged"),
         (reverse, "tau2 reversed"),
-        (lambda torque: np.multiply(torque, 0.5, out=torque), "no load explains them"),
+        pytest.param(
+            lambda torque: np.multiply(torque, 0.5, out=torque), "no load explains them", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_second_fitted_file_is_judged_by_the_first_one(chain, folder, gravity, change, says):

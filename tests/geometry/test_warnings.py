@@ -86,7 +86,7 @@ def one_component(seed: int) -> PoseMeasurements:
     return measure(truth_of(0), "distance", 160, seed, sigma=SIGMA)
 
 
-@pytest.mark.parametrize("measured", [scattered, one_component])
+@pytest.mark.parametrize("measured", [scattered, pytest.param(one_component, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 16), marks=pytest.mark.slow)])
 def test_scattered_bad_rows_are_no_set_up(measured, seeds):
     """Bad rows scattered over the day, and noise of one component, are no set-up."""
@@ -127,7 +127,7 @@ def test_the_rank_is_told_with_its_gap():
     assert all(any(place in one["into"] for one in merged) for place in PLACES.values())
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_confusion_of_tool_and_base_is_said(seed):
     """Positions in a small region with the wrist held still, against positions anywhere."""
     truth = truth_of(seed)

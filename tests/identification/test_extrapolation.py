@@ -51,7 +51,7 @@ def test_bent_shape_stays_beyond_the_edge(one):
     assert free.settings[0] == np.inf
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_sensor_friction_brakes_and_is_small(seed):
     """Friction of sensors behind the gears brakes and is small."""
     case = without_friction(planted.case("log", seed, noise=0.2))

@@ -46,11 +46,11 @@ def test_spreading_is_adjoint_of_decimation(factor):
 @pytest.mark.parametrize(
     "settings",
     [
-        PLAIN,
+        pytest.param(PLAIN, marks=pytest.mark.slow),
         replace(PLAIN, method="ols"),
-        replace(PLAIN, friction="asymmetric"),
+        pytest.param(replace(PLAIN, friction="asymmetric"), marks=pytest.mark.slow),
         replace(PLAIN, prior="cad"),
-        replace(PLAIN, samples=200),
+        pytest.param(replace(PLAIN, samples=200), marks=pytest.mark.slow),
     ],
     ids=["wls", "ols", "ridge", "prior", "thinned"],
 )

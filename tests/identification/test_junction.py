@@ -76,6 +76,7 @@ def test_calibrated_robot_reads_back(tmp_path):
     np.testing.assert_allclose(again.covariance, robot.covariance, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_corrected_geometry_is_no_robot():
     """A geometry good only with its corrections is not taken for a robot."""
     found = geometry("harmonics").selection.fit

@@ -30,7 +30,7 @@ def test_loaded_recording_is_named_with_mass(count: int, place: int):
     assert load.after < 0.5 * load.before
 
 
-@pytest.mark.parametrize("loaded", [False, True])
+@pytest.mark.parametrize("loaded", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_recordings_alike_tell_of_no_load(loaded: bool):
     for seed in range(3):
         assert unstated_load({f"{k}": samples(k, loaded) for k in (seed, seed + 1)}) is None

@@ -117,7 +117,7 @@ def test_log_of_another_robot_names_that_robot():
     assert found.values["robot"] in ("lwr4plus", "iiwa14") and found.values["after"] < 0.6 * found.values["before"]
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", [pytest.param(name, marks=[pytest.mark.slow] * (name != "ur10e")) for name in ROBOTS])
 def test_sound_columns_accuse_nothing(robot):
     assert wrong_joints(recorded(robot, 4)) is None
 

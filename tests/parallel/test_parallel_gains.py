@@ -48,9 +48,11 @@ def test_gain_sigmas_hold_under_noise():
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"gain_identification": None}, "currents without gains"),
+        pytest.param({"gain_identification": None}, "currents without gains", marks=pytest.mark.slow),
         ({"payload": {"5": {}}}, "with its mass"),
-        ({"payload": {"5": {"mass": 5.37}, "6": {"mass": 1.0}}}, "was the payload attached"),
+        pytest.param(
+            {"payload": {"5": {"mass": 5.37}, "6": {"mass": 1.0}}}, "was the payload attached", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_gains_need_a_known_payload(changes, said):

@@ -200,6 +200,7 @@ def test_choosing_all_candidates_is_allowed():
     assert chosen.efficiency == pytest.approx(1.0, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_the_seed_repeats_every_bit():
     few = ARM[:150]
     one, two = select_poses(few, 17, SearchSettings(seed=5)), select_poses(few, 17, SearchSettings(seed=5))

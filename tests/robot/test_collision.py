@@ -143,7 +143,10 @@ def test_capsules_along_a_chain():
     assert 0.05 < free.mean() < 0.95
 
 
-@pytest.mark.parametrize("arm", ["lwr4plus", "ur5", "rv2sq", "motley"])
+@pytest.mark.parametrize(
+    "arm",
+    [pytest.param("lwr4plus", marks=pytest.mark.slow), "ur5", "rv2sq", pytest.param("motley", marks=pytest.mark.slow)],
+)
 def test_capsules_measure_as_coal_does(arm):
     """Capsule by capsule, over random postures: against each other, floor, box, sphere and cylinder."""
     import coal

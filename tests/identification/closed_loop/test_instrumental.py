@@ -124,7 +124,9 @@ def test_noisy_sign_where_simulation_lags():
     assert np.abs(relative).max() < 0.06
 
 
-@pytest.mark.parametrize(("runs", "accused"), [(1, 0), pytest.param(12, 1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("runs", "accused"), [pytest.param(1, 0, marks=pytest.mark.slow), pytest.param(12, 1, marks=pytest.mark.slow)]
+)
 def test_exact_positions_clear_least_squares(runs, accused):
     """At 1 %: of 12 honest runs at most one is accused."""
     results = [found(log(0.0, seed)) for seed in range(runs)]
@@ -161,7 +163,9 @@ def test_binding_bound_removes_spread():
     assert held.constrained is not None and held.constrained.findings[0].code == "on-its-bound"
 
 
-@pytest.mark.parametrize("method", ["iv", pytest.param("didim", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "method", [pytest.param("iv", marks=pytest.mark.slow), pytest.param("didim", marks=pytest.mark.slow)]
+)
 def test_curved_constraint_holds_in_rounds(method):
     """A curved constraint holds in every round."""
     case = log(1e-3, 3)

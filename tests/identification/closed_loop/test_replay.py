@@ -37,7 +37,7 @@ def recorded() -> tuple[controllers.Reference, np.ndarray, Case]:
     return asked, push, make_case("log", motion)
 
 
-@pytest.mark.parametrize("share", [0.8, 1.0])
+@pytest.mark.parametrize("share", [pytest.param(0.8, marks=pytest.mark.slow), 1.0])
 def test_replay_tracks_as_the_true_robot(share):
     """A model whose friction falls short, fed forward on the true robot, pushed as it was: the same rms within 10 %."""
     _, push, case = recorded()

@@ -116,6 +116,7 @@ def test_impossible_input_writes_nothing(robot, tmp_path, capsys, spoil, said):
     assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".out*"))
 
 
+@pytest.mark.slow
 def test_reversed_torques_are_refused(robot, tmp_path, capsys):
     """Reversed torques are refused, and one reversed joint fails."""
     good = planted.series(0)

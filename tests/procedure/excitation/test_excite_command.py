@@ -114,6 +114,7 @@ def earlier(designed, tmp_path_factory) -> Path:
     return motion_folder.write_design(designed, tmp_path_factory.mktemp("excited") / "e")
 
 
+@pytest.mark.slow
 def test_motions_before_count(earlier, tmp_path):
     """Designed with what is known, the two motions together tell more than twice the first one would."""
     before = coefficients.read(earlier)

@@ -94,6 +94,7 @@ def test_another_robots_urdf_is_refused(cell, calib, fitted):
     assert (code, "not describe the nominal robot" in err, Path("new.urdf").exists()) == (2, True, False)
 
 
+@pytest.mark.slow
 def test_offsets_are_those_of_a_fit_of_offsets_alone(cell, calib, fitted):
     """The table of a fit of the full geometry has the offsets of ``--model offsets``, and says so."""
     code, out, _ = calib("export", fitted, "--offsets", "offsets.csv")
@@ -176,6 +177,7 @@ def test_the_source_is_never_written_over(cell, calib, fitted):
     assert Path("source.urdf").read_bytes() == before and not Path("n.urdf").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("old", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_flange_is_outside_ur_kinematics(cell, calib, old):
     """A flange 0.109 m behind the last joint, as in ur10_ipa; URDFs of old have UR's own d6 there instead."""

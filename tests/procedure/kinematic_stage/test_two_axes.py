@@ -61,7 +61,7 @@ def test_the_public_positioner(data, calib, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("step", [1, pytest.param(17, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("holdout", [(), ("--holdout", "0.25")])
+@pytest.mark.parametrize("holdout", [pytest.param((), marks=pytest.mark.slow), ("--holdout", "0.25")])
 def test_twelve_positioner_rows_are_answered(data, calib, tmp_path, monkeypatch, holdout, step):
     """Of the first twelve rows one joint stands still, and no model of the arm can be better than the nominal one."""
     monkeypatch.chdir(tmp_path)

@@ -57,6 +57,7 @@ def codes(fit):
     return {finding.code: finding.values for finding in fit.assessment.noticed}
 
 
+@pytest.mark.slow
 def test_masses_described_2_5_times_too_large_are_seen_and_the_unseen_load_is_predicted(tmp_path):
     """With the described masses the error was twice the noise, and nothing was said."""
     fit = fitted(tmp_path, 2.5)

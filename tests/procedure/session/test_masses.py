@@ -77,6 +77,7 @@ def test_identified_masses_fix_compliance(identified, tmp_path):
     assert np.sqrt(read.corrections.covariance[own, own]) == pytest.approx(sigma, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_masses_of_another_arm_are_refused(identified, tmp_path):
     """Masses of another arm or of no folder are refused."""
     with pytest.raises(UsageError, match="has 7"):
