@@ -208,6 +208,7 @@ def test_motion_programs_go_where_asked(tmp_path, capsys):
     assert "give a list of poses, a program, or the folder of a motion" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_parallel_fit_has_pages_of_arm_fits(tmp_path):
     """A parallel fit has the pages and figures of an arm's fit."""
     robot, rng = find("fivebar"), np.random.default_rng(0)

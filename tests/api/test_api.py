@@ -345,6 +345,7 @@ def test_torques_have_sigmas(model):
     assert (np.median(fast, axis=0) > np.median(own, axis=0)).all()
 
 
+@pytest.mark.slow
 def test_export_and_compensation_in_memory(fitted, model, cell, logs, tmp_path, monkeypatch):
     """Export and compensation take results in memory."""
     written = calib.export(fitted, tmp_path / "geometry")

@@ -108,6 +108,7 @@ def test_constraints_and_poses_are_values(tmp_path):
         np.testing.assert_array_equal(q, by_file)
 
 
+@pytest.mark.slow
 def test_notebook_shows_progress_in_one_line(monkeypatch):
     """A notebook shows progress in one line."""
     said = []

@@ -112,6 +112,7 @@ def test_pieces_become_silent_segments(recording):
     assert motion.decimator.factor == whole.decimator.factor
 
 
+@pytest.mark.slow
 def test_motion_at_the_end_alone_counts(recording):
     """Motion that fills only the end of a recording counts."""
     slow = 0.01 * np.sin(2 * np.pi * 0.05 * recording.t)[:, None]

@@ -253,6 +253,7 @@ def test_noise_of_images_settles(seed):
     assert position_errors(cell.cell, found.cell, found.cell.chain)[2] < 0.08
 
 
+@pytest.mark.slow
 def test_rows_shifted_by_one_are_said_to_be():
     cell, block = study()
     block = replace(block, lens=cell.lens)

@@ -29,7 +29,13 @@ def fitted(wide: float, seed: int, rows: int = 60):
 
 
 @pytest.mark.parametrize(
-    "wide", [0.25, pytest.param(0.5, marks=pytest.mark.slow), pytest.param(1.0, marks=pytest.mark.slow), 3.0]
+    "wide",
+    [
+        0.25,
+        pytest.param(0.5, marks=pytest.mark.slow),
+        pytest.param(1.0, marks=pytest.mark.slow),
+        pytest.param(3.0, marks=pytest.mark.slow),
+    ],
 )
 def test_sigma_over_range_is_the_error(wide):
     """Rms over seeds: one arm's error varies."""

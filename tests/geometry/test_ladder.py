@@ -52,7 +52,11 @@ def unseen(found, truth: Installation, known: bool) -> float:
 
 @pytest.mark.parametrize(
     "robot, kind, count",
-    [("ur5", "position", 150), ("lwr4plus", "pose", 120), pytest.param("ur5", "pose", 600, marks=pytest.mark.slow)],
+    [
+        ("ur5", "position", 150),
+        pytest.param("lwr4plus", "pose", 120, marks=pytest.mark.slow),
+        pytest.param("ur5", "pose", 600, marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_rigid_truth_shows_no_effect(robot, kind, count, seed):
@@ -77,6 +81,7 @@ def test_an_arm_that_is_its_nominal_stays_so():
     assert unseen(found.fit, truth, False) < 1.3 * SIGMA * np.sqrt(found.fit.identified / 150)
 
 
+@pytest.mark.slow
 def test_offsets_cost_no_more_than_geometry():
     """Where only the offsets are wrong the full geometry finds that, to its noise."""
     nominal = load("ur5")
@@ -135,6 +140,7 @@ def test_planted_harmonics_are_found(seed):
     assert fitted[f"theta1 sin 11 {joints[0]}"] == pytest.approx(2e-4, rel=0.25)
 
 
+@pytest.mark.slow
 def test_last_kept_rung_is_chosen():
     """The last rung kept is the one chosen, and each kept rung is better."""
     found, _ = climbed(0)

@@ -254,6 +254,7 @@ def test_planted_outliers_are_named(loss):
     assert others <= 6  # of 540 good rows
 
 
+@pytest.mark.slow
 def test_a_clean_measurement_has_no_outliers():
     for seed in range(6):
         nominal, _, measured, _ = planted("position", seed)

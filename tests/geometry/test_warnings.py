@@ -210,6 +210,7 @@ def test_real_poses_are_sound(data, folder, way):
     assert (found and (found.code, found.joints)) == (("joint-coupled", (2, 1)) if way else None)
 
 
+@pytest.mark.slow
 def test_joint_without_effect_reaches_the_user():
     """The explanation of a search is a finding of the fit, with the joint's name."""
     cell = perturbed_cell(load("ur5"), seed=2)

@@ -71,6 +71,7 @@ def test_sensitivity_is_slope_of_estimate(settings):
     differences.check(refitted, matrix[:, :-2], np.array(arm.values), step=1e-5, tolerance=1e-7)
 
 
+@pytest.mark.slow
 def test_pieces_of_a_recording_tell_the_same(monkeypatch):
     """Pieces of a long recording tell the same."""
     arm, case = planted.arm(), planted.case("a", 0, noise=0.0, duration=60.0)

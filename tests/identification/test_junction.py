@@ -61,6 +61,7 @@ def test_one_process_equals_way_by_files(model, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_calibrated_robot_reads_back(tmp_path):
     """A calibrated robot reads back as it was written."""
     robot = geometry("harmonics").robot

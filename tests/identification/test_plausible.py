@@ -426,6 +426,7 @@ def test_counted_dates_agree_where_right() -> None:
     assert float(note.split()[-1]) == pytest.approx(0.5, rel=0.01)
 
 
+@pytest.mark.slow
 def test_inconsistent_velocities_are_noted() -> None:
     """Velocities that do not follow the positions are noted."""
     v, noise = recorded().v, np.random.default_rng(1).normal(size=(len(recorded()), 3))

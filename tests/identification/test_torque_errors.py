@@ -79,6 +79,7 @@ def test_faster_motion_expects_larger_errors():
     assert any(line.startswith("accelerating more than in training at joint a, b, c") for line in said)
 
 
+@pytest.mark.slow
 def test_exact_torques_give_intervals_too():
     """Several recordings and exact torques give intervals, too."""
     found, model = learnt(0.0, (0, 1, 2, 3), duration=10.0, noise=0.0)

@@ -169,6 +169,7 @@ def test_bound_holds_over_the_whole_space(bound):
     assert bound_over_space(space, few, 6, climbs=0).upper < best.value**2 * 6  # the candidates' bound does not hold
 
 
+@pytest.mark.slow
 def test_multistart_processes_agree():
     """Multistart on other processes gives the same poses."""
     here = select_poses(None, 5, SearchSettings(method="multistart", starts=3), q=Q, space=SPACE)

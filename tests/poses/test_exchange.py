@@ -209,6 +209,7 @@ def test_the_seed_repeats_every_bit():
     assert random_baseline(few, 17, seed=6) != one.random_baseline
 
 
+@pytest.mark.slow
 def test_interrupted_exchange_returns_best():
     """An interrupted exchange returns the best so far."""
 

@@ -214,6 +214,7 @@ def test_locked_joint_leaves_no_information():
         design(problem(family=fourier_family((4, 4, 0, 4, 4, 4, 4), 15.0)), starts=1, evaluations=30)
 
 
+@pytest.mark.slow
 def test_interrupting_keeps_the_best_so_far():
     calls = []
 

@@ -318,6 +318,7 @@ def test_failed_frames_are_not_for_use(tmp_path, capsys):
     assert run(["hand-eye", str(path)]) == 2 and "1 pair of poses" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_turns_about_one_axis_leave_positions_open(tmp_path, capsys):
     """With turns about one axis only, positions are not identifiable, and no frame is offered for use."""
     path = table(tmp_path / "pairs.csv", *sampled(8, turns=(0.0, 0.0, 1.0)))

@@ -231,6 +231,7 @@ def test_the_controller_is_read_from_its_log():
     assert np.allclose(result.controller.kp, cascade.kp, rtol=0.2)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_done_is_said():
     case = log(1e-4, 1)
     with pytest.raises(UsageError, match="not one of iv, didim"):

@@ -224,6 +224,7 @@ def test_constrained_forms_match_formulas():
         assert found == pytest.approx(np.append(free[:2] + moved, 0.4), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_forms_part_where_a_bound_is_wrong():
     """Weak instruments: 0.24 σ apart at the true bound, 2.4 σ with one 6 σ off, where the slides' form errs less."""
     apart, errors = [], []

@@ -52,6 +52,7 @@ def test_velocity_formed_otherwise_is_named():
     np.testing.assert_allclose(found.factor, 1.0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_noise_beyond_smoothed_sign_is_borne():
     """Noise in the loop wider than the smoothed sign is told, and leaves IV right."""
     noisy = problem(0, 1e-3, v0=0.005)

@@ -78,6 +78,7 @@ def test_noise_that_hides_columns_is_told():
     assert found.status is EstimateStatus.RANK_DEFICIENT and "noise of the encoders alone" in str(found.failure)
 
 
+@pytest.mark.slow
 def test_bounded_error_intervals_hold_truth():
     """Intervals of bounded errors hold the truth, and are those of all rows."""
     rng = np.random.default_rng(0)

@@ -69,7 +69,10 @@ def test_a_repeat_is_no_evidence(robot, tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("options", "said"),
-    [("rows = 'power'", False), pytest.param("[payload.tool]\nmass = 2.0", True, marks=pytest.mark.slow)],
+    [
+        pytest.param("rows = 'power'", False, marks=pytest.mark.slow),
+        pytest.param("[payload.tool]\nmass = 2.0", True, marks=pytest.mark.slow),
+    ],
 )
 def test_uncarried_payload_is_said(robot, tmp_path, options, said):
     """Power is explained, and a payload that is never carried is said."""
@@ -154,7 +157,7 @@ def test_unlike_units_are_pointed_at(robot, tmp_path, capsys):
         ("drives = ['Ia', 'Fv']", "drives: 2 values for 3 joints"),
         ("drives = 'Ia Fx'", "drive term 'Fx'"),
         ("prior = 'cad'\nmethod = 'iv'", "controller"),
-        ("keep = ['ZZ9']", "ZZ9"),
+        pytest.param("keep = ['ZZ9']", "ZZ9", marks=pytest.mark.slow),
         ("gains = [1.0, 2.0]", "gains: 2 values for 3 joints"),
         ("[gain_identification]\nunloaded = 'train.npz'\nloaded = 'train.npz'", "payload"),
         ("not toml", "is not a TOML file"),

@@ -178,6 +178,7 @@ def test_a_damaged_model_is_refused(room, capsys):
     assert "no identified model" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_uncertain_model_keeps_torque_free(room, capsys):
     """Only Ia2 is uncertain, so sigma is its own times the largest acceleration of joint 2."""
     files.write_table(

@@ -113,6 +113,7 @@ def test_impossible_urdf(cell, calib, text, options, word):
     assert not Path("done").exists()
 
 
+@pytest.mark.slow
 def test_foreign_folder_is_unchanged(cell, calib):
     """A folder that holds other things is left alone."""
     file = cell.write("a.csv", cell.measure(40))

@@ -272,6 +272,7 @@ def test_bad_targets_are_refused(fitted, here, calib, text, said):
     assert said in err
 
 
+@pytest.mark.slow
 def test_unsuited_folders_and_words_fail(fitted, here, calib):
     """Folders and words that do not serve are refused."""
     write(here / "t.csv", Q, np.zeros((1, 6)) + 0.5)

@@ -60,6 +60,7 @@ def test_planted_arm_is_found(cell, calib):
     assert "verdict: pass" in out and "day2.csv" in out
 
 
+@pytest.mark.slow
 def test_files_of_a_fit_hold_the_same_robot(cell, calib):
     """The files of a fit hold the same robot."""
     file = cell.write("day1.csv", cell.measure(60))
@@ -231,7 +232,9 @@ def test_calibrated_folder_is_a_robot(cell, calib):
     ) and "verdict: fail" in out
 
 
-@pytest.mark.parametrize("deliverable", [pytest.param("urdf", marks=pytest.mark.slow), "corrections"])
+@pytest.mark.parametrize(
+    "deliverable", [pytest.param("urdf", marks=pytest.mark.slow), pytest.param("corrections", marks=pytest.mark.slow)]
+)
 def test_deliverable_comes_first_everywhere(cell, calib, deliverable):
     """The deliverable's figure comes first in each, the alternative's has its words; plots show the deliverable."""
     file = cell.write("a.csv", cell.measure(90))
@@ -502,6 +505,7 @@ def test_unseen_poses_of_a_changed_arm_contradict_the_fit(cell, calib, count, fr
     assert "moved.csv: " in out and "times expected" in out
 
 
+@pytest.mark.slow
 def test_few_unseen_poses_are_said_and_decide_nothing(cell, calib) -> None:
     """Seven poses are named on the console, in the verdict and on the certificate; eight decide it."""
     file, other = cell.write("a.csv", cell.measure(60)), cell.measure(8, 1)

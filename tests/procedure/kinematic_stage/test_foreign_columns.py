@@ -318,7 +318,8 @@ def test_numbered_columns_of_a_torso_with_two_arms(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("per_turn", "zero"), [(4096, 2048), pytest.param(10_000, 0, marks=pytest.mark.slow), (2**20, 0)]
+    ("per_turn", "zero"),
+    [pytest.param(4096, 2048, marks=pytest.mark.slow), pytest.param(10_000, 0, marks=pytest.mark.slow), (2**20, 0)],
 )
 def test_encoder_counts_are_told_by_the_arm(arm, tmp_path, per_turn, zero):
     """Whole numbers too large for deg are read by the usual encoder that agrees with the arm, or asked for."""

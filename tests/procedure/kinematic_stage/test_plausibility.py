@@ -143,7 +143,9 @@ def test_coupled_or_swapped_joints_are_named(cell, calib, change, code, values, 
     assert model != "frames" or accepted(calib, out)[0] == 0
 
 
-@pytest.mark.parametrize("degrees", [90, pytest.param(180, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "degrees", [pytest.param(90, marks=pytest.mark.slow), pytest.param(180, marks=pytest.mark.slow)]
+)
 def test_quarter_turn_zeros_are_named(cell, calib, degrees):
     """The full geometry explains it by axes that are turned by 180°, or nearly so."""
     rows = [row | {"q3": row["q3"] + np.radians(degrees)} for row in cell.measure(COUNT)]
@@ -187,6 +189,7 @@ def test_misaligned_rows_are_named(cell, calib, first, way):
     assert (found["by"], found["way"]) == (1, way) and abs(found["first"] - max(first - 1, 1)) <= 1
 
 
+@pytest.mark.slow
 def test_rows_of_two_targets_are_sorted(cell, calib):
     rows = cell.measure(COUNT)
     second = [k for k in range(COUNT) if k % 3 == 0]
@@ -221,7 +224,11 @@ def with_targets(rows: list[dict], change) -> None:
         pytest.param(
             lambda k, first, second: first if k in (3, 9, 21) else second, {"target-copied"}, marks=pytest.mark.slow
         ),
-        (lambda k, first, second: [0, 0, 0] if k in (3, 9, 21) else second, {"reading-repeated"}),
+        pytest.param(
+            lambda k, first, second: [0, 0, 0] if k in (3, 9, 21) else second,
+            {"reading-repeated"},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_copied_readings_are_named(cell, calib, change, codes):
@@ -242,7 +249,7 @@ def test_copied_readings_are_named(cell, calib, change, codes):
         pytest.param(1.0, None, marks=pytest.mark.slow),
         (1.05, "fail"),
         pytest.param(0.98, "marginal", marks=pytest.mark.slow),
-        (1.003, "note"),
+        pytest.param(1.003, "note", marks=pytest.mark.slow),
     ],
 )
 def test_common_factor_has_two_causes(cell, calib, factor, level):

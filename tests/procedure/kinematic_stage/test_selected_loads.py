@@ -49,6 +49,7 @@ def test_compliance_is_told_better_with_loads_than_without(chosen):
     assert np.all(np.array(record["sigma"]) <= 1.001 * np.array(record["prior"]))
 
 
+@pytest.mark.slow
 def test_each_load_is_attached_once(chosen):
     masses = chosen().loads.masses
     assert set(masses) <= {0.0, 2.5, 5.0} and len(set(masses)) > 1

@@ -186,6 +186,7 @@ def test_predicted_sigma_is_of_many_fits():
     assert not np.isfinite(predicted(seen, seen(q[:5]), typical).rms)
 
 
+@pytest.mark.slow
 def test_selection_tells_run_and_prediction(tmp_path):
     """A selection tells the run, the prediction and what seeing costs."""
     (tmp_path / "c.toml").write_text(CELL)
@@ -271,6 +272,7 @@ def test_hidden_poses_are_replaced_cheaply(index):
     assert found.words.startswith(f"poses {named[0]}, {named[1]} replaced")
 
 
+@pytest.mark.slow
 def test_pose_on_another_turn_is_kept():
     """The same pose on another turn is kept."""
     room, seen = walls(6.0), observation(targets_of(CHAIN))

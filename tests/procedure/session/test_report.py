@@ -240,6 +240,7 @@ def test_a_dollar_in_a_name_is_a_dollar(name: str) -> None:
     assert [(label.get_text(), label.get_parse_math()) for label in labels] == [(name, False)] * 2
 
 
+@pytest.mark.slow
 def test_paper_is_white_and_peaks_are_kept() -> None:
     one, two = (sheets.png(drawing.figure(geometry_figures.singular_values(np.ones(3), 3))) for _ in range(2))
     assert one == two, "drawn the same twice"

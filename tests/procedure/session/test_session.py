@@ -83,6 +83,7 @@ def test_changed_setting_makes_readers_stale(finished: Session) -> None:
     assert json.loads(finished.path("4-fit/metrics.json").read_text())["model"] == "offsets"
 
 
+@pytest.mark.slow
 def test_measured_plan_is_not_replaced(finished: Session) -> None:
     """A plan is not replaced once it was measured."""
     before = finished.path("2-poses/poses.csv").read_text()

@@ -35,6 +35,7 @@ def test_tool_runs_straight(chain):
     np.testing.assert_allclose(found.path(np.zeros(1))[0], start, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_redundancy_stays_near_the_start():
     """Of all postures with the tool at the end of the line none near by is nearer to the start."""
     start = WAYPOINTS[0] + 0.2
