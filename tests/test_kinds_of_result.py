@@ -160,6 +160,7 @@ def test_power_tells_payload(powered):
     assert abs(found.values[mass] - planted_motion.PAYLOAD[9]) < 4 * found.sigma[mass] < 0.2 * planted_motion.PAYLOAD[9]
 
 
+@pytest.mark.slow
 def test_power_model_is_a_result_like_others(powered, tmp_path):
     """A model of power is a result like others."""
     robot, model, folder = powered

@@ -225,6 +225,7 @@ def test_later_validation_equals_immediate(fitted, cell):
     assert "other.csv" in later.to_dict()["validation"] and "other.csv" not in fitted.to_dict()["validation"]
 
 
+@pytest.mark.slow
 def test_results_print_ladder_and_verdict(fitted, model):
     """Results print the ladder, the errors and the verdict."""
     shown = str(fitted)

@@ -55,7 +55,7 @@ def fitted(cell, block, *others, **more):
     return block, fit(start, [block, *others], candidates, **more)
 
 
-@pytest.mark.parametrize("mounting", [IN_HAND, TO_HAND])
+@pytest.mark.parametrize("mounting", [IN_HAND, pytest.param(TO_HAND, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "lens", [camera.FIVE_MEGAPIXEL, pytest.param(FISHEYE, marks=pytest.mark.slow)], ids=["pinhole", "fisheye"]
 )
@@ -265,6 +265,7 @@ def test_rows_shifted_by_one_are_said_to_be():
         complete_camera(cell.cell.nominal, mixed)
 
 
+@pytest.mark.slow
 def test_board_of_other_square_is_refused():
     """A board of another square is refused with its size."""
     cell, block = study()

@@ -73,6 +73,7 @@ def test_rigid_truth_shows_no_effect(robot, kind, count, seed):
     assert best.parameters == found.fit.identified == found.fit.split.rank
 
 
+@pytest.mark.slow
 def test_an_arm_that_is_its_nominal_stays_so():
     """The error of the fit is at most the noise that as many identifiable parameters take up."""
     truth = cell(load("ur5"), 1)
@@ -159,6 +160,7 @@ def test_any_rung_can_be_asked_for(model):
     assert found.rungs[-1].kept
 
 
+@pytest.mark.slow
 def test_what_is_fixed_stays_at_its_nominal():
     from calib.geometry.observation import layout
 

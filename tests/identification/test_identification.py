@@ -98,6 +98,7 @@ def test_gains_come_from_known_payload():
         identify_gains(data, {})
 
 
+@pytest.mark.slow
 def test_payload_of_unseen_motion_counts():
     """A payload that only unseen motion carries counts with its stated mass and centre."""
     loaded, errors = planted.case("b", 1, ("load",)), {}

@@ -54,6 +54,7 @@ def test_interval_holds_95_of_100_errors(outside):
     assert 0.93 < np.mean(shares) < 0.985
 
 
+@pytest.mark.slow
 def test_parameter_covariance_is_too_small():
     """The covariance of the parameters alone would be far too small."""
     found, model = learnt(1.0)

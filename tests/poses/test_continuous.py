@@ -119,7 +119,14 @@ def test_predicate_holds_against_gradient():
 
 
 @pytest.mark.parametrize(
-    "method", ["polish", "local", "multistart", "mlsl", pytest.param("tabu", marks=pytest.mark.slow)]
+    "method",
+    [
+        "polish",
+        "local",
+        pytest.param("multistart", marks=pytest.mark.slow),
+        "mlsl",
+        pytest.param("tabu", marks=pytest.mark.slow),
+    ],
 )
 def test_methods_repeat_and_beat_random(method):
     """Methods keep constraints, repeat by seed and beat random sets."""

@@ -94,6 +94,7 @@ def test_rank_updates_are_the_determinant():
     assert found == outside[gains.argmax()] and gain == pytest.approx(gains.max())
 
 
+@pytest.mark.slow
 def test_detmax_finds_the_best_of_all_sets():
     for seed in range(6):
         jacobians = np.random.default_rng(seed).normal(size=(11, 2, 4))

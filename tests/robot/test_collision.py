@@ -61,7 +61,7 @@ def test_distances_by_hand(balls):
     assert distances["one", "three"] == pytest.approx(np.hypot(1.5, 0.5) - 0.2)
 
 
-@pytest.mark.parametrize("arm", ["balls", "lwr4plus", "ur5"])
+@pytest.mark.parametrize("arm", ["balls", "lwr4plus", pytest.param("ur5", marks=pytest.mark.slow)])
 def test_gradients_follow_the_witness_points(arm, balls):
     box = Obstacle("box", "box", (0.3, 0.4, 0.5), pose(position=[0.5, 0.1, 0.4]))
     if arm == "balls":  # a continuous joint, a joint about -z

@@ -234,6 +234,7 @@ def from_home(folder: Path, date: str, seed: int) -> str:
     return str(path)
 
 
+@pytest.mark.slow
 def test_two_logs_from_the_same_rest_are_two_logs(identified: Path, tmp_path: Path):
     first, second = from_home(tmp_path, "2026-03-05", 13), from_home(tmp_path, "2026-03-06", 14)
     series = [np.load(path) for path in (first, second)]

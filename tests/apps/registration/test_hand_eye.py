@@ -123,7 +123,7 @@ def test_detector_poses_with_joints_are_read_as_their_inverse(tmp_path, capsys):
         (("vector", "rvec"), "{0}_{1}", 1.0),
         (("kuka", "matrix"), "{1}_{0}", 1.0),
         (("zyz", "vector"), "{0}.{1}", 1e3),
-        (("w first", "quaternion"), "{0}_{1}", 1e2),
+        pytest.param(("w first", "quaternion"), "{0}_{1}", 1e2, marks=pytest.mark.slow),
     ],
 )
 def test_conventions_and_units_are_found_by_what_agrees(tmp_path, forms, names, mm):
@@ -280,6 +280,7 @@ def test_rows_that_lag_are_named_with_the_first_of_them(tmp_path, lag, first):
     assert f"with the robot's poses {rows}" in str(fit)
 
 
+@pytest.mark.slow
 def test_mounting_that_nothing_says_is_asked_for(tmp_path):
     """Poses that agree as they are may be of a board on the arm, or of a camera in the board: it is asked."""
     path = table(tmp_path / "pairs.csv", *sampled(7, in_hand=False))
@@ -346,6 +347,7 @@ def test_pass_prints_no_error_above_the_tolerance(tmp_path):
     assert judged.verdict == "marginal" and "rms on the fitted poses, above the tolerance" in str(judged)
 
 
+@pytest.mark.slow
 def test_result_is_written_into_a_urdf(tmp_path, capsys):
     """The URDF with camera and board has both frames where the result says."""
     source = tmp_path / "arm.urdf"

@@ -115,6 +115,7 @@ def points_and_joints(session: Session, count: int = 16) -> tuple[bytes, bytes, 
     return "\n".join(points).encode("utf-16"), "\n".join(joints).encode(), q
 
 
+@pytest.mark.slow
 def test_joints_and_points_apart_are_joined_in_the_page(session: Session, client: TestClient) -> None:
     """Columns are asked for, the pairing is shown, and taken as the measurement of the step."""
     points, joints, q = points_and_joints(session)

@@ -84,6 +84,7 @@ def test_robust_estimates_get_a_note(name: str):
     np.testing.assert_allclose(test.found.stray, 0.5, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_loop_explaining_too_little_is_named():
     """0.8 of the reference's velocity, whose gains no tracking error tells: 4 for 2 %, and 6 for 0.8."""
     _, test = judged("iv", 1e-5, 0.05, share=0.8, timing="stated")

@@ -71,6 +71,7 @@ def test_an_identified_model_is_planned_with(room, capsys):
     assert not (room / "out" / "approach.csv").exists()
 
 
+@pytest.mark.slow
 def test_model_and_stated_drives_plan_alike(room):
     """Model and stated drives plan the same motion."""
     one = planning.plan("lwr4plus", room / "way.csv", model=room / "model")
@@ -100,6 +101,7 @@ def test_shapes(room):
     assert found["after"] <= found["before"] and found["evaluations"] >= 4
 
 
+@pytest.mark.slow
 def test_waypoints_of_the_tool(room, capsys):
     """Places are met exactly: with an orientation, without one, and in the configuration that joints beside it say."""
     poses = forward(CHAIN, WAYPOINTS)
@@ -196,6 +198,7 @@ def test_uncertain_model_keeps_torque_free(room, capsys):
     assert "the margin for torque uncertainty" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_payload_on_board_takes_longer(room):
     place = room / "model" / "dynamics.json"
     table = json.loads(place.read_text())

@@ -25,6 +25,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found.save(tmp_path_factory.mktemp("front") / "motion", plots=False)
 
 
+@pytest.mark.slow
 def test_each_row_has_its_motion(folder: Path) -> None:
     """Rows differ, each has a motion, and the designed one is that of the folder."""
     front = stored_front.read(folder)
@@ -36,6 +37,7 @@ def test_each_row_has_its_motion(folder: Path) -> None:
     np.testing.assert_allclose(q, designed, atol=0.05)
 
 
+@pytest.mark.slow
 def test_picked_motion_is_the_front_s(folder: Path) -> None:
     """Without a search the picked motion has the condition number of its row, and the front stays."""
     front = stored_front.read(folder)
@@ -50,6 +52,7 @@ def test_picked_motion_is_the_front_s(folder: Path) -> None:
     assert f"motion {number} of the {len(front.motions)} of the front" in str(picked)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "settings", "number", "message"),
     [

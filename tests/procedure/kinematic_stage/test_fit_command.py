@@ -93,6 +93,7 @@ def test_files_of_a_fit_hold_the_same_robot(cell, calib):
         assert np.isclose(np.sqrt(float(own[row["name"]])), float(row["sigma"]), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_residuals_are_those_of_the_metrics(cell, calib):
     rows = cell.measure(60)
     rows[7]["x"] += 0.01
@@ -110,6 +111,7 @@ def test_residuals_are_those_of_the_metrics(cell, calib):
     assert 9.0 < worst["size_mm"] < 11.0
 
 
+@pytest.mark.slow
 def test_holdout_is_end_of_the_permutation(cell, calib):
     """Holdout keeps the last share of the permutation."""
     file = cell.write("day1.csv", cell.measure(60))
@@ -336,6 +338,7 @@ def test_refitting_own_folder_is_no_failure(cell, calib):
     assert (code, "verdict: fail" in out) == (0, False)
 
 
+@pytest.mark.slow
 def test_tolerance_is_tested_on_unseen_rows(cell, calib):
     """A tolerance is held against unseen rows, and named."""
     file = cell.write("a.csv", cell.measure(60))

@@ -333,6 +333,7 @@ def test_encoder_counts_are_told_by_the_arm(arm, tmp_path, per_turn, zero):
         read_measurements(path, chain.joint_names)
 
 
+@pytest.mark.slow
 def test_counts_from_an_odd_zero_are_asked_for(arm, tmp_path):
     """Counts from a zero that no usual encoder has are asked for joint by joint, and read as stated."""
     chain, q, position, _ = arm

@@ -262,7 +262,10 @@ def test_common_factor_has_two_causes(cell, calib, factor, level):
         assert found[0].values["factor"] == pytest.approx(factor, abs=5e-4)
 
 
-@pytest.mark.parametrize("factor, told", [pytest.param(1.0, False, marks=pytest.mark.slow), (1.002, True)])
+@pytest.mark.parametrize(
+    "factor, told",
+    [pytest.param(1.0, False, marks=pytest.mark.slow), pytest.param(1.002, True, marks=pytest.mark.slow)],
+)
 def test_lengths_that_grow_alike_are_noted(cell, calib, factor, told):
     """0.2 % is hidden in the errors of joints here, so that one factor explains little of what the nominal leaves."""
     rows = cell.measure(COUNT)

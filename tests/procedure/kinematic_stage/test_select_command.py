@@ -42,6 +42,7 @@ def write_poses(path: str, count: int, seed: int) -> None:
     np.savetxt(path, q, delimiter=",", header=",".join(load("ur5").joint_names), comments="")
 
 
+@pytest.mark.slow
 def test_selection_is_near_the_bound(cell, calib, monkeypatch):
     """The selection is better than chance, and near the bound."""
     choose, selections = selection.choose, []

@@ -82,6 +82,7 @@ def test_right_masses_are_kept(tmp_path):
     assert "masses-scaled" not in codes(fit)
 
 
+@pytest.mark.slow
 def test_under_one_load_the_doubt_of_the_masses_remains(tmp_path):
     """One load tells the product of compliance and masses alone: the interval is that of the prior."""
     fit = fitted(tmp_path, 1.4, loads=(2.5,))

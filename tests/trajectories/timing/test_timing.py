@@ -86,6 +86,7 @@ def test_any_path_is_timed_at_a_limit(seed):
     assert np.isclose(checked.weights.sum(), found.duration)
 
 
+@pytest.mark.slow
 def test_faster_than_slowed_polynomials():
     """A quintic rest-to-rest law on the same path, slowed until it keeps the limits, takes longer."""
     path, bounds, law = spline(WAYPOINTS), limits(), lwr()
