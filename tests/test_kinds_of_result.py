@@ -245,7 +245,9 @@ def test_wrong_list_length_is_refused(given):
 
 
 @pytest.mark.parametrize("arm", [pytest.param("tx40", marks=pytest.mark.slow), "ur5"])
-@pytest.mark.parametrize("kind", ["position", *KINDS])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in ("bar", "plane"))) for kind in ("position", *KINDS)]
+)
 def test_computed_measurements_are_fitted(kind, arm):
     """Exact but for the rounding of a file: what they do not determine lies in valleys too narrow to follow."""
     cell = planted.cell(planted.perturb(load(arm), 1, 3e-4, 5e-4), 2)

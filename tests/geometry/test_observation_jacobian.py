@@ -132,7 +132,20 @@ def test_residual_slope_is_minus_jacobian(name, kind):
         assert [p.label for p in parts] == ["consistency", "distance"] and parts[1].value.shape[1] == 1
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-10, 1e-6, 5e-5, 2e-4, 1e-2, 1.0, 2.5, 3.1])
+@pytest.mark.parametrize(
+    "angle",
+    [
+        0.0,
+        pytest.param(1e-10, marks=pytest.mark.slow),
+        1e-6,
+        pytest.param(5e-5, marks=pytest.mark.slow),
+        2e-4,
+        pytest.param(1e-2, marks=pytest.mark.slow),
+        1.0,
+        pytest.param(2.5, marks=pytest.mark.slow),
+        3.1,
+    ],
+)
 def test_orientation_residuals_of_every_size(angle):
     """The slope stays right through the series at small angles and up to nearly half a turn."""
     truth = cell(load("ur5"), 4)

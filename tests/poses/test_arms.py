@@ -81,7 +81,7 @@ def test_far_local_search_stays_feasible(name, index, file):
 
 @pytest.mark.parametrize("name", [*ARMS, "motley"])
 @pytest.mark.parametrize("kind", ["pose", "position"])
-@pytest.mark.parametrize("reference", [False, True])
+@pytest.mark.parametrize("reference", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_derivative_product_is_exact(name, kind, reference):
     chain = motley() if name == "motley" else ARMS[name]()
     seen = observation(targets_of(chain, [(0.05, 0.02, 0.1), (0.0, -0.1, 0.02)]), kind, reference=reference)

@@ -263,7 +263,9 @@ def test_nothing_feasible_gives_the_share():
     assert (caught.value.found, caught.value.draws) == (0, 4096)
 
 
-@pytest.mark.parametrize("spare", [1, 2, 5, 40])
+@pytest.mark.parametrize(
+    "spare", [pytest.param(1, marks=pytest.mark.slow), 2, 5, pytest.param(40, marks=pytest.mark.slow)]
+)
 def test_bound_is_tight_with_few_candidates(spare):
     """The bound is tight with few candidates to spare."""
     few = ARM[: 17 + spare]
