@@ -214,6 +214,7 @@ def test_the_same_poses_are_chosen(fitted: Path, files: Path, tmp_path: Path) ->
     np.testing.assert_allclose(chosen, read_poses(out, names), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_same_robot_is_exported(fitted: Path, tmp_path: Path) -> None:
     out = tmp_path / "joint_offsets.csv"
     assert not command("export", fitted / "4-fit", "--offsets", out)

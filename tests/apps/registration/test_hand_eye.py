@@ -168,7 +168,13 @@ def opencv(path: Path, robot, seen, in_hand: bool):
 @pytest.mark.parametrize("in_hand", [pytest.param(True, marks=pytest.mark.slow), False])
 @pytest.mark.parametrize(
     ("write", "name"),
-    [(easy_handeye, "s.yaml"), (moveit, "s.yaml"), (opencv, "s.yml"), (opencv, "s.xml"), (opencv, "s.json")],
+    [
+        (easy_handeye, "s.yaml"),
+        (moveit, "s.yaml"),
+        (opencv, "s.yml"),
+        pytest.param(opencv, "s.xml", marks=pytest.mark.slow),
+        pytest.param(opencv, "s.json", marks=pytest.mark.slow),
+    ],
 )
 def test_files_of_other_tools(tmp_path, write, name, in_hand):
     """Samples of easy_handeye, MoveIt and OpenCV are read, also where the robot's poses are stored as their inverse."""

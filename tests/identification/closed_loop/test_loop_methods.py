@@ -249,7 +249,14 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize("log_as, loop, message", REFUSED, ids=[message for *_, message in REFUSED])
+# of those that are found in the options the first one quickly
+@pytest.mark.parametrize(
+    "log_as, loop, message",
+    [
+        pytest.param(*case, id=case[2], marks=[pytest.mark.slow] * (5 <= number <= 8))
+        for number, case in enumerate(REFUSED)
+    ],
+)
 def test_what_cannot_be_simulated_is_refused(robot, tmp_path, capsys, log_as, loop, message):
     if "short.csv" in loop:
         asked = motion(1)

@@ -192,6 +192,7 @@ def test_held_joint_columns_have_full_rank():
     assert np.linalg.cond(scaled[:, held.columns]) < 200
 
 
+@pytest.mark.slow
 def test_motion_in_a_log_is_read_by_identify(earlier, tmp_path, cell, calib):
     """A motion is recalled from a log, and read by identify."""
     reference = coefficients.read(earlier)

@@ -260,6 +260,7 @@ def test_deliverable_comes_first_everywhere(cell, calib, deliverable):
     assert f"{nominal:.3g} mm rms before, {judged:.3g} mm after" == histogram.panels[0].title
 
 
+@pytest.mark.slow
 def test_deflection_table_comes_back(cell, calib):
     """Deflections go out as a table with its formula, and come back."""
     file = cell.write("a.csv", cell.measure(90))

@@ -121,10 +121,7 @@ def test_every_form_is_read_with_some_separator():
 
 @pytest.mark.parametrize(
     ("name", "separator", "mark"),
-    [
-        pytest.param(*form, marks=[pytest.mark.slow] * (form[0] in DECIDED_BY_ARM and form[0] != "kuka"))
-        for form in READ
-    ],
+    [pytest.param(*form, marks=[pytest.mark.slow] * (form[0] in DECIDED_BY_ARM)) for form in READ],
 )
 def test_one_reading_is_taken_and_said(arm, tmp_path, name, separator, mark):
     chain, q, position, rotation = arm

@@ -62,6 +62,7 @@ def test_a_single_load_is_carried_in_all_poses(chosen):
     assert chosen(loads=(2.5,)).loads.masses.tolist() == [2.5] * 14
 
 
+@pytest.mark.slow
 def test_the_csv_states_the_load_of_each_pose_and_is_no_measurement(chosen, tmp_path):
     path = selection.write(chosen(), tmp_path / "poses.csv")
     with path.open(newline="") as file:

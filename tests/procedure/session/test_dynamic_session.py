@@ -87,6 +87,7 @@ def test_session_columns_have_units(whole: Session) -> None:
     assert seen > 100 and not list(whole.folder.glob("*/validation.csv"))
 
 
+@pytest.mark.slow
 def test_later_dynamics_keep_the_geometry(waiting: Session) -> None:
     """Dynamics asked for afterwards keep the geometry."""
     found = kinds(waiting)
@@ -96,6 +97,7 @@ def test_later_dynamics_keep_the_geometry(waiting: Session) -> None:
     assert not waiting.path("6-export").exists() and waiting.path("9-export/robot.urdf").exists()
 
 
+@pytest.mark.slow
 def test_two_lines_say_what_to_play_and_log(waiting: Session) -> None:
     """Two lines say what to play and what to log."""
     state = next(state for state in steps.states(waiting) if state.kind == steps.WAITING)
@@ -105,6 +107,7 @@ def test_two_lines_say_what_to_play_and_log(waiting: Session) -> None:
     assert "7-recorded/training_log.csv" in second and "q_joint1 [deg]" in second and "tau_joint7 [Nm]" in second
 
 
+@pytest.mark.slow
 def test_no_plan_means_no_designed_motion(waiting: Session) -> None:
     """Without a plan no motion is designed or presented."""
     shutil.rmtree(waiting.path("6-excitation"))
@@ -118,6 +121,7 @@ def test_no_plan_means_no_designed_motion(waiting: Session) -> None:
     assert "a different one for validation" in commands.asks(session, stopped)[0]
 
 
+@pytest.mark.slow
 def test_recorded_motion_survives_a_refit(waiting: Session) -> None:
     """A motion that was recorded stays when the geometry is fitted again."""
     for brought, kept in ((False, False), (True, True)):
@@ -220,6 +224,7 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
     return table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -267,6 +272,7 @@ def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], st
     assert kinds(recorded)["excite"] == steps.DONE and not recorded.path("8-dynamics/dynamics.json").exists()
 
 
+@pytest.mark.slow
 def test_loose_or_rare_playback_is_noted(recorded: Session) -> None:
     """A motion played too seldom and loosely is noted."""
     path, motion = recorded.path("7-recorded/training_log.csv"), designed_motions(recorded)["training"]
@@ -276,6 +282,7 @@ def test_loose_or_rare_playback_is_noted(recorded: Session) -> None:
     assert found.periods == 2 and [one.code for one in noted] == ["repetitions-missing", "tracking-loose"]
 
 
+@pytest.mark.slow
 def test_training_and_validation_stay_apart(recorded: Session) -> None:
     """The validation motion is not learnt from, and the training motion is no proof."""
     one, two = recorded.path("7-recorded/training_log.csv"), recorded.path("7-recorded/validation_log.csv")
@@ -284,6 +291,7 @@ def test_training_and_validation_stay_apart(recorded: Session) -> None:
         go_on(recorded)
 
 
+@pytest.mark.slow
 def test_recordings_keep_their_plan(recorded: Session) -> None:
     """Recordings keep the plan that they were made to."""
     before = recorded.path("6-excitation/training/trajectory.csv").read_text()

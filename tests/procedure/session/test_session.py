@@ -60,6 +60,7 @@ def test_fit_waits_for_validation(measured: Session) -> None:
     assert measured.path("4-fit/robot.toml").stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_measurement_makes_dependents_stale(finished: Session) -> None:
     """A changed measurement makes stale what rests on it."""
     path = finished.path("3-measured/measured.csv")
