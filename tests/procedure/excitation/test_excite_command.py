@@ -51,8 +51,8 @@ all = 12.0
 Fv = [14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6]
 Fc = [11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04]
 """
-QUICK = ("--starts", 1, "--evaluations", 30, "--period", 16, "--harmonics", 4, "--rate", 100, "--no-outlook")
-SHORT = ExcitationSettings(starts=1, evaluations=20, period=16.0, harmonics=4, rate=100.0, samples=120)
+QUICK = ("--starts", 1, "--evaluations", 60, "--period", 16, "--harmonics", 4, "--rate", 100, "--no-outlook")
+SHORT = ExcitationSettings(starts=1, evaluations=45, period=16.0, harmonics=4, rate=100.0, samples=120)
 
 
 @pytest.mark.slow

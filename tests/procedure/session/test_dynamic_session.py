@@ -28,7 +28,7 @@ from calib.robot.library import load_calibrated
 from calib.simulation.truth import torque_errors
 from calib.simulation.virtual_cells import virtual_cell
 
-QUICK = {"period": 6.0, "harmonics": 5, "starts": 1, "evaluations": 25, "repeats": 2, "rate": 250.0}
+QUICK = {"period": 6.0, "harmonics": 5, "starts": 1, "evaluations": 100, "repeats": 2, "rate": 250.0}
 
 
 @pytest.fixture(scope="module")
