@@ -153,6 +153,7 @@ def powered(tmp_path_factory):
     return robot, model, model.save(folder / "model")
 
 
+@pytest.mark.slow
 def test_power_tells_payload(powered):
     """The power of two recordings tells the payload."""
     found = powered[1].estimate

@@ -234,6 +234,7 @@ def test_results_print_ladder_and_verdict(fitted, model):
     assert set(fitted.plot()) >= {"position", "parameters"} and set(model.plot()) >= {"torque_1", "friction"}
 
 
+@pytest.mark.slow
 def test_notebook_shows_page_and_verdict(fitted, model):
     """A notebook shows the page, and a verdict equals its name."""
     for result in (fitted, model):

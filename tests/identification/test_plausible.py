@@ -484,6 +484,7 @@ def away(recording: Recording) -> Contradiction:
     return far
 
 
+@pytest.mark.slow
 def test_estimate_far_from_possible_fails() -> None:
     """An estimate far from every possible robot fails, and one with other friction is not remarked upon."""
     sound = away(recorded())

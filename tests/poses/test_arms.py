@@ -61,7 +61,7 @@ def starts(space: SearchSpace, count: int, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize(
     ("name", "index"),
     [
-        ("4 joints", "cond"),
+        pytest.param("4 joints", "cond", marks=pytest.mark.slow),
         pytest.param("6 joints", "O1", marks=pytest.mark.slow),
         pytest.param("4 joints", "O1", marks=pytest.mark.slow),
         pytest.param("6 joints", "cond", marks=pytest.mark.slow),

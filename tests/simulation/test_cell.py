@@ -71,6 +71,7 @@ def test_hidden_part_has_size_of_paper() -> None:
     assert 0.6 < np.median(errors) < 1.1  # paper, Table 3: 0.80 mm
 
 
+@pytest.mark.slow
 def test_stated_sigma_is_the_spread() -> None:
     """The stated sigma is the spread of repeated measurements."""
     bars = SimulatedInstrument(base_frame=np.eye(4), encoder_sigma=0.0)

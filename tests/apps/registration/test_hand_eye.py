@@ -94,6 +94,7 @@ def test_sigma_covers_the_errors(tmp_path, in_hand):
     assert 0.8 < np.sqrt(np.mean(np.square(scaled))) < 1.25
 
 
+@pytest.mark.slow
 def test_detector_poses_with_joints_are_read_as_their_inverse(tmp_path, capsys):
     """Poses of the board in a camera on the arm are read as their inverse, and weighed as they were measured."""
     arm = calib.load("ur5").chain

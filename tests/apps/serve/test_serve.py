@@ -235,6 +235,7 @@ def test_halves_are_told_by_columns_and_names(header: tuple[str, ...], stem: str
     assert split_logs.half_of(header, stem) == half
 
 
+@pytest.mark.slow
 def test_mistakes_in_files_are_shown_with_their_cure(session: Session, client: TestClient) -> None:
     """What cannot be read is no measurement; the page says why, and what to do."""
     names = ",".join(f"joint{k}" for k in range(1, 8))

@@ -215,6 +215,7 @@ def test_motion_in_a_log_is_read_by_identify(earlier, tmp_path, cell, calib):
     assert np.allclose(table.q, q[:1600], atol=1e-6) and table.kind == "torque"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "words"),
     [

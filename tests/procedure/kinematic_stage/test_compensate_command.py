@@ -219,6 +219,7 @@ def test_tool_in_numbers_is_the_flange_moved(cell, fitted, here, calib):
     assert np.abs(numbers(commands("a.csv"), Q) - numbers(commands("b.csv"), Q)).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_unreachable_stops_all_or_is_empty(cell, fitted, here, calib):
     """What is out of reach stops all, or is left empty."""
     q = drawn(cell, 3, 10)

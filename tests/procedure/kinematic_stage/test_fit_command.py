@@ -497,7 +497,11 @@ def test_self_explaining_file_proves_nothing(cell, calib) -> None:
 
 @pytest.mark.parametrize(
     ("count", "frames"),
-    [pytest.param(6, ["--refit-frames"], marks=pytest.mark.slow), (7, []), pytest.param(8, [], marks=pytest.mark.slow)],
+    [
+        pytest.param(6, ["--refit-frames"], marks=pytest.mark.slow),
+        pytest.param(7, [], marks=pytest.mark.slow),
+        pytest.param(8, [], marks=pytest.mark.slow),
+    ],
 )
 def test_unseen_poses_of_a_changed_arm_contradict_the_fit(cell, calib, count, frames) -> None:
     """Joint 3 moved by 4 mrad since the fit: few poses fail as many do, also where the placement is fitted to them."""

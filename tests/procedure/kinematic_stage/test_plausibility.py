@@ -220,7 +220,7 @@ def with_targets(rows: list[dict], change) -> None:
     ("change", "codes"),
     [
         pytest.param(lambda k, first, second: second, set(), marks=pytest.mark.slow),
-        (lambda k, first, second: first, {"target-copied"}),
+        pytest.param(lambda k, first, second: first, {"target-copied"}, marks=pytest.mark.slow),
         pytest.param(
             lambda k, first, second: first if k in (3, 9, 21) else second, {"target-copied"}, marks=pytest.mark.slow
         ),
@@ -295,6 +295,7 @@ def computed(cell) -> np.ndarray:
     return forward(cell.nominal, q)[:, :3, 3]
 
 
+@pytest.mark.slow
 def test_computed_positions_are_noted(cell, calib):
     rounding = 3e-7 * np.random.default_rng(0).normal(size=(COUNT, 3))
     rows = changed(cell, lambda _: computed(cell) + rounding)

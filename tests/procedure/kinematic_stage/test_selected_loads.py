@@ -115,6 +115,7 @@ def test_columns_of_compliance_are_derivatives_of_the_predicted_position():
         assert np.allclose(jacobian[:, :, first + column], slope, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_command_takes_loads_and_says_what_they_tell(folder, calib, cell):
     arguments = ("-m", "12", "--candidates", "40", "--without", "self-collision", "--no-plots", "--out", "p.csv")
     code, out, err = calib("select", str(folder / "weighed.urdf"), *arguments, "--loads", "0,5")
