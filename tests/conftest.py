@@ -11,8 +11,6 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-import compiling
-import loaded as processes
 import produced
 import pytest
 from hypothesis import HealthCheck, settings
@@ -64,6 +62,9 @@ def compiling_lock(config: pytest.Config) -> Path | None:
 def pytest_configure(config: pytest.Config) -> None:
     # two workers that want a kernel at the same time would both compile it, for up to ten seconds
     if lock := compiling_lock(config):
+        # it imports Numba, which the process that only starts the workers does not need
+        import compiling
+
         compiling.take_turns(lock)
     if config.getoption("findings") == "note":
         produced.note()
@@ -96,6 +97,9 @@ def pytest_collection_finish() -> None:
 @pytest.fixture(scope="session")
 def loaded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, set[str]]:
     """Return the modules that one process has loaded at each of its stages."""
+    # with what it simulates, for which the process that only starts the workers would wait
+    import loaded as processes
+
     return processes.stages(tmp_path_factory.mktemp("loaded"))
 
 

@@ -49,6 +49,7 @@ def test_call_has_one_thread_and_restores(found, when, threads):
     assert found[when] == threads
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"])
 def test_environment_variable_counts(name):
     """A variable of the environment that asks for threads counts."""
@@ -56,6 +57,7 @@ def test_environment_variable_counts(name):
     assert chosen["call"] == [3] and chosen["steps"] == [[3]] * 3
 
 
+@pytest.mark.slow
 def test_command_has_one_unless_told_more():
     """A command has one thread unless the environment says more."""
     assert python("-c", COMMAND, "formats") == "[1]"

@@ -74,6 +74,7 @@ def test_what_the_user_sets_counts(read_only: Path, monkeypatch: pytest.MonkeyPa
     assert not list(read_only.iterdir())
 
 
+@pytest.mark.slow
 def test_kernels_of_a_read_only_package_load(tmp_path: Path) -> None:
     """In a process of its own, with a copy of the package in which no cache can be made."""
     package = tmp_path / "calib"

@@ -23,7 +23,8 @@ from calib.identification import identify_options
 from calib.procedure.formats import SCHEMAS
 from calib.procedure.measuring.constraints_file import ConstraintsFile
 
-FEW = settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+FEW = settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
 LEAVES = st.one_of(
@@ -46,11 +47,8 @@ def places(table: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
         yield (*above, "kind of nothing")
 
 
-@pytest.mark.parametrize("kind", FILES)
-@FEW
-@given(data=st.data())
-def test_wrong_value_is_one_complaint_line(kind: str, data: st.DataObject) -> None:
-    """What is read, its JSON schema accepts, too: an editor shows no error where there is none."""
+def check_wrong_value(kind: str, data: st.DataObject) -> None:
+    """Check that a wrong value is one line of complaint, and what is read, accepted by the JSON schema, too."""
     base, read = FILES[kind]
     table = copy.deepcopy(base)
     *way, key = data.draw(st.sampled_from(list(places(base))))
@@ -65,6 +63,22 @@ def test_wrong_value_is_one_complaint_line(kind: str, data: st.DataObject) -> No
         return
     if kind in SCHEMAS and known_to_json(table):
         assert not list(validator(kind).iter_errors(table))
+
+
+@pytest.mark.parametrize("kind", FILES)
+@FEW
+@given(data=st.data())
+def test_wrong_value_is_one_complaint_line(kind: str, data: st.DataObject) -> None:
+    """What is read, its JSON schema accepts, too: an editor shows no error where there is none."""
+    check_wrong_value(kind, data)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", FILES)
+@MANY
+@given(data=st.data())
+def test_wrong_values_by_the_dozen(kind: str, data: st.DataObject) -> None:
+    check_wrong_value(kind, data)
 
 
 def known_to_json(value: Any) -> bool:

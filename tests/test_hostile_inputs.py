@@ -105,7 +105,9 @@ def refused_or_done(code: int, command: tuple[str, ...], room: Path, capsys: pyt
     assert code == 0 or after == before
 
 
-@pytest.mark.parametrize("name", HOSTILE)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "a gap of eleven days")) for name in HOSTILE]
+)
 def test_hostile_input_is_refused_or_read(name: str, room: Path, capsys) -> None:
     """A hostile input is refused in one line, or read."""
     spoil, command, code = HOSTILE[name]
@@ -113,6 +115,7 @@ def test_hostile_input_is_refused_or_read(name: str, room: Path, capsys) -> None
     refused_or_done(code, command, room, capsys)
 
 
+@pytest.mark.slow
 def test_session_damage_is_named(room: Path, capsys) -> None:
     """What is damaged in a session is named."""
     assert run("new", "cell", "--robot", "arm.urdf", "--instrument", "tracker", "--geometry-only") == 0

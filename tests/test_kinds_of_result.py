@@ -37,7 +37,9 @@ def truth():
     return planted.cell(planted.perturb(load("tx40"), 3, 5e-5, 1e-4), 1)
 
 
-@pytest.fixture(scope="module", params=KINDS)
+@pytest.fixture(
+    scope="module", params=[pytest.param(kind, marks=[pytest.mark.slow] * (kind != "sockets")) for kind in KINDS]
+)
 def pointless(request, truth, tmp_path_factory) -> tuple[str, Path]:
     """Folder of a fit by what measures no position."""
     out = tmp_path_factory.mktemp("pointless") / request.param
@@ -82,6 +84,7 @@ def test_certificate_names_what_was_measured(pointless):
     assert f"{words}, rms" in page and "position, rms" not in page
 
 
+@pytest.mark.slow
 def test_view_separates_rows_by_station(points, tmp_path):
     """View separates the rows of another station."""
     settings = calib.FitSettings(model="geometry", refit_frames=True)
@@ -94,6 +97,7 @@ def test_view_separates_rows_by_station(points, tmp_path):
     assert all(np.sqrt(np.mean(sizes**2)) < 10 * SIGMA for sizes in errors)
 
 
+@pytest.mark.slow
 def test_unestimated_arms_are_not_tested(points, tmp_path):
     """Calibrations that estimated nothing of the arm are not tested."""
     frames = calib.fit_geometry("tx40", points[0], calib.FitSettings(model="frames"))
@@ -105,6 +109,7 @@ def test_unestimated_arms_are_not_tested(points, tmp_path):
     assert "not tested" not in calib.diff(geometry, geometry).verdict.reason
 
 
+@pytest.mark.slow
 def test_fit_on_fit_knows_nominal_placement(points, fitted, tmp_path):
     """A fit on a fit knows where the nominal robot stands."""
     again = calib.fit_geometry(fitted, points[1], calib.FitSettings(model="geometry")).save(tmp_path / "b", plots=False)
@@ -115,6 +120,7 @@ def test_fit_on_fit_knows_nominal_placement(points, fitted, tmp_path):
         assert own == pytest.approx(other, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_compliance_takes_masses_from_folder(truth, tmp_path):
     """A compliance takes its masses from its folder."""
     stiff = load("lwr4plus")
@@ -147,6 +153,7 @@ def powered(tmp_path_factory):
     return robot, model, model.save(folder / "model")
 
 
+@pytest.mark.slow
 def test_power_tells_payload(powered):
     """The power of two recordings tells the payload."""
     found = powered[1].estimate
@@ -154,6 +161,7 @@ def test_power_tells_payload(powered):
     assert abs(found.values[mass] - planted_motion.PAYLOAD[9]) < 4 * found.sigma[mass] < 0.2 * planted_motion.PAYLOAD[9]
 
 
+@pytest.mark.slow
 def test_power_model_is_a_result_like_others(powered, tmp_path):
     """A model of power is a result like others."""
     robot, model, folder = powered
@@ -168,6 +176,7 @@ def test_power_model_is_a_result_like_others(powered, tmp_path):
         calib.design_excitation(robot, calib.ExcitationSettings(period=4.0, starts=1), after=folder)
 
 
+@pytest.mark.slow
 def test_friction_step_without_terms_is_said(tmp_path):
     """A friction step without terms is said."""
     robot = description.write(tmp_path / "planted.toml", planted_motion.arm())
@@ -201,6 +210,7 @@ def test_motion_programs_go_where_asked(tmp_path, capsys):
     assert "give a list of poses, a program, or the folder of a motion" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_parallel_fit_has_pages_of_arm_fits(tmp_path):
     """A parallel fit has the pages and figures of an arm's fit."""
     robot, rng = find("fivebar"), np.random.default_rng(0)
@@ -235,8 +245,10 @@ def test_wrong_list_length_is_refused(given):
         parse(_Table, {"sigmas": given}, "t.toml")
 
 
-@pytest.mark.parametrize("arm", ["tx40", "ur5"])
-@pytest.mark.parametrize("kind", ["position", *KINDS])
+@pytest.mark.parametrize("arm", [pytest.param("tx40", marks=pytest.mark.slow), "ur5"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in ("bar", "plane"))) for kind in ("position", *KINDS)]
+)
 def test_computed_measurements_are_fitted(kind, arm):
     """Exact but for the rounding of a file: what they do not determine lies in valleys too narrow to follow."""
     cell = planted.cell(planted.perturb(load(arm), 1, 3e-4, 5e-4), 2)

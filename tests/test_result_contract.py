@@ -95,6 +95,21 @@ VERBS = (
     *("view", "certificate", "export", "diff", "log", "fleet", "status", "next", "run", "redo", "drift"),
     *("deliver", "compensate", "recall", "program", "identify", "select", "plan", "fit"),
 )
+# Verbs that compute for long, with kinds of which they read the robot alone: quickly it is that of a fit.
+LONG_VERBS = {"fit", "select", "plan"}
+REPEATED_KINDS = {"frames", "placement", "export"}
+SLOWLY = {(verb, kind) for verb in LONG_VERBS for kind in REPEATED_KINDS}
+
+
+def kinds(*verbs: str) -> list:
+    """Return the kinds, each with every verb; those of parallel robots, and `SLOWLY`, are slow."""
+    cases = []
+    for kind in WORKS:
+        for verb in verbs or ("",):
+            slow = kind.startswith("parallel") or (verb, kind) in SLOWLY
+            values = (verb, kind) if verb else (kind,)
+            cases.append(pytest.param(*values, marks=[pytest.mark.slow] * slow))
+    return cases
 
 
 def command(verb: str, folder: Path, files: Path, out: Path) -> list[str]:
@@ -138,9 +153,22 @@ def results(tmp_path_factory) -> Path:
     (root / "limits.toml").write_text(LIMITS)
     (root / "empty").mkdir()
     _write_arm_results(root)
-    _write_parallel_results(root)
     _write_reports(root)
     return root
+
+
+@pytest.fixture(scope="module")
+def parallel_results(results: Path) -> Path:
+    """The same folder, with results of a parallel robot."""
+    _write_parallel_results(results)
+    return results
+
+
+@pytest.fixture
+def folder(kind: str, request: pytest.FixtureRequest) -> Path:
+    """The result of a kind."""
+    written = "parallel_results" if kind.startswith("parallel") else "results"
+    return request.getfixturevalue(written) / kind
 
 
 def _write_arm_results(root: Path) -> None:
@@ -198,7 +226,9 @@ def _write_parallel_results(root: Path) -> None:
     q = true.place(x).q[:, robot.chain.actuated] + 1e-5 * rng.normal(size=(20, 2))
     with (root / "parallel.csv").open("w", newline="") as file:
         csv.writer(file).writerows([["motor_left", "motor_right", "x [mm]", "y [mm]"], *np.hstack([q, 1e3 * x])])
-    calib.fit_geometry("fivebar", root / "parallel.csv").save(root / "parallel fit", plots=False)
+    calib.fit_geometry("fivebar", root / "parallel.csv", calib.FitSettings(holdout=0.25)).save(
+        root / "parallel fit", plots=False
+    )
     search = calib.ExcitationSettings(period=4.0, harmonics=2, rate=250.0, starts=1, evaluations=3, outlook=False)
     motion = calib.design_excitation("fivebar", search)
     motion.save(root / "parallel excitation", plots=False)
@@ -232,10 +262,8 @@ def _run(*arguments: object) -> None:
     assert cli.run([str(argument) for argument in arguments]) == 0
 
 
-@pytest.mark.parametrize("kind", WORKS)
-@pytest.mark.parametrize("verb", VERBS)
-def test_a_verb_works_or_says_what_it_takes(kind, verb, results, tmp_path, capsys):
-    folder = results / kind
+@pytest.mark.parametrize(("verb", "kind"), kinds(*VERBS))
+def test_a_verb_works_or_says_what_it_takes(verb, kind, folder, results, tmp_path, capsys):
     code = cli.run(command(verb, folder, results, tmp_path))
     printed = capsys.readouterr()
     if verb in WORKS[kind]:
@@ -256,9 +284,9 @@ def test_a_verb_works_or_says_what_it_takes(kind, verb, results, tmp_path, capsy
     assert any(noun in said for noun in nouns[: 1 + kind.startswith("parallel")])
 
 
-@pytest.mark.parametrize("kind", [kind for kind in WORKS if kind != "empty"])
-def test_a_stored_result_keeps_the_protocol(kind, results, tmp_path):
-    stored = open_result(results / kind)
+@pytest.mark.parametrize("kind", [case for case in kinds() if case.values != ("empty",)])
+def test_a_stored_result_keeps_the_protocol(kind, folder, tmp_path):
+    stored = open_result(folder)
     assert isinstance(stored, calib.Result)
     assert stored.kind.name == NAMES.get(kind, kind)
     assert stored.verdict.level in LEVELS and stored.verdict.reason
@@ -282,10 +310,10 @@ def test_delivery_states_verdict_of_result(kind, results, capsys):
     assert f"verdict {open_result(results / kind).verdict.level}: " in capsys.readouterr().out
 
 
-def test_each_kind_is_recognised(results):
-    for name in WORKS:
-        kind = kind_of(results / name)
-        assert (kind.name if kind else None) == NAMES.get(name, name)
+@pytest.mark.parametrize("kind", kinds())
+def test_each_kind_is_recognised(kind, folder):
+    recognised = kind_of(folder)
+    assert (recognised.name if recognised else None) == NAMES.get(kind, kind)
 
 
 def test_classes_are_of_kinds_that_exist():

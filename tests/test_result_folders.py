@@ -171,7 +171,7 @@ def test_an_error_of_a_library_that_lost_ctrl_c_is_an_interruption(tmp_path: Pat
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows ends a process without a signal")
-@pytest.mark.parametrize("lost_exits", [0, 2])
+@pytest.mark.parametrize("lost_exits", [0, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_terminated_command_leaves_no_staged_folder(tmp_path: Path, lost_exits: int) -> None:
     """Not even where a library loses the exit that the signal raised in its callback."""
     program = WRITING.format(lost_exits=lost_exits)

@@ -295,6 +295,7 @@ def test_second_signal_hides_worker_output(tmp_path: Path) -> None:
     assert running.returncode != 0
 
 
+@pytest.mark.slow
 def test_no_process_outlives_its_parent(tmp_path: Path) -> None:
     running = script(tmp_path)
     pids = pids_in(tmp_path)

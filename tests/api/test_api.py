@@ -112,6 +112,7 @@ def test_numpy_scalars_and_arrays_accepted():
     assert calib.SelectionSettings(tools=tool, seconds=2).tools == ((0.1, 0.0, 0.0),)  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_a_data_frame_is_refused_by_its_name():
     frame = pytest.importorskip("pandas").DataFrame({"q1": [0.0]})
     with pytest.raises(UsageError, match=r"measured: .*found a DataFrame: write it"):
@@ -157,6 +158,7 @@ def test_a_fit_is_what_the_command_writes(fitted, cell, tmp_path, capsys):
     assert all(line.strip() in " ".join(said.split()) for line in [f"verdict: {fitted.verdict.level}"])
 
 
+@pytest.mark.slow
 def test_measurements_and_robots_in_memory(fitted, cell):
     """Measurements and robots in memory give what their files give."""
     robot = calib.load("ur5")
@@ -182,6 +184,7 @@ def test_measurements_in_memory_are_checked(fitted, cell):
             calib.fit_geometry("ur5", [wrong, cell / "other.csv"], fitted.settings)
 
 
+@pytest.mark.slow
 def test_readers_results_stand_among_files(fitted, cell):
     """What readers return may stand among files."""
     both = [calib.read_poses(cell / "measured.csv", "ur5"), cell / "other.csv"]
@@ -212,6 +215,7 @@ def test_impossible_time_in_memory_is_told(logs, stamps, words):
         calib.identify_dynamics(logs / "robot.toml", replace(given, t=stamps(np.array(given.t))))
 
 
+@pytest.mark.slow
 def test_later_validation_equals_immediate(fitted, cell):
     """Validation afterwards is validation at once."""
     robot, other = "ur5", cell / "other.csv"
@@ -221,6 +225,7 @@ def test_later_validation_equals_immediate(fitted, cell):
     assert "other.csv" in later.to_dict()["validation"] and "other.csv" not in fitted.to_dict()["validation"]
 
 
+@pytest.mark.slow
 def test_results_print_ladder_and_verdict(fitted, model):
     """Results print the ladder, the errors and the verdict."""
     shown = str(fitted)
@@ -229,6 +234,7 @@ def test_results_print_ladder_and_verdict(fitted, model):
     assert set(fitted.plot()) >= {"position", "parameters"} and set(model.plot()) >= {"torque_1", "friction"}
 
 
+@pytest.mark.slow
 def test_notebook_shows_page_and_verdict(fitted, model):
     """A notebook shows the page, and a verdict equals its name."""
     for result in (fitted, model):
@@ -306,6 +312,7 @@ def test_designed_motion_is_sampled_exactly(tmp_path):
     assert np.allclose(np.gradient(fine[1], fine[0], axis=0)[1:-1], fine[2][1:-1], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_geometry_noise_reaches_the_dynamics(logs):
     """Σ = Σ_torque + S Σ_geometry Sᵀ, without a file between fit and identification."""
     chain = description.read(logs / "robot.toml")
@@ -319,6 +326,7 @@ def test_geometry_noise_reaches_the_dynamics(logs):
     assert (unsure.estimate.sigma > 1.01 * exact.estimate.sigma).any()
 
 
+@pytest.mark.slow
 def test_recordings_in_memory_and_validation(model, logs):
     """Recordings in memory are taken, and validation may come later."""
     robot = calib.load(logs / "robot.toml")
@@ -339,6 +347,7 @@ def test_torques_have_sigmas(model):
     assert (np.median(fast, axis=0) > np.median(own, axis=0)).all()
 
 
+@pytest.mark.slow
 def test_export_and_compensation_in_memory(fitted, model, cell, logs, tmp_path, monkeypatch):
     """Export and compensation take results in memory."""
     written = calib.export(fitted, tmp_path / "geometry")
@@ -359,6 +368,7 @@ def test_export_and_compensation_in_memory(fitted, model, cell, logs, tmp_path, 
     assert commands.save(tmp_path / "commands.csv").is_file()
 
 
+@pytest.mark.slow
 def test_session_in_python_is_the_commands(logs, tmp_path, monkeypatch, capsys):
     """A session in Python is the command's session."""
     monkeypatch.chdir(tmp_path)

@@ -15,6 +15,7 @@ OFFSETS = calib.FitSettings(model="offsets")
 Q = np.random.default_rng(0).uniform(-2.0, 2.0, (60, 6))
 
 
+@pytest.mark.slow
 def test_fit_of_arrays_restores_their_robot():
     """A fit of arrays brings back the robot that made them."""
     robot = calib.load("ur5")
@@ -107,6 +108,7 @@ def test_constraints_and_poses_are_values(tmp_path):
         np.testing.assert_array_equal(q, by_file)
 
 
+@pytest.mark.slow
 def test_notebook_shows_progress_in_one_line(monkeypatch):
     """A notebook shows progress in one line."""
     said = []

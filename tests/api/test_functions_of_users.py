@@ -27,6 +27,7 @@ def chosen(robot, candidates) -> calib.PoseSelection:
     return calib.select_poses(robot, 12, candidates=candidates)
 
 
+@pytest.mark.slow
 def test_poses_are_chosen_of_the_candidates_given(robot, candidates, chosen, tmp_path: Path):
     """Of an array, a function and a file; those that break the constraints are left out, and said."""
     np.testing.assert_allclose(candidates[chosen.selection.indices], chosen.q, atol=1e-12)
@@ -66,6 +67,7 @@ def soft_l1(z: np.ndarray) -> np.ndarray:
     return np.array([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3])
 
 
+@pytest.mark.slow
 def test_a_loss_of_scipy_withstands_gross_rows(robot):
     """Three rows off by 35 mm; the result names the loss, and can be judged on further rows."""
     rng = np.random.default_rng(2)

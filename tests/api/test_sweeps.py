@@ -43,6 +43,7 @@ def test_a_grid_gives_a_row_for_each_combination():
     assert table["findings.cross_validated"][3] == pytest.approx(fit.selection.cross_validated, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_runs_have_figures_of_ones_own_and_errors_in_a_column():
     """A run that fails does not end the sweep."""
     few = ARM.measure(ARM.postures(2))

@@ -88,6 +88,7 @@ def test_ragged_rows_keep_their_numbers(write):
     assert error.value.row == 40_003
 
 
+@pytest.mark.slow
 def test_damaged_cells_told_over_all_columns(write):
     """Damaged cells are told over all columns from the first row."""
     rows = [["1", "2", "3"] for _ in range(45_000)]

@@ -72,7 +72,10 @@ def test_a_short_recording_is_used_whole(recording):
     assert notes == []
 
 
-@pytest.mark.parametrize("save", [np.savez, np.savez_compressed, "csv"])
+@pytest.mark.parametrize(
+    "save",
+    [np.savez, pytest.param(np.savez_compressed, marks=pytest.mark.slow), pytest.param("csv", marks=pytest.mark.slow)],
+)
 def test_files_share_their_pieces(recording, save, tmp_path):
     """Every file is read in the same pieces."""
     if save == "csv":
@@ -95,6 +98,7 @@ def test_a_cut_is_taken_before_the_pieces(recording, tmp_path):
     assert len(found) == 20_000 and found.t[0] >= 600.0 and 1180.0 < found.t[-1] < 1200.0
 
 
+@pytest.mark.slow
 def test_pieces_become_silent_segments(recording):
     """Pieces become segments without a line each."""
     used = in_pieces(recording, 20_000)
@@ -108,6 +112,7 @@ def test_pieces_become_silent_segments(recording):
     assert motion.decimator.factor == whole.decimator.factor
 
 
+@pytest.mark.slow
 def test_motion_at_the_end_alone_counts(recording):
     """Motion that fills only the end of a recording counts."""
     slow = 0.01 * np.sin(2 * np.pi * 0.05 * recording.t)[:, None]

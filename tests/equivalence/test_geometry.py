@@ -152,6 +152,7 @@ def test_corrections_stay_as_the_nominal(files: Path, tmp_path: Path) -> None:
     assert nominal < 1.5 * calibrated  # it is calibrated already
 
 
+@pytest.mark.slow
 def test_odd_file_names_are_allowed(files: Path, tmp_path: Path) -> None:
     """A file's name may hold commas, quotes and line breaks."""
     robot, fit, unseen = named_oddly(files, tmp_path)
@@ -201,6 +202,7 @@ def test_promise_of_poses_is_checked(fitted: Path, tmp_path: Path) -> None:
     assert "not found" in command(*words, "--selection", tmp_path / "nothing.csv")
 
 
+@pytest.mark.slow
 def test_the_same_poses_are_chosen(fitted: Path, files: Path, tmp_path: Path) -> None:
     out, session = tmp_path / "poses.csv", open_session(shutil.copytree(fitted, tmp_path / "cell"))
     planned(session)
@@ -212,6 +214,7 @@ def test_the_same_poses_are_chosen(fitted: Path, files: Path, tmp_path: Path) ->
     np.testing.assert_allclose(chosen, read_poses(out, names), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_same_robot_is_exported(fitted: Path, tmp_path: Path) -> None:
     out = tmp_path / "joint_offsets.csv"
     assert not command("export", fitted / "4-fit", "--offsets", out)

@@ -53,6 +53,7 @@ def test_rsd_rule_alone_drops_a_certain_one():
     assert both.steps == () and both.refused is not None and both.refused.p < 1e-6
 
 
+@pytest.mark.slow
 def test_f_rule_keeps_zeros_at_stated_rate():
     """The F rule keeps each zero with its stated probability."""
     kept = np.zeros(5)

@@ -26,6 +26,7 @@ def fit_decay(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
     return found.state, covariance(found.factor), found.cost / 57
 
 
+@pytest.mark.slow
 def test_normalised_errors_are_chi_squared():
     """Normalised errors over many seeds are chi squared."""
     sizes, variances = [], []

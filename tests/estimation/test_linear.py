@@ -49,6 +49,7 @@ def test_group_sigmas_reproduce_themselves():
     assert fit.estimate.residual_std == pytest.approx(1.0, abs=1e-5)
 
 
+@pytest.mark.slow
 def test_settled_sigmas_are_unbiased():
     """Settled standard deviations are unbiased where parameters are many."""
     found = []
@@ -74,6 +75,7 @@ def test_covariance_is_true_over_data_sets(estimate, std):
     assert np.mean(sizes) == pytest.approx(5.0, abs=4 * np.sqrt(10 / 300) + 0.25)  # F(5, 115) has mean 5.09
 
 
+@pytest.mark.slow
 def test_wls_beats_ols_by_theoretical_share():
     """WLS beats OLS on unlike groups by what theory says."""
 

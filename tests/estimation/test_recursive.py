@@ -56,7 +56,9 @@ def test_a_step_adds_its_variance():
     np.testing.assert_array_equal(widened(state.factors[0], np.zeros(P)), state.factors[0])
 
 
-@pytest.mark.parametrize("rate", [0.0, 0.03, 0.1])
+@pytest.mark.parametrize(
+    "rate", [pytest.param(0.0, marks=pytest.mark.slow), 0.03, pytest.param(0.1, marks=pytest.mark.slow)]
+)
 def test_the_rate_of_drift_is_estimated_and_sigmas_hold(rate: float):
     relative_errors = []
     found = []

@@ -85,6 +85,7 @@ def only(block: Positions) -> Finding:
     return found
 
 
+@pytest.mark.slow
 def test_motion_is_stated_beside_its_noise(tmp_path):
     """Motion of 1 mm is found in all series; a still base is taken for one that moves in hardly any."""
     codes = [only(measured(tmp_path, 1e-3, seed)).code for seed in range(8)]
@@ -149,6 +150,7 @@ def test_no_base_frame_no_finding(tmp_path):
     assert not base_motion([measured(tmp_path, 1e-3, 0, "ignored")])
 
 
+@pytest.mark.slow
 def test_predicted_sigma_counts_both_frames(tmp_path):
     """Errors from the base frame at unseen poses are as large as the pose plan predicts."""
     q = study_poses(40, 5)

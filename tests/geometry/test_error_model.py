@@ -61,6 +61,7 @@ def test_parameter_covariance_is_too_small(found):
     assert np.mean(errors(cell, [block]).main < model.discrepancy.radius * alone) < 0.8
 
 
+@pytest.mark.slow
 def test_uneven_error_of_joint_is_expected():
     """One interval for all poses, of 1.0 mm, held 77 % at that end and 100 % elsewhere, where the rms error is 0.24."""
 

@@ -84,7 +84,7 @@ def weighed_alike(found, judge) -> float:
 
 
 @pytest.mark.parametrize("seeds", [[0], pytest.param([1, 2], marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", ["pose", "position", "sockets"])
+@pytest.mark.parametrize("kind", [pytest.param("pose", marks=pytest.mark.slow), "position", "sockets"])
 def test_guess_leads_to_best_of_many_starts(kind, seeds):
     """With arm errors of millimetres the guess leads to the best of many random starts."""
     for seed in seeds:
@@ -107,7 +107,7 @@ def test_guess_leads_to_best_of_many_starts(kind, seeds):
 
 
 @pytest.mark.parametrize("kind", ["pose", "position"])
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2, 3))])
 def test_robust_loss_ignores_outliers(kind, seed):
     """A fifth of outliers does not matter with a robust loss."""
     nominal, truth, _ = arm_off(seed)

@@ -41,6 +41,7 @@ def test_plain_reference_recovers_arms(text: str):
     assert rms_mm(error) <= 1e3 * LIMIT * CONDITIONS.noise
 
 
+@pytest.mark.slow
 @given(text=arms())
 @settings(max_examples=5)
 def test_the_plain_references_jacobian(text: str):

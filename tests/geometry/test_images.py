@@ -55,7 +55,7 @@ def fitted(cell, block, *others, **more):
     return block, fit(start, [block, *others], candidates, **more)
 
 
-@pytest.mark.parametrize("mounting", [IN_HAND, TO_HAND])
+@pytest.mark.parametrize("mounting", [IN_HAND, pytest.param(TO_HAND, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "lens", [camera.FIVE_MEGAPIXEL, pytest.param(FISHEYE, marks=pytest.mark.slow)], ids=["pinhole", "fisheye"]
 )
@@ -85,6 +85,7 @@ def test_residual_slope_is_minus_jacobian(mounting, lens):
     assert residual @ residual == pytest.approx(values @ values, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_whitening_is_of_full_covariance():
     """Rᵀ R of the reduced rows equals Jᵀ (f² σ² I + G S Gᵀ)⁻¹ J over all corners of an image."""
     cell, block = study(count=6)
@@ -173,6 +174,7 @@ def test_two_cameras_see_one_board():
     assert position_errors(cell.cell, own, found.cell.chain)[2] < 0.03
 
 
+@pytest.mark.slow
 def test_worse_corners_are_said():
     """Corners that are detected worse than stated are said."""
     cell, block = study()
@@ -210,6 +212,7 @@ def test_bad_corners_and_images_are_named():
     assert position_errors(cell.cell, found.cell, found.cell.chain)[1] < 0.08
 
 
+@pytest.mark.slow
 def test_gross_corners_and_images_left_out():
     """Without a robust loss, too: one corner that is another one's, images turned by a program, joints exchanged."""
     cell, block = study()
@@ -250,6 +253,7 @@ def test_noise_of_images_settles(seed):
     assert position_errors(cell.cell, found.cell, found.cell.chain)[2] < 0.08
 
 
+@pytest.mark.slow
 def test_rows_shifted_by_one_are_said_to_be():
     cell, block = study()
     block = replace(block, lens=cell.lens)
@@ -261,6 +265,7 @@ def test_rows_shifted_by_one_are_said_to_be():
         complete_camera(cell.cell.nominal, mixed)
 
 
+@pytest.mark.slow
 def test_board_of_other_square_is_refused():
     """A board of another square is refused with its size."""
     cell, block = study()
@@ -269,6 +274,7 @@ def test_board_of_other_square_is_refused():
         complete_camera(cell.cell.nominal, wrong)
 
 
+@pytest.mark.slow
 def test_one_direction_hides_focal_length():
     """Images from one direction do not tell the focal length."""
     cell, _ = study()

@@ -28,7 +28,15 @@ def fitted(wide: float, seed: int, rows: int = 60):
     return fit(start, [block], layout(start).rigid_index), start, truth
 
 
-@pytest.mark.parametrize("wide", [0.25, 0.5, 1.0, 3.0])
+@pytest.mark.parametrize(
+    "wide",
+    [
+        0.25,
+        pytest.param(0.5, marks=pytest.mark.slow),
+        pytest.param(1.0, marks=pytest.mark.slow),
+        pytest.param(3.0, marks=pytest.mark.slow),
+    ],
+)
 def test_sigma_over_range_is_the_error(wide):
     """Rms over seeds: one arm's error varies."""
     q = random_joints(load("ur5"), 300, 1)

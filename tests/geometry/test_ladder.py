@@ -52,7 +52,11 @@ def unseen(found, truth: Installation, known: bool) -> float:
 
 @pytest.mark.parametrize(
     "robot, kind, count",
-    [("ur5", "position", 150), ("lwr4plus", "pose", 120), pytest.param("ur5", "pose", 600, marks=pytest.mark.slow)],
+    [
+        ("ur5", "position", 150),
+        pytest.param("lwr4plus", "pose", 120, marks=pytest.mark.slow),
+        pytest.param("ur5", "pose", 600, marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_rigid_truth_shows_no_effect(robot, kind, count, seed):
@@ -69,6 +73,7 @@ def test_rigid_truth_shows_no_effect(robot, kind, count, seed):
     assert best.parameters == found.fit.identified == found.fit.split.rank
 
 
+@pytest.mark.slow
 def test_an_arm_that_is_its_nominal_stays_so():
     """The error of the fit is at most the noise that as many identifiable parameters take up."""
     truth = cell(load("ur5"), 1)
@@ -77,6 +82,7 @@ def test_an_arm_that_is_its_nominal_stays_so():
     assert unseen(found.fit, truth, False) < 1.3 * SIGMA * np.sqrt(found.fit.identified / 150)
 
 
+@pytest.mark.slow
 def test_offsets_cost_no_more_than_geometry():
     """Where only the offsets are wrong the full geometry finds that, to its noise."""
     nominal = load("ur5")
@@ -90,7 +96,7 @@ def test_offsets_cost_no_more_than_geometry():
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("known", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_planted_compliance_is_found(seed, known):
     """With gravity torques as compliances, near the planted ones; without, as moments fitted with the geometry."""
     truth, nominal = sagging(seed), load("lwr4plus")
@@ -121,6 +127,7 @@ def climbed(seed: int) -> tuple:
     return climb(load("ur5"), measured), climb(load("ur5"), measured, "geometry")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_planted_harmonics_are_found(seed):
     truth, nominal = wavy(seed), load("ur5")
@@ -134,6 +141,7 @@ def test_planted_harmonics_are_found(seed):
     assert fitted[f"theta1 sin 11 {joints[0]}"] == pytest.approx(2e-4, rel=0.25)
 
 
+@pytest.mark.slow
 def test_last_kept_rung_is_chosen():
     """The last rung kept is the one chosen, and each kept rung is better."""
     found, _ = climbed(0)
@@ -152,6 +160,7 @@ def test_any_rung_can_be_asked_for(model):
     assert found.rungs[-1].kept
 
 
+@pytest.mark.slow
 def test_what_is_fixed_stays_at_its_nominal():
     from calib.geometry.observation import layout
 

@@ -65,7 +65,7 @@ def test_pieces_and_warm_start_agree(kind, loss, sigmas, monkeypatch):
     assert pair_errors(whole.fit.cell, [measured]) == pytest.approx(pairs, rel=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["position", "pose"])
+@pytest.mark.parametrize("kind", ["position", pytest.param("pose", marks=pytest.mark.slow)])
 def test_elementwise_statistics_match_rows(kind, monkeypatch):
     """Beside frames and lengths: harmonics of three joints, more than `MANY` corrections of two of them."""
     arm, offered = load("ur5"), EFFECTS["harmonics"](load("ur5"), False)

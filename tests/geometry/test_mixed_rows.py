@@ -125,6 +125,7 @@ def test_positions_in_another_frame_from_a_row_on_are_named():
     assert parted_set_up(load("ur5"), replace(moved, position=block.position)) == []
 
 
+@pytest.mark.slow
 def test_a_fit_names_rows_in_another_unit():
     """A fit of positions whose later rows are in mm, read as m, says so and fails."""
     block = poses()

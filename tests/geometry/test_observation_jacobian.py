@@ -132,7 +132,20 @@ def test_residual_slope_is_minus_jacobian(name, kind):
         assert [p.label for p in parts] == ["consistency", "distance"] and parts[1].value.shape[1] == 1
 
 
-@pytest.mark.parametrize("angle", [0.0, 1e-10, 1e-6, 5e-5, 2e-4, 1e-2, 1.0, 2.5, 3.1])
+@pytest.mark.parametrize(
+    "angle",
+    [
+        0.0,
+        pytest.param(1e-10, marks=pytest.mark.slow),
+        1e-6,
+        pytest.param(5e-5, marks=pytest.mark.slow),
+        2e-4,
+        pytest.param(1e-2, marks=pytest.mark.slow),
+        1.0,
+        pytest.param(2.5, marks=pytest.mark.slow),
+        3.1,
+    ],
+)
 def test_orientation_residuals_of_every_size(angle):
     """The slope stays right through the series at small angles and up to nearly half a turn."""
     truth = cell(load("ur5"), 4)
@@ -147,7 +160,7 @@ def test_orientation_residuals_of_every_size(angle):
 
 
 @pytest.mark.parametrize("kind", ["plane", "bar", "sockets", "distance"])
-@pytest.mark.parametrize("size", [1e-4, 1e-2])
+@pytest.mark.parametrize("size", [pytest.param(1e-4, marks=pytest.mark.slow), 1e-2])
 def test_cost_gradient_is_exact(kind, size):
     """Kaufman's Jacobian is not the slope of the residuals, but Jᵀr is the slope of half the squared cost."""
     truth = cell(load("lwr4plus"), 4)

@@ -46,7 +46,7 @@ def rms(cell: Installation, block: Positions) -> float:
 
 
 @pytest.mark.parametrize("tilt", [0.0, pytest.param(1e-3, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("kind", ["line", "curve", "surface"])
+@pytest.mark.parametrize("kind", [pytest.param("line", marks=pytest.mark.slow), "curve", "surface"])
 def test_one_orientation_is_placed_well(kind, tilt):
     """Such poses were placed 300 mm wrong: rotations alone tell nothing of where the instrument stands there."""
     for seed in (1,):

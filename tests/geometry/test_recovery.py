@@ -73,6 +73,7 @@ def calibrate(nominal, measured, settings=None):
     return fit(start.cell, measured, settings=settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in SCENES]
 )
@@ -94,7 +95,7 @@ def test_errors_follow_stated_covariance(name):
     assert abs(squares - freedom) < 4 * np.sqrt(2 * freedom)  # the stated sigmas are those of the residuals
 
 
-@pytest.mark.parametrize("robot", ["lwr4plus", "ur5"])
+@pytest.mark.parametrize("robot", ["lwr4plus", pytest.param("ur5", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["pose", "position"])
 def test_predictions_beat_one_measurement(robot, kind):
     """Error of the prediction: sigma sqrt(p / rows), about; the nominal arm is 20 times off."""
@@ -111,7 +112,15 @@ def test_predictions_beat_one_measurement(robot, kind):
         assert np.sqrt(np.mean(position_error(start.cell, truth, q) ** 2)) > 10 * error
 
 
-@pytest.mark.parametrize("name", ["pose", "position", "sockets", "distance"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "pose",
+        pytest.param("position", marks=pytest.mark.slow),
+        "sockets",
+        pytest.param("distance", marks=pytest.mark.slow),
+    ],
+)
 def test_exact_rows_give_the_truth(name):
     """Without noise the truth is found to rounding."""
     scene = SCENES[name][0]
@@ -123,7 +132,10 @@ def test_exact_rows_give_the_truth(name):
 
 @pytest.mark.parametrize(
     ("name", "seeds"),
-    [("position", 6), *(pytest.param(name, SEEDS, marks=pytest.mark.slow) for name in ("pose", "position"))],
+    [
+        pytest.param("position", 6, marks=pytest.mark.slow),
+        *(pytest.param(name, SEEDS, marks=pytest.mark.slow) for name in ("pose", "position")),
+    ],
 )
 def test_unstated_sigmas_are_estimated(name, seeds):
     """Position and orientation each get their own, within the scatter that so many rows allow."""
@@ -213,6 +225,7 @@ def test_row_order_does_not_matter():
     assert position_error(one.cell, aligned, q).max() < 1e-3 * SIGMA
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("loss", [pytest.param("huber", marks=pytest.mark.slow), "cauchy"])
 def test_planted_outliers_are_named(loss):
     """Planted outliers are named with file and row, and hardly any others."""
@@ -241,6 +254,7 @@ def test_planted_outliers_are_named(loss):
     assert others <= 6  # of 540 good rows
 
 
+@pytest.mark.slow
 def test_a_clean_measurement_has_no_outliers():
     for seed in range(6):
         nominal, _, measured, _ = planted("position", seed)

@@ -28,7 +28,16 @@ def measured(count, name="ur5", seed=1, errors=(0.5e-3, 1e-3)):
     return arm, Positions(q, arm.joint_names, seen.point.T, file="measured.csv")
 
 
-@pytest.mark.parametrize("variant", ["whole", "shifted", "held out", "two tools", "other order"])
+@pytest.mark.parametrize(
+    "variant",
+    [
+        pytest.param("whole", marks=pytest.mark.slow),
+        "shifted",
+        pytest.param("held out", marks=pytest.mark.slow),
+        pytest.param("two tools", marks=pytest.mark.slow),
+        "other order",
+    ],
+)
 def test_best_first_row_as_by_a_fit_for_each(variant):
     """The last row from which on a shift explains as much as the best one is the same as by a fit for every row."""
     random = np.random.default_rng(0)

@@ -178,6 +178,7 @@ def test_rows_of_a_swinging_arm_are_named_and_replaced(chain, folder):
     assert np.abs(torque - driven(block(folder / "empty.csv"), fit).torque)[[4, 9, 20]].max() < 1.0
 
 
+@pytest.mark.slow
 def test_friction_at_rest_is_smoothed_by_the_masses(chain, tmp_path):
     """Torques of motors: friction of either sign is in each; those of the fitted masses are nearer to gravity."""
     arm = GivingArm(seed=3, friction=0.08)
@@ -192,6 +193,7 @@ def test_friction_at_rest_is_smoothed_by_the_masses(chain, tmp_path):
     assert errors[1] < 0.5 * errors[0]
 
 
+@pytest.mark.slow
 def test_loads_by_row_of_one_file_are_those_of_several_files(arm, chain, folder, tmp_path):
     tables = arm.table(80, 1), arm.table(40, 2, 2.5, (0.02, -0.03, 0.12))
     rows = np.column_stack([np.concatenate(tables), np.repeat([0.0, 2.5], [80, 40])])
@@ -208,10 +210,14 @@ def test_loads_by_row_of_one_file_are_those_of_several_files(arm, chain, folder,
 @pytest.mark.parametrize(
     "change, says",
     [
-        (lambda torque: np.negative(torque, out=torque), "the other one than in empty.csv"),
+        pytest.param(
+            lambda torque: np.negative(torque, out=torque), "the other one than in empty.csv", marks=pytest.mark.slow
+        ),
         (lambda torque: np.multiply(torque, 1000.0, out=torque), "times the gravity of empty.csv"),
         (lambda torque: torque.fill(0.0), "zero in every row"),
-        (lambda torque: np.multiply(torque, 0.5, out=torque), "no load explains them"),
+        pytest.param(
+            lambda torque: np.multiply(torque, 0.5, out=torque), "no load explains them", marks=pytest.mark.slow
+        ),
         (lambda torque: np.negative(torque[:, 1], out=torque[:, 1]), "with tau2 reversed"),
     ],
 )
@@ -286,11 +292,15 @@ def changed(measured, change):
 @pytest.mark.parametrize(
     "change, says",
     [
-        (lambda torque: np.negative(torque, out=torque), "the other one than in empty.csv"),
+        pytest.param(
+            lambda torque: np.negative(torque, out=torque), "the other one than in empty.csv", marks=pytest.mark.slow
+        ),
         (lambda torque: np.multiply(torque, 1000.0, out=torque), "kg"),
         (exchange, "tau2 and tau4 exchanged"),
         (reverse, "tau2 reversed"),
-        (lambda torque: np.multiply(torque, 0.5, out=torque), "no load explains them"),
+        pytest.param(
+            lambda torque: np.multiply(torque, 0.5, out=torque), "no load explains them", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_second_fitted_file_is_judged_by_the_first_one(chain, folder, gravity, change, says):
@@ -301,6 +311,7 @@ def test_a_second_fitted_file_is_judged_by_the_first_one(chain, folder, gravity,
     assert np.array_equal(fit.chain.inertias, gravity.chain.inertias)
 
 
+@pytest.mark.slow
 def test_of_three_files_the_one_that_contradicts_two_is_named(arm, chain, folder, tmp_path):
     others = [block(arm.write(tmp_path / f"{seed}.csv", arm.table(30, seed))) for seed in (5, 6)]
     odd = changed(block(folder / "empty.csv"), lambda torque: np.negative(torque, out=torque))
@@ -325,8 +336,16 @@ def turn_few(torque):
     torque[5:] = np.nan
 
 
-@pytest.mark.parametrize("change, count", [(rub, 40), (rub, 80), (turn_ten, 80), (turn_few, 80)])
-@pytest.mark.parametrize("files", [("odd", "good"), ("good", "odd")])
+@pytest.mark.parametrize(
+    "change, count",
+    [
+        (rub, 40),
+        pytest.param(rub, 80, marks=pytest.mark.slow),
+        pytest.param(turn_ten, 80, marks=pytest.mark.slow),
+        pytest.param(turn_few, 80, marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.parametrize("files", [("odd", "good"), pytest.param(("good", "odd"), marks=pytest.mark.slow)])
 def test_of_two_files_the_one_that_shows_gravity_stays(arm, chain, tmp_path, change, count, files):
     """The odd file has as many rows as the good one or more; it is motor friction, or turned where it has torques."""
     good = block(arm.write(tmp_path / "good.csv", arm.table(40, 5)))
@@ -337,6 +356,7 @@ def test_of_two_files_the_one_that_shows_gravity_stays(arm, chain, tmp_path, cha
     assert len(fit.loads) == 1
 
 
+@pytest.mark.slow
 def test_of_three_files_two_without_gravity_are_named(arm, chain, tmp_path):
     tables = [block(arm.write(tmp_path / f"{seed}.csv", arm.table(40, seed))) for seed in (5, 6, 7)]
     fit, agreeing, findings = agreeing_torques(chain, [changed(tables[0], rub), changed(tables[1], shuffle), tables[2]])
@@ -350,6 +370,7 @@ def test_empty_torques_of_an_unseen_file_are_called_empty(folder, gravity):
     assert measured.measured_torque is None and unused.values["reason"] == "their columns are empty"
 
 
+@pytest.mark.slow
 def test_files_of_a_few_rows_each_or_of_a_single_pose_do_not_contradict_each_other(arm, chain, folder, tmp_path):
     rows = arm.table(24, 5)
     poses = np.tile(rows[:1, :7], (12, 1)) + 1e-4 * np.arange(12)[:, None]

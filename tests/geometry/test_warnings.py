@@ -47,6 +47,7 @@ def nearby(truth: Installation, centres: int, each: int, seed: int, sigma: float
     return Positions(q, truth.chain.joint_names, position=position, file="cluster.csv")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3, 4))])
 def test_noise_alone_gives_no_warning(seed):
     for measured in (
@@ -85,7 +86,7 @@ def one_component(seed: int) -> PoseMeasurements:
     return measure(truth_of(0), "distance", 160, seed, sigma=SIGMA)
 
 
-@pytest.mark.parametrize("measured", [scattered, one_component])
+@pytest.mark.parametrize("measured", [scattered, pytest.param(one_component, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 16), marks=pytest.mark.slow)])
 def test_scattered_bad_rows_are_no_set_up(measured, seeds):
     """Bad rows scattered over the day, and noise of one component, are no set-up."""
@@ -126,7 +127,7 @@ def test_the_rank_is_told_with_its_gap():
     assert all(any(place in one["into"] for one in merged) for place in PLACES.values())
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_confusion_of_tool_and_base_is_said(seed):
     """Positions in a small region with the wrist held still, against positions anywhere."""
     truth = truth_of(seed)
@@ -142,7 +143,10 @@ def test_confusion_of_tool_and_base_is_said(seed):
     assert not any(one.code == "loose-tool" for one in unidentified(calibrate(free)))
 
 
-@pytest.mark.parametrize(("turned", "most"), [((), 1), ((1,), 8), ((2, 5), 10)])
+@pytest.mark.parametrize(
+    ("turned", "most"),
+    [((), 1), pytest.param((1,), 8, marks=pytest.mark.slow), pytest.param((2, 5), 10, marks=pytest.mark.slow)],
+)
 def test_unplaceable_reversal_not_searched(monkeypatch, turned, most):
     """Trying every joint fits placements 7, 12 and 16 times."""
     cell, placed = perturbed_cell(load("ur5"), seed=1), []
@@ -157,7 +161,10 @@ def test_unplaceable_reversal_not_searched(monkeypatch, turned, most):
     assert len(placed) <= most
 
 
-@pytest.mark.parametrize(("joint", "end"), [(5, "--tip "), (0, "--base "), (2, None)])
+@pytest.mark.parametrize(
+    ("joint", "end"),
+    [(5, "--tip "), pytest.param(0, "--base ", marks=pytest.mark.slow), pytest.param(2, None, marks=pytest.mark.slow)],
+)
 def test_joint_without_effect_is_named(joint, end):
     """A gripper's column beside the arm's, a track that carries the instrument, too."""
     cell = perturbed_cell(load("ur5"), seed=2)
@@ -191,7 +198,9 @@ def real_positions(folder: Path) -> tuple[Chain, PoseMeasurements]:
     return arm, take(block, np.arange(0, len(block), max(1, len(block) // 100)))
 
 
-@pytest.mark.parametrize("folder", REAL)
+@pytest.mark.parametrize(
+    "folder", [pytest.param(name, marks=[pytest.mark.slow] * (name != "ur5_gts3800")) for name in REAL]
+)
 @pytest.mark.parametrize("way", [0.0, 1.0])
 def test_real_poses_are_sound(data, folder, way):
     """Real poses are sound unless a joint counts from the one before."""
@@ -201,6 +210,7 @@ def test_real_poses_are_sound(data, folder, way):
     assert (found and (found.code, found.joints)) == (("joint-coupled", (2, 1)) if way else None)
 
 
+@pytest.mark.slow
 def test_joint_without_effect_reaches_the_user():
     """The explanation of a search is a finding of the fit, with the joint's name."""
     cell = perturbed_cell(load("ur5"), seed=2)

@@ -165,6 +165,7 @@ def problem_of(data: Information) -> BodyCost:
     return make_problem(data, next(find_prior_bodies(data.chain, data.dynamics.model)))
 
 
+@pytest.mark.slow
 def test_optimum_does_not_depend_on_start():
     """The optimum is the same from that of another weight."""
     _, model, _, information = planted(3)

@@ -35,6 +35,7 @@ def away(found: dict[str, tuple[float, float]], sigma: dict[str, tuple[float, fl
     return float(np.sqrt(np.mean([((found[name][0] - x) / sigma[name][1]) ** 2 for name, x in truth.items()])))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method", [*(pytest.param(method, marks=pytest.mark.slow) for method in ("ols", "tls")), "irls"]
 )
@@ -102,6 +103,7 @@ def test_joint_error_widens_all_sigmas(robot: Path, tmp_path: Path):
     assert "autocorrelated-residual" in {one.code for one in model_findings(inputs.cases, found["tls"])}
 
 
+@pytest.mark.slow
 def test_parameter_on_bound_has_no_sigma(robot: Path, tmp_path: Path):
     """Certainty would be the bound's, not the data's: the cell is empty, the others have theirs, readers get NaN."""
     options, out = tmp_path / "o.toml", tmp_path / "out"

@@ -51,7 +51,7 @@ def test_bent_shape_stays_beyond_the_edge(one):
     assert free.settings[0] == np.inf
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_sensor_friction_brakes_and_is_small(seed):
     """Friction of sensors behind the gears brakes and is small."""
     case = without_friction(planted.case("log", seed, noise=0.2))
@@ -62,6 +62,7 @@ def test_sensor_friction_brakes_and_is_small(seed):
     assert max(own) < 0.1 * min(planted.DRIVES["Fc"])
 
 
+@pytest.mark.slow
 def test_planted_coupling_alone_is_found():
     """A coupling is found and written, and none where there is none."""
     case = planted.case("log", 0, noise=0.05, terms=COUPLED, values=GEARS)
@@ -77,6 +78,7 @@ def test_planted_coupling_alone_is_found():
     assert "coupling" not in alone.friction.chosen and drive_table(alone.dynamics).pairs == ()
 
 
+@pytest.mark.slow
 def test_one_frequency_tells_no_coupling():
     """Friction that the standard model lacks is explained by other joints' motion there, but not elsewhere."""
     case = planted.case("log", 0, noise=0.05, harmonics=1)

@@ -53,6 +53,7 @@ def model(folder, robot) -> calib.DynamicsModel:
     return calib.identify_dynamics(robot, recordings[0], validate=recordings[1], terms=[ARCTAN], friction="standard")
 
 
+@pytest.mark.slow
 def test_a_function_is_identified_stored_and_read_without_it(model, robot, tmp_path):
     values = dict(zip(model.estimate.names, model.estimate.values))
     sigmas = dict(zip(model.estimate.names, model.estimate.sigma))

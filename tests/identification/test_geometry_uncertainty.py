@@ -46,11 +46,11 @@ def test_spreading_is_adjoint_of_decimation(factor):
 @pytest.mark.parametrize(
     "settings",
     [
-        PLAIN,
+        pytest.param(PLAIN, marks=pytest.mark.slow),
         replace(PLAIN, method="ols"),
-        replace(PLAIN, friction="asymmetric"),
+        pytest.param(replace(PLAIN, friction="asymmetric"), marks=pytest.mark.slow),
         replace(PLAIN, prior="cad"),
-        replace(PLAIN, samples=200),
+        pytest.param(replace(PLAIN, samples=200), marks=pytest.mark.slow),
     ],
     ids=["wls", "ols", "ridge", "prior", "thinned"],
 )
@@ -71,6 +71,7 @@ def test_sensitivity_is_slope_of_estimate(settings):
     differences.check(refitted, matrix[:, :-2], np.array(arm.values), step=1e-5, tolerance=1e-7)
 
 
+@pytest.mark.slow
 def test_pieces_of_a_recording_tell_the_same(monkeypatch):
     """Pieces of a long recording tell the same."""
     arm, case = planted.arm(), planted.case("a", 0, noise=0.0, duration=60.0)
@@ -197,6 +198,7 @@ def test_command_carries_covariance_of_fit(tmp_path, capsys):
     assert kept is not None and kept[1, 1] == pytest.approx(1e-6), "the identified robot carries it on"
 
 
+@pytest.mark.slow
 def test_geometry_taken_as_exact_is_said(tmp_path, capsys):
     """The command says where the geometry is taken as exact."""
     found, rows, out = run(fitted_folder(tmp_path, None), tmp_path, "--no-plots")

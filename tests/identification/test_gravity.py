@@ -48,14 +48,14 @@ def said(gravity: np.ndarray, masses: bool, without: tuple[int, ...] = (), seed:
     return gravity_of([MotionSamples(np.arange(len(t)), q, v, a, torques, v, bodies)], known)
 
 
-@pytest.mark.parametrize("masses", [True, False])
+@pytest.mark.parametrize("masses", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_stated_gravity_is_not_remarked_upon(masses):
     """Gravity as stated is not remarked upon."""
     for seed in range(3):
         assert not said(STATED, masses, seed=seed).refuted
 
 
-@pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.parametrize("mount", [pytest.param(name, marks=[pytest.mark.slow] * (name != "slope")) for name in MOUNTS])
 def test_other_mounting_is_found_with_vector(mount):
     """Another mounting is found with its vector."""
     gravity = np.array(MOUNTS[mount])
@@ -64,6 +64,7 @@ def test_other_mounting_is_found_with_vector(mount):
     assert hypotheses.direction @ gravity > 9.81**2 * np.cos(np.radians(5.0))
 
 
+@pytest.mark.slow
 def test_torques_without_gravity_are_named():
     """Torques without gravity are named as such."""
     assert 1 in said(np.zeros(3), masses=True).absent

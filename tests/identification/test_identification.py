@@ -25,7 +25,9 @@ def errors(found) -> np.ndarray:
     return off @ np.linalg.solve(found.fitted.estimate.covariance, off) / len(off)
 
 
-@pytest.mark.parametrize("method", [pytest.param("ols", marks=pytest.mark.slow), "wls", "irls"])
+@pytest.mark.parametrize(
+    "method", [pytest.param("ols", marks=pytest.mark.slow), "wls", pytest.param("irls", marks=pytest.mark.slow)]
+)
 def test_base_parameters_within_covariance(method):
     """Base parameters come back within their covariance."""
     settings = IdentificationSettings(friction="standard", method=method, essential="none")
@@ -96,6 +98,7 @@ def test_gains_come_from_known_payload():
         identify_gains(data, {})
 
 
+@pytest.mark.slow
 def test_payload_of_unseen_motion_counts():
     """A payload that only unseen motion carries counts with its stated mass and centre."""
     loaded, errors = planted.case("b", 1, ("load",)), {}
@@ -121,6 +124,7 @@ def one_sine(name: str = "s"):
     return make_case(name, make_motion(recording, FilterOptions(cutoff=20.0, band=5.0)))
 
 
+@pytest.mark.slow
 def test_one_sine_is_drawn_to_cad():
     """The estimate from one sine is drawn to the CAD, and says so."""
     found = identify(planted.arm(), [one_sine()])

@@ -42,6 +42,7 @@ def estimated(*cases: Case) -> EncoderDifference:
     return difference
 
 
+@pytest.mark.slow
 def test_compliance_and_delay_are_recovered_within_their_sigmas():
     errors: list[float] = []
     for seed in range(5):

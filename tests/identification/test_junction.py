@@ -32,6 +32,7 @@ def geometry(model: str) -> kinematic.Outcome:
     return kinematic.run(Inputs(cell.nominal, Path("planted.toml"), (block,)), settings=FitSettings(model=model))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["geometry", pytest.param("harmonics", marks=pytest.mark.slow)])
 def test_one_process_equals_way_by_files(model, tmp_path):
     """Fit and identification in one process equal the way through files."""
@@ -60,6 +61,7 @@ def test_one_process_equals_way_by_files(model, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_calibrated_robot_reads_back(tmp_path):
     """A calibrated robot reads back as it was written."""
     robot = geometry("harmonics").robot
@@ -75,6 +77,7 @@ def test_calibrated_robot_reads_back(tmp_path):
     np.testing.assert_allclose(again.covariance, robot.covariance, rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_corrected_geometry_is_no_robot():
     """A geometry good only with its corrections is not taken for a robot."""
     found = geometry("harmonics").selection.fit

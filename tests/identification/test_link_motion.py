@@ -94,6 +94,7 @@ def test_deflection_improves_prediction():
     assert errors[1] < 0.5 * errors[0] and errors[2] > 1.5 * errors[0]
 
 
+@pytest.mark.slow
 def test_stiffness_slope_is_that_of_refits():
     """Measured: 0.3 % off."""
     step = 0.02 / STIFFNESS[1] * np.eye(3)[1]

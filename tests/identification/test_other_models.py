@@ -27,7 +27,9 @@ class Other:
         return getattr(self.inner, name)
 
 
-@pytest.mark.parametrize("method", ["ols", "wls", "irls", "tls"])
+@pytest.mark.parametrize(
+    "method", [pytest.param("ols", marks=pytest.mark.slow), "wls", "irls", pytest.param("tls", marks=pytest.mark.slow)]
+)
 def test_the_estimate_is_that_of_a_chain(method):
     arm, cases, model = planted.arm(), [planted.case("a", 0)], Other(planted.model())
     settings = replace(PLAIN, method=method)

@@ -69,7 +69,7 @@ def test_torques_against_own_masses_fail() -> None:
     assert (one.code, level_of(one)) == ("torques-against-masses", "fail") and "joint2" in one.values["joints"]
 
 
-@pytest.mark.parametrize("joint", [0, 1, 2])
+@pytest.mark.parametrize("joint", [pytest.param(0, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.slow), 2])
 def test_one_joint_in_another_unit_is_named(joint: int) -> None:
     tau = recorded().effort.copy()
     tau[:, joint] *= 1e3
@@ -80,7 +80,14 @@ def test_one_joint_in_another_unit_is_named(joint: int) -> None:
     assert float(times) == pytest.approx(np.quantile(np.abs(tau[:, joint]), 0.99) / 60.0, rel=0.1)
 
 
-@pytest.mark.parametrize("factor, level", [(1.0, None), (2.0, "marginal"), (10.0, "fail")])
+@pytest.mark.parametrize(
+    "factor, level",
+    [
+        pytest.param(1.0, None, marks=pytest.mark.slow),
+        pytest.param(2.0, "marginal", marks=pytest.mark.slow),
+        (10.0, "fail"),
+    ],
+)
 def test_gain_beyond_joint_limit_is_told(factor: float, level: str | None) -> None:
     """A gain that takes a joint beyond its limit is told."""
     usual = np.quantile(np.abs(recorded().effort[:, 2]), 0.99)
@@ -97,7 +104,15 @@ def test_tiny_torques_are_another_unit() -> None:
     assert level_of(one) == "marginal" and one.values["share"] < 0.01
 
 
-@pytest.mark.parametrize("factor, level", [(1.5, None), (2.6, "marginal"), (4.0, "fail"), (0.2, "fail")])
+@pytest.mark.parametrize(
+    "factor, level",
+    [
+        pytest.param(1.5, None, marks=pytest.mark.slow),
+        pytest.param(2.6, "marginal", marks=pytest.mark.slow),
+        (4.0, "fail"),
+        (0.2, "fail"),
+    ],
+)
 def test_torques_of_another_robot_are_told(factor: float, level: str | None) -> None:
     """Torques of another robot are told by their size."""
     told = coded(found(recorded(tau=factor * recorded().effort)), "torques-unlike-masses")
@@ -105,7 +120,14 @@ def test_torques_of_another_robot_are_told(factor: float, level: str | None) -> 
 
 
 @pytest.mark.parametrize(
-    "clock, level", [(1.01, None), (1.03, "marginal"), (1.1, "marginal"), (2.0, "fail"), (0.5, "fail")]
+    "clock, level",
+    [
+        (1.01, None),
+        (1.03, "marginal"),
+        pytest.param(1.1, "marginal", marks=pytest.mark.slow),
+        pytest.param(2.0, "fail", marks=pytest.mark.slow),
+        (0.5, "fail"),
+    ],
 )
 def test_velocities_unlike_slopes_are_told(clock: float, level: str | None) -> None:
     """Velocities that are no slopes are told."""
@@ -114,7 +136,18 @@ def test_velocities_unlike_slopes_are_told(clock: float, level: str | None) -> N
     assert all(one.values["size"] == pytest.approx(max(clock, 1 / clock), rel=2e-3) for one in told)
 
 
-@pytest.mark.parametrize("late", [0.0, 0.005, 0.02, 0.05, -0.05, 0.1, 0.2])
+@pytest.mark.parametrize(
+    "late",
+    [
+        0.0,
+        0.005,
+        0.02,
+        pytest.param(0.05, marks=pytest.mark.slow),
+        pytest.param(-0.05, marks=pytest.mark.slow),
+        pytest.param(0.1, marks=pytest.mark.slow),
+        pytest.param(0.2, marks=pytest.mark.slow),
+    ],
+)
 def test_lag_of_all_torques_is_taken_back(late: float) -> None:
     """A lag of all torques is found and taken back."""
     sizes = compare_sizes(case_of(recorded(late)), ARM)
@@ -138,7 +171,7 @@ def bending(t: np.ndarray, v: np.ndarray) -> np.ndarray:
     return z
 
 
-@pytest.mark.parametrize("late", [0.0, 0.05])
+@pytest.mark.parametrize("late", [pytest.param(0.0, marks=pytest.mark.slow), 0.05])
 def test_late_friction_is_no_lag(late: float) -> None:
     """Friction that turns over late is no lag."""
     t, q, v, a = planted.motion(0)
@@ -188,7 +221,7 @@ def test_huge_torques_are_another_unit() -> None:
 
 
 @pytest.mark.parametrize("spike", [100.0, 1e5, 1e300])
-@pytest.mark.parametrize("limit", [60.0, np.inf])
+@pytest.mark.parametrize("limit", [pytest.param(60.0, marks=pytest.mark.slow), np.inf])
 def test_spike_is_dropped_and_many_refused(spike: float, limit: float) -> None:
     """A spike of a torque is left out with its row, and many are refused."""
     joints, log = Joints(NAMES, effort=np.full(3, limit)), recorded()
@@ -242,7 +275,7 @@ def test_jitter_and_lost_samples_are_noted() -> None:
     assert sampling_findings([case_of(log)]) == []
 
 
-@pytest.mark.parametrize("kind", ["average", "start"])
+@pytest.mark.parametrize("kind", ["average", pytest.param("start", marks=pytest.mark.slow)])
 def test_tared_torques_are_named(kind):
     """Torques zeroed over the log, or at its start, are named; offsets of friction are not."""
     tau = recorded().effort
@@ -252,7 +285,16 @@ def test_tared_torques_are_named(kind):
     assert tare_findings(inputs_of(recorded()), None) == []
 
 
-@pytest.mark.parametrize("clock, level", [(1.0, None), (1.2, None), (2.0, "fail"), (0.5, "fail"), (3.0, "fail")])
+@pytest.mark.parametrize(
+    "clock, level",
+    [
+        (1.0, None),
+        pytest.param(1.2, None, marks=pytest.mark.slow),
+        (2.0, "fail"),
+        (0.5, "fail"),
+        pytest.param(3.0, "fail", marks=pytest.mark.slow),
+    ],
+)
 def test_a_clock_is_told_without_velocities(clock: float, level: str | None) -> None:
     """Of a robot whose masses are not known, too: lengths suffice."""
     stamped = replace(recorded(clock=clock), v=None)
@@ -284,7 +326,16 @@ def test_right_angle_at_zero_is_no_exchange() -> None:
     assert told.values["angle"] == pytest.approx(-np.pi / 2)
 
 
-@pytest.mark.parametrize("reverse", [(), (0,), (1,), (2,), (0, 2)])
+@pytest.mark.parametrize(
+    "reverse",
+    [
+        (),
+        pytest.param((0,), marks=pytest.mark.slow),
+        pytest.param((1,), marks=pytest.mark.slow),
+        pytest.param((2,), marks=pytest.mark.slow),
+        (0, 2),
+    ],
+)
 def test_reversed_joints_alone_are_named(reverse: tuple[int, ...]) -> None:
     """Whether the robot's own masses are known or not."""
     signs = np.where(np.isin(np.arange(3), reverse), -1.0, 1.0)
@@ -299,10 +350,10 @@ def test_reversed_joints_alone_are_named(reverse: tuple[int, ...]) -> None:
     ("left", "factor", "code", "told"),
     [
         (0.02, 0.9, "columns-exchanged", True),
-        (0.46, 0.85, "columns-exchanged", False),
+        pytest.param(0.46, 0.85, "columns-exchanged", False, marks=pytest.mark.slow),
         (0.02, 0.99, "columns-exchanged", False),
         (0.02, 0.5, "zero-elsewhere", True),
-        (0.02, 0.9, "zero-elsewhere", False),
+        pytest.param(0.02, 0.9, "zero-elsewhere", False, marks=pytest.mark.slow),
     ],
 )
 def test_change_without_gain_is_not_told(left, factor, code, told) -> None:
@@ -312,7 +363,7 @@ def test_change_without_gain_is_not_told(left, factor, code, told) -> None:
     assert bool(findings([replace(compare_sizes(case_of(recorded()), ARM), other=other)], NAMES)) == told
 
 
-@pytest.mark.parametrize("way", [1.0, -1.0])
+@pytest.mark.parametrize("way", [1.0, pytest.param(-1.0, marks=pytest.mark.slow)])
 def test_joint_counting_from_last_is_named(way: float) -> None:
     """Whether the robot's own masses are known or not."""
     log = recorded()
@@ -335,7 +386,17 @@ def logged(clock: float = 1.0, speed: float | np.ndarray = 1.0) -> Recording:
     )
 
 
-@pytest.mark.parametrize("clock, speed", [(1.0, 0.9), (1.0, 1.1), (1.0, 2.0), (2.0, 1.0), (0.9, 1.0), (0.1, 1.0)])
+@pytest.mark.parametrize(
+    "clock, speed",
+    [
+        (1.0, 0.9),
+        pytest.param(1.0, 1.1, marks=pytest.mark.slow),
+        pytest.param(1.0, 2.0, marks=pytest.mark.slow),
+        pytest.param(2.0, 1.0, marks=pytest.mark.slow),
+        pytest.param(0.9, 1.0, marks=pytest.mark.slow),
+        (0.1, 1.0),
+    ],
+)
 def test_contradicting_dates_have_both_rates(clock: float, speed: float) -> None:
     """Counted dates that contradict the stamps are told with both rates."""
     case = case_of(logged(clock, speed)) if clock != 0.1 else make_case("log", make_motion(logged(clock, speed)))
@@ -346,7 +407,14 @@ def test_contradicting_dates_have_both_rates(clock: float, speed: float) -> None
     assert one.values["counted"] == pytest.approx(200.0 * speed, rel=0.01)
 
 
-@pytest.mark.parametrize(("factor", "unit"), [(30.0 / np.pi, "rpm"), (1e3, "mrad/s or mm/s"), (2.0, None)])
+@pytest.mark.parametrize(
+    ("factor", "unit"),
+    [
+        (30.0 / np.pi, "rpm"),
+        pytest.param(1e3, "mrad/s or mm/s", marks=pytest.mark.slow),
+        pytest.param(2.0, None, marks=pytest.mark.slow),
+    ],
+)
 def test_unit_of_velocities_is_named(factor: float, unit: str | None) -> None:
     v = recorded().v
     assert v is not None
@@ -380,6 +448,7 @@ def test_counted_dates_agree_where_right() -> None:
     assert float(note.split()[-1]) == pytest.approx(0.5, rel=0.01)
 
 
+@pytest.mark.slow
 def test_inconsistent_velocities_are_noted() -> None:
     """Velocities that do not follow the positions are noted."""
     v, noise = recorded().v, np.random.default_rng(1).normal(size=(len(recorded()), 3))
@@ -415,6 +484,7 @@ def away(recording: Recording) -> Contradiction:
     return far
 
 
+@pytest.mark.slow
 def test_estimate_far_from_possible_fails() -> None:
     """An estimate far from every possible robot fails, and one with other friction is not remarked upon."""
     sound = away(recorded())
@@ -446,7 +516,10 @@ def test_impossible_description_cannot_pass():
     assert Verdict.of("good", settle(wrong, ["description"])).level == "pass"
 
 
-@pytest.mark.parametrize("clock, level", [(1.0, None), (0.5, "fail"), (3.0, "fail")])
+@pytest.mark.parametrize(
+    "clock, level",
+    [(1.0, None), pytest.param(0.5, "fail", marks=pytest.mark.slow), pytest.param(3.0, "fail", marks=pytest.mark.slow)],
+)
 def test_masses_tell_clock_beyond_lengths(clock: float, level: str | None) -> None:
     """BIRDy's TX40 has half the inertia that rods of its lengths would have."""
     arm = load("tx40")

@@ -47,6 +47,7 @@ def test_energy_derivative_is_the_power():
     assert np.allclose(rising, power, rtol=0, atol=1e-5 * np.abs(power).max())
 
 
+@pytest.mark.slow
 def test_power_needs_no_accelerations():
     """Base parameters within their sigmas, from two recordings one of which is ten times as noisy."""
     n, away = motley().n, []

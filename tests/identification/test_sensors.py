@@ -55,7 +55,14 @@ def identify(robot: Path, folder: Path, rows: str, *logs: str) -> tuple[int, Pat
     return run("identify", robot, *logs, "--options", options, "--out", out), out
 
 
-@pytest.mark.parametrize("rows, count", [pytest.param("link", 34, marks=pytest.mark.slow), ("both", 46), ("drive", 12)])
+@pytest.mark.parametrize(
+    "rows, count",
+    [
+        pytest.param("link", 34, marks=pytest.mark.slow),
+        pytest.param("both", 46, marks=pytest.mark.slow),
+        pytest.param("drive", 12, marks=pytest.mark.slow),
+    ],
+)
 def test_models_1_to_3_recover_the_truth(robot, tmp_path, capsys, rows, count):
     """Model 2 has as many base parameters as Models 1 and 3 together, and all lie where their sigmas say."""
     columns = ("tau_sensor", "tau") if rows == "both" else ("tau_l", "tau_m")  # motor torques may be called tau

@@ -76,6 +76,7 @@ def in_motion(found: Identification, case: Case) -> float:
     return score(case, predict(found.dynamics, case)).moving.total
 
 
+@pytest.mark.slow
 def test_friction_returns_despite_standing(monkeypatch):
     """With standing rows as any others it is several times as wrong, and so is motion that the fit has not seen."""
     cases, other = [stop_and_go(seed) for seed in range(3)], stop_and_go(7)
@@ -186,6 +187,7 @@ def test_joint_that_never_moves_keeps_rows():
     assert not standing[:, 1].any() and standing[:, [0, 2]].any(axis=0).all()
 
 
+@pytest.mark.slow
 def test_intervals_have_two_widths():
     """Intervals have two widths and hold in both."""
     covered = []

@@ -42,7 +42,9 @@ def judged(found: Identification, model: TorqueErrorModel, case: Case) -> Torque
     return intervals(model, found.dynamics, case, predict(found.dynamics, case))
 
 
-@pytest.mark.parametrize("outside", [0.0, 1.0])
+@pytest.mark.parametrize(
+    "outside", [pytest.param(0.0, marks=pytest.mark.slow), pytest.param(1.0, marks=pytest.mark.slow)]
+)
 def test_interval_holds_95_of_100_errors(outside):
     """Over 8 x 3 pairs of motions, 20 s to learn from and to judge by; a single pair is known to a few percent only."""
     shares, unseen = [], [recorded(seed, outside) for seed in range(20, 23)]
@@ -52,6 +54,7 @@ def test_interval_holds_95_of_100_errors(outside):
     assert 0.93 < np.mean(shares) < 0.985
 
 
+@pytest.mark.slow
 def test_parameter_covariance_is_too_small():
     """The covariance of the parameters alone would be far too small."""
     found, model = learnt(1.0)
@@ -77,6 +80,7 @@ def test_faster_motion_expects_larger_errors():
     assert any(line.startswith("accelerating more than in training at joint a, b, c") for line in said)
 
 
+@pytest.mark.slow
 def test_exact_torques_give_intervals_too():
     """Several recordings and exact torques give intervals, too."""
     found, model = learnt(0.0, (0, 1, 2, 3), duration=10.0, noise=0.0)

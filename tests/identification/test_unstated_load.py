@@ -20,7 +20,7 @@ def samples(seed: int, loaded: bool = False, friction: float = 0.0) -> MotionSam
     return replace(taken, effort=taken.effort + friction * np.tanh(taken.velocity / 0.05))
 
 
-@pytest.mark.parametrize("count", [2, 3])
+@pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("place", [0, 1])
 def test_loaded_recording_is_named_with_mass(count: int, place: int):
     """The loaded recording is named with its mass."""
@@ -30,7 +30,7 @@ def test_loaded_recording_is_named_with_mass(count: int, place: int):
     assert load.after < 0.5 * load.before
 
 
-@pytest.mark.parametrize("loaded", [False, True])
+@pytest.mark.parametrize("loaded", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_recordings_alike_tell_of_no_load(loaded: bool):
     for seed in range(3):
         assert unstated_load({f"{k}": samples(k, loaded) for k in (seed, seed + 1)}) is None

@@ -73,7 +73,9 @@ def mistakes(n: int, j: int) -> list[tuple[str, tuple[int, ...], Mistake]]:
     ]
 
 
-@pytest.mark.parametrize("number", range(7))
+@pytest.mark.parametrize(
+    "number", [pytest.param(number, marks=[pytest.mark.slow] * (number != 4)) for number in range(7)]
+)
 def test_wrong_column_is_named_without_masses(number):
     """A wrong column is named with its joints, and nothing else is."""
     code, joints, mistake = mistakes(6, 1)[number]
@@ -100,6 +102,7 @@ def test_robot_that_stands_without_noise_accuses_nothing():
     assert wrong_joints(replace(samples, q=samples.q[:1] + standing, v=standing, a=standing)) is None
 
 
+@pytest.mark.slow
 def test_corrected_columns_are_those_that_were_recorded():
     sound = recorded("tx40", 1)
     for _, _, mistake in mistakes(6, 2)[2::2]:
@@ -111,6 +114,7 @@ def test_corrected_columns_are_those_that_were_recorded():
     assert corrected(sound, None) is sound
 
 
+@pytest.mark.slow
 def test_log_of_another_robot_names_that_robot():
     panda = load("panda")
     log = recorded("lwr4plus", 3)
@@ -120,7 +124,7 @@ def test_log_of_another_robot_names_that_robot():
     assert found.values["robot"] in ("lwr4plus", "iiwa14") and found.values["after"] < 0.6 * found.values["before"]
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", [pytest.param(name, marks=[pytest.mark.slow] * (name != "ur10e")) for name in ROBOTS])
 def test_sound_columns_accuse_nothing(robot):
     assert wrong_joints(recorded(robot, 4)) is None
 

@@ -22,7 +22,9 @@ def made(tmp_path, content: str):
     return closed(parallel_robot.read(path))
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name == "stewart")) for name in ROBOTS]
+)
 def test_encoders_and_platform_agree(name):
     """Coordinates → joints → coordinates, on the branch of home, loops closed to rounding; records as random ones."""
     known, rng = find(name).mechanism, np.random.default_rng(0)

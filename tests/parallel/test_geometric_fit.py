@@ -21,7 +21,9 @@ def planted(name: str, seed: int = 0, rows: int = 60):
     return nominal, true, q + NOISE * rng.normal(size=q.shape), x
 
 
-@pytest.mark.parametrize("name", ["dualv", "fivebar", pytest.param("stewart", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", [pytest.param("dualv", marks=pytest.mark.slow), "fivebar", pytest.param("stewart", marks=pytest.mark.slow)]
+)
 def test_platform_poses_tell_the_geometry(name):
     """Residuals at the encoders' noise, and unseen poses a hundred times nearer than with the nominal geometry."""
     nominal, _, q, x = planted(name)

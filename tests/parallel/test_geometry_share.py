@@ -35,7 +35,7 @@ def refitted(found: ParallelDynamics, known: ClosedRobot) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("name", "rows"),
-    [("fivebar", "motor"), *(pytest.param(*each, marks=pytest.mark.slow)
+    [pytest.param("fivebar", "motor", marks=pytest.mark.slow), *(pytest.param(*each, marks=pytest.mark.slow)
       for each in (("dualv", "motor"), ("dualv", "power"), ("stewart", "motor")))],
 )  # fmt: skip
 def test_sensitivities_match_other_geometry(name, rows):

@@ -76,7 +76,9 @@ def test_regressor_gives_the_torque(name, rows):
         assert np.allclose(W @ values, model.torque(values, states.q, states.v, states.a, carried), atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "fivebar")) for name in ROBOTS]
+)
 def test_power_is_the_change_of_energy(name):
     """Along a motion, vᵀ W χ without friction is the derivative of the energies' columns."""
     known, rng = robot(name), np.random.default_rng(3)

@@ -94,7 +94,9 @@ def played(mujoco, robot: OpenedRobot, step: float) -> tuple[float, float, float
     return start, np.abs(data.efc_pos).max(), np.abs(positions - motion.posture.q[-1]).max()
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", ["fivebar", *(pytest.param(name, marks=pytest.mark.slow) for name in ("dualv", "stewart"))]
+)
 def test_mujoco_moves_as_planned(name):
     """Played from home without control, the torques of a motion lead to it with an error in proportion to the step."""
     mujoco = pytest.importorskip("mujoco")

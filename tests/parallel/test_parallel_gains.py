@@ -25,7 +25,9 @@ def found(name: str, noise: float, seed: int, changes: dict | None = None, sampl
     return gains, gather(robot, runs, options=parse_options({k: v for k, v in table.items() if v is not None})).gains
 
 
-@pytest.mark.parametrize("name", ["dualv", pytest.param("stewart", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", [pytest.param("dualv", marks=pytest.mark.slow), pytest.param("stewart", marks=pytest.mark.slow)]
+)
 def test_known_payload_gives_gains(name):
     """Redundant actuators with a preload that nobody states, currents with noise of different size."""
     gains, identified = found(name, 0.2 if name == "dualv" else 5.0, 0)
@@ -46,9 +48,11 @@ def test_gain_sigmas_hold_under_noise():
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"gain_identification": None}, "currents without gains"),
+        pytest.param({"gain_identification": None}, "currents without gains", marks=pytest.mark.slow),
         ({"payload": {"5": {}}}, "with its mass"),
-        ({"payload": {"5": {"mass": 5.37}, "6": {"mass": 1.0}}}, "was the payload attached"),
+        pytest.param(
+            {"payload": {"5": {"mass": 5.37}, "6": {"mass": 1.0}}}, "was the payload attached", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_gains_need_a_known_payload(changes, said):

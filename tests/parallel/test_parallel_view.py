@@ -50,6 +50,7 @@ def fitted(tmp_path_factory) -> Path:
     return here / "fit"
 
 
+@pytest.mark.slow
 def test_a_fit_shows_its_poses_and_errors(fitted, tmp_path):
     assert cli.run(["view", str(fitted), "--save", str(tmp_path / "a.rrd")]) == 0
     found = recorded(tmp_path / "a.rrd")
@@ -68,6 +69,7 @@ def test_a_fit_shows_its_poses_and_errors(fitted, tmp_path):
     assert np.isnan(measured.turned).all()
 
 
+@pytest.mark.slow
 def test_views_name_actuators_and_rows(fitted, tmp_path):
     """Motions and torques are shown under the names of actuators and rows."""
     folder = tmp_path / "id"

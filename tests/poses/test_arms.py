@@ -61,8 +61,8 @@ def starts(space: SearchSpace, count: int, seed: int = 0) -> np.ndarray:
 @pytest.mark.parametrize(
     ("name", "index"),
     [
-        ("4 joints", "cond"),
-        ("6 joints", "O1"),
+        pytest.param("4 joints", "cond", marks=pytest.mark.slow),
+        pytest.param("6 joints", "O1", marks=pytest.mark.slow),
         pytest.param("4 joints", "O1", marks=pytest.mark.slow),
         pytest.param("6 joints", "cond", marks=pytest.mark.slow),
         pytest.param("7 joints", "O1", marks=pytest.mark.slow),
@@ -81,7 +81,7 @@ def test_far_local_search_stays_feasible(name, index, file):
 
 @pytest.mark.parametrize("name", [*ARMS, "motley"])
 @pytest.mark.parametrize("kind", ["pose", "position"])
-@pytest.mark.parametrize("reference", [False, True])
+@pytest.mark.parametrize("reference", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_derivative_product_is_exact(name, kind, reference):
     chain = motley() if name == "motley" else ARMS[name]()
     seen = observation(targets_of(chain, [(0.05, 0.02, 0.1), (0.0, -0.1, 0.02)]), kind, reference=reference)

@@ -119,7 +119,14 @@ def test_predicate_holds_against_gradient():
 
 
 @pytest.mark.parametrize(
-    "method", ["polish", "local", "multistart", "mlsl", pytest.param("tabu", marks=pytest.mark.slow)]
+    "method",
+    [
+        "polish",
+        "local",
+        pytest.param("multistart", marks=pytest.mark.slow),
+        "mlsl",
+        pytest.param("tabu", marks=pytest.mark.slow),
+    ],
 )
 def test_methods_repeat_and_beat_random(method):
     """Methods keep constraints, repeat by seed and beat random sets."""
@@ -169,6 +176,7 @@ def test_bound_holds_over_the_whole_space(bound):
     assert bound_over_space(space, few, 6, climbs=0).upper < best.value**2 * 6  # the candidates' bound does not hold
 
 
+@pytest.mark.slow
 def test_multistart_processes_agree():
     """Multistart on other processes gives the same poses."""
     here = select_poses(None, 5, SearchSettings(method="multistart", starts=3), q=Q, space=SPACE)

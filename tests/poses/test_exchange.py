@@ -36,7 +36,7 @@ def log_det_of(jacobians):
     [
         pytest.param(library_arm.jacobian, 17, marks=pytest.mark.slow),
         (library_arm.point_jacobian, 17),
-        (library_arm.jacobian, 30),
+        pytest.param(library_arm.jacobian, 30, marks=pytest.mark.slow),
         pytest.param(library_arm.point_jacobian, 30, marks=pytest.mark.slow),
     ],
 )
@@ -53,6 +53,7 @@ def test_sandwich(function, m):
     assert len(set(chosen.indices.tolist())) == m
 
 
+@pytest.mark.slow
 def test_bound_is_tight_and_feasible():
     """The bound is tight, and its weights are feasible."""
     for capped, most in ((True, 1.0), (False, 17.0)):
@@ -65,6 +66,7 @@ def test_bound_is_tight_and_feasible():
     assert bound(ARM, 120, tolerance=1e-4).upper < 0.999 * bound(ARM, 120, capped=False, tolerance=1e-4).upper
 
 
+@pytest.mark.slow
 def test_any_weights_certify_a_valid_bound():
     """However bad the weights, no relaxed design may beat the bound they give, nor any real selection."""
     generator = np.random.default_rng(0)
@@ -92,6 +94,7 @@ def test_rank_updates_are_the_determinant():
     assert found == outside[gains.argmax()] and gain == pytest.approx(gains.max())
 
 
+@pytest.mark.slow
 def test_detmax_finds_the_best_of_all_sets():
     for seed in range(6):
         jacobians = np.random.default_rng(seed).normal(size=(11, 2, 4))
@@ -136,7 +139,16 @@ def spectra_of_all_sets(jacobians, m):
     return np.linalg.svd(stacked, compute_uv=False)
 
 
-@pytest.mark.parametrize("index", ["O2", "O3", "O4", "O5", "cond"])
+@pytest.mark.parametrize(
+    "index",
+    [
+        pytest.param("O2", marks=pytest.mark.slow),
+        pytest.param("O3", marks=pytest.mark.slow),
+        pytest.param("O4", marks=pytest.mark.slow),
+        pytest.param("O5", marks=pytest.mark.slow),
+        "cond",
+    ],
+)
 def test_every_index_finds_the_best_set(index):
     """Without restarts half of these searches end at a local optimum; with few of them none does."""
     for seed in range(4):
@@ -162,6 +174,7 @@ def test_arm_optimum_is_reached(index):
     assert chosen.value == pytest.approx(np.exp(best), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_o1_selection_does_not_see_units():
     scale = 10.0 ** np.random.default_rng(1).uniform(-3, 3, ARM.shape[2])
     one, other = of_the_arm(), select_poses(ARM * scale, 17)
@@ -169,6 +182,7 @@ def test_o1_selection_does_not_see_units():
     assert other.efficiency == pytest.approx(one.efficiency, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_known_information_is_counted():
     """What is known before is taken into account."""
     before = ARM[:30]
@@ -187,6 +201,7 @@ def test_choosing_all_candidates_is_allowed():
     assert chosen.efficiency == pytest.approx(1.0, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_the_seed_repeats_every_bit():
     few = ARM[:150]
     one, two = select_poses(few, 17, SearchSettings(seed=5)), select_poses(few, 17, SearchSettings(seed=5))
@@ -195,6 +210,7 @@ def test_the_seed_repeats_every_bit():
     assert random_baseline(few, 17, seed=6) != one.random_baseline
 
 
+@pytest.mark.slow
 def test_interrupted_exchange_returns_best():
     """An interrupted exchange returns the best so far."""
 
@@ -247,7 +263,9 @@ def test_nothing_feasible_gives_the_share():
     assert (caught.value.found, caught.value.draws) == (0, 4096)
 
 
-@pytest.mark.parametrize("spare", [1, 2, 5, 40])
+@pytest.mark.parametrize(
+    "spare", [pytest.param(1, marks=pytest.mark.slow), 2, 5, pytest.param(40, marks=pytest.mark.slow)]
+)
 def test_bound_is_tight_with_few_candidates(spare):
     """The bound is tight with few candidates to spare."""
     few = ARM[: 17 + spare]

@@ -41,6 +41,7 @@ def test_accept_names_match_the_catalogue():
     assert set().union(*chapters) == chapters[1] | chapters[9] | chapters[10]
 
 
+@pytest.mark.slow
 def test_every_entry_is_used():
     sources = "".join(path.read_text(encoding="utf-8") for path in Path(findings.__file__).parents[1].rglob("*.py"))
     assert [code for code in CODES if f'"{code}"' not in sources] == []

@@ -115,6 +115,7 @@ def _asked(line: str) -> dict[str, str]:
     return {"_CALIB_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(line.split()) - 1)}
 
 
+@pytest.mark.slow
 def test_console_without_unicode_gets_words(tmp_path):
     """Letters that an encoding lacks are spelt: sigma, ^2, +-; others get their number."""
     assert (

@@ -168,6 +168,7 @@ def test_new_motion_adds_to_both_loads(folder, tmp_path):
     assert (found.save(tmp_path / "motion", plots=False) / "prediction.csv").is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_plan_keeps_limits_and_waypoints(folder, tmp_path, line):
     """Plan keeps the limits, and passes the waypoints."""
@@ -217,33 +218,50 @@ NOT_THERE = ("empty.csv", "absent/load.csv", "--options", "options.toml", "--no-
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
-        (("identify", "dualv", "reversed.csv", "--validate", "other.csv", "--no-plots"), 1, "fail above 30 %"),
-        (("fit", "dualv", "wrong.csv", "--validate", "poses.csv"), 1, "worse than the nominal"),
+        pytest.param(
+            ("identify", "dualv", "reversed.csv", "--validate", "other.csv", "--no-plots"),
+            1,
+            "fail above 30 %",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            ("fit", "dualv", "wrong.csv", "--validate", "poses.csv"),
+            1,
+            "worse than the nominal",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(("identify", "dualv", *NOT_THERE), 0, "seems absent from its recordings", marks=pytest.mark.slow),
-        pytest.param(("identify", "dualv", NOT_THERE[1], *NOT_THERE[2:]), 0, "record a run without it",
-                     marks=pytest.mark.slow),
-        *((words, 2, said) for words, said in (
-        (("identify", "dualv", "three.csv"), "3 joints"),
-        (("identify", "dualv", "swapped.csv"), "swapped.csv: sample 1: the loops"),
-        (("identify", "dualv", "load.csv", "--method", "didim"), "needs the closed loop"),
-        (("identify", "dualv", "load.csv", "--friction", "stribeck"), "standard friction only"),
-        (("fit", "dualv", "passive.csv"), "passive joint"),
-        (("fit", "dualv", "three.csv"), "'motor1' is missing"),
-        (("excite", "dualv", "--lock", "motor1"), "lock is for serial arms"),
-        (("excite", "dualv", "--goal", "wrist=0.1"), "'wrist' is not one of raw, normalised"),
-        (("excite", "dualv", "--options", "options.toml", "--load", "tool"), "payload 'tool' is not one of 5"),
-        (("plan", "dualv", "--waypoints", "empty.csv"), "neither the platform's coordinates (x, y, rz)"),
-        (("plan", "dualv", "--waypoints", "outside.csv"), "waypoint 2: joint 1 at 0.3"),
-        (("plan", "dualv", "--waypoints", "way.csv", "--shorten", 5), "shorten is for serial arms"),
-        (("fit", "dualv", "poses.csv", "--model", "stiffness"), "model 'stiffness' is for serial arms"),
-        (("fit", "dualv", "readings.csv", "--tolerance", 0.1), "a tolerance needs a measured platform position"),
-        (("identify", "dualv", "load.csv", "--base", "link0"), "base 'link0'"),
-        (("export", "dualv"), "give --into FOLDER"),
-        (("select", "dualv"), "choosing poses is for serial arms"),
-        (("new", "--robot", "dualv", "--instrument", "cmm"), "a guided session is for serial arms"),
-        )),
+        pytest.param(
+            ("identify", "dualv", NOT_THERE[1], *NOT_THERE[2:]), 0, "record a run without it", marks=pytest.mark.slow
+        ),
+        *(
+            (words, 2, said)
+            for words, said in (
+                (("identify", "dualv", "three.csv"), "3 joints"),
+                (("identify", "dualv", "swapped.csv"), "swapped.csv: sample 1: the loops"),
+                (("identify", "dualv", "load.csv", "--method", "didim"), "needs the closed loop"),
+                (("identify", "dualv", "load.csv", "--friction", "stribeck"), "standard friction only"),
+                (("fit", "dualv", "passive.csv"), "passive joint"),
+                (("fit", "dualv", "three.csv"), "'motor1' is missing"),
+                (("excite", "dualv", "--lock", "motor1"), "lock is for serial arms"),
+                (("excite", "dualv", "--goal", "wrist=0.1"), "'wrist' is not one of raw, normalised"),
+                (("excite", "dualv", "--options", "options.toml", "--load", "tool"), "payload 'tool' is not one of 5"),
+                (("plan", "dualv", "--waypoints", "empty.csv"), "neither the platform's coordinates (x, y, rz)"),
+                (("plan", "dualv", "--waypoints", "outside.csv"), "waypoint 2: joint 1 at 0.3"),
+                (("plan", "dualv", "--waypoints", "way.csv", "--shorten", 5), "shorten is for serial arms"),
+                (("fit", "dualv", "poses.csv", "--model", "stiffness"), "model 'stiffness' is for serial arms"),
+                (
+                    ("fit", "dualv", "readings.csv", "--tolerance", 0.1),
+                    "a tolerance needs a measured platform position",
+                ),
+                (("identify", "dualv", "load.csv", "--base", "link0"), "base 'link0'"),
+                (("export", "dualv"), "give --into FOLDER"),
+                (("select", "dualv"), "choosing poses is for serial arms"),
+                (("new", "--robot", "dualv", "--instrument", "cmm"), "a guided session is for serial arms"),
+            )
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_is_said(folder, tmp_path, capsys, words, code, said):
     command, *rest = [folder / word if str(word).endswith((".csv", ".toml")) else word for word in words]
     out = tmp_path / "out"
@@ -252,6 +270,7 @@ def test_what_is_wrong_is_said(folder, tmp_path, capsys, words, code, said):
     assert said in "".join(capsys.readouterr())
 
 
+@pytest.mark.slow
 def test_unread_and_dropped_parts_are_noted(folder, tmp_path):
     """Contradicting encoders, unread passive joints, uncarried payloads and dropped parameters are noted."""
     words = ["--options", folder / "dropped.toml", "--out", tmp_path, "--no-plots"]

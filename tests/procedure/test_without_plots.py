@@ -58,6 +58,7 @@ def test_plots_and_none_exclude_each_other(cell, calib):
     assert code == 2 and "gif" in said and "png" in said
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_no_half_made_figures(cell, calib, monkeypatch, undrawn):
     """Ctrl-C while figures are drawn leaves nothing half made."""
     measured = cell.write("m.csv", cell.measure(40))

@@ -61,7 +61,7 @@ def test_distances_by_hand(balls):
     assert distances["one", "three"] == pytest.approx(np.hypot(1.5, 0.5) - 0.2)
 
 
-@pytest.mark.parametrize("arm", ["balls", "lwr4plus", "ur5"])
+@pytest.mark.parametrize("arm", ["balls", "lwr4plus", pytest.param("ur5", marks=pytest.mark.slow)])
 def test_gradients_follow_the_witness_points(arm, balls):
     box = Obstacle("box", "box", (0.3, 0.4, 0.5), pose(position=[0.5, 0.1, 0.4]))
     if arm == "balls":  # a continuous joint, a joint about -z
@@ -143,7 +143,10 @@ def test_capsules_along_a_chain():
     assert 0.05 < free.mean() < 0.95
 
 
-@pytest.mark.parametrize("arm", ["lwr4plus", "ur5", "rv2sq", "motley"])
+@pytest.mark.parametrize(
+    "arm",
+    [pytest.param("lwr4plus", marks=pytest.mark.slow), "ur5", "rv2sq", pytest.param("motley", marks=pytest.mark.slow)],
+)
 def test_capsules_measure_as_coal_does(arm):
     """Capsule by capsule, over random postures: against each other, floor, box, sphere and cylinder."""
     import coal

@@ -41,7 +41,10 @@ def study_poses(count: int, seed: int) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("robot", "seeds"),
-    [("lwr4plus", 10), *(pytest.param(name, 30, marks=pytest.mark.slow) for name in ("lwr4plus", "ur10"))],
+    [
+        pytest.param("lwr4plus", 10, marks=pytest.mark.slow),
+        *(pytest.param(name, 30, marks=pytest.mark.slow) for name in ("lwr4plus", "ur10")),
+    ],
 )
 def test_planted_truth_is_recovered(robot: str, seeds: int) -> None:
     """The planted truth is recovered within its covariance."""
@@ -58,6 +61,7 @@ def test_planted_truth_is_recovered(robot: str, seeds: int) -> None:
     assert 0.8 < np.mean(ratios) < 1.2
 
 
+@pytest.mark.slow
 def test_hidden_part_has_size_of_paper() -> None:
     """Its size was chosen for this: the cell is as bad as the paper's, which says nothing of the fit."""
     cell = lwr4plus_cell()
@@ -67,6 +71,7 @@ def test_hidden_part_has_size_of_paper() -> None:
     assert 0.6 < np.median(errors) < 1.1  # paper, Table 3: 0.80 mm
 
 
+@pytest.mark.slow
 def test_stated_sigma_is_the_spread() -> None:
     """The stated sigma is the spread of repeated measurements."""
     bars = SimulatedInstrument(base_frame=np.eye(4), encoder_sigma=0.0)

@@ -46,6 +46,7 @@ def test_seeds_repeat_an_arm_and_its_files():
     assert np.abs(arm.measure(q, seed=1).position - arm.measure(q).position).max() > 1e-6
 
 
+@pytest.mark.slow
 def test_a_fit_comes_near_the_hidden_truth():
     """What no rigid geometry describes remains; the fit itself, and its robot newly placed, are both compared."""
     arm = calib.population("ur5", 1, seed=5)[0]

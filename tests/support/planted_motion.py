@@ -1,6 +1,6 @@
 """An arm of three joints with known dynamics, moved along Fourier series, and its recordings."""
 
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -119,7 +119,23 @@ def series(
 
 def case(name: str, seed: int, carried: tuple[str, ...] = (), band: float = 10.0, gains=None, **settings) -> Case:
     """Return a recorded case of `series` with other settings; with gains [N m/A] its currents."""
-    log = series(seed, payload=bool(carried), **settings)
+    values = tuple((settings.pop("values", None) or {}).items())
+    hashable_gains = None if gains is None else tuple(gains)
+    return _case(name, seed, carried, band, hashable_gains, values, tuple(settings.items()))
+
+
+@lru_cache(maxsize=32)
+def _case(
+    name: str,
+    seed: int,
+    carried: tuple[str, ...],
+    band: float,
+    gains: tuple[float, ...] | None,
+    values: tuple[tuple[str, float], ...],
+    settings: tuple[tuple[str, object], ...],
+) -> Case:
+    """Return a case; tests share it, as none changes it in place."""
+    log = series(seed, values=dict(values), payload=bool(carried), **dict(settings))
     effort = log["tau"]
     if gains is not None:
         effort = effort / np.asarray(gains)

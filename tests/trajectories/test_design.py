@@ -69,6 +69,7 @@ def test_motion_keeps_every_limit():
     assert least.margin == pytest.approx((EFFORT - np.abs(torque))[:, int(least.label[6]) - 1].min(), abs=0.5)
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_motion():
     """The same seed gives the same motion, also through a map."""
     spot = problem(samples=30)
@@ -123,12 +124,14 @@ def test_goals_are_attained_within_gamma():
     assert run.merit < 0.0
 
 
+@pytest.mark.slow
 def test_a_hard_goal_out_of_reach_is_named():
     spot = problem(goals=(AttainmentGoal(Excitation(), 30.0), AttainmentGoal(SLACK, 0.1, 0.0)), samples=30)
     with pytest.raises(NothingFeasible, match=r"torque slack of joints 6, 7.*0\.1"):
         design(spot, starts=1, evaluations=60)
 
 
+@pytest.mark.slow
 def test_free_period_is_shortened_to_limit():
     """A free period is shortened down to a limit."""
     spot = problem(
@@ -187,6 +190,7 @@ def test_domination():
     ]
 
 
+@pytest.mark.slow
 def test_infeasibility_names_constraint():
     """Nothing feasible names the constraint and the excess."""
     with pytest.raises(NothingFeasible, match=r"in 1 start: .* workspace limit \(tool lowest\) by 0\.\d+ m") as caught:
@@ -210,6 +214,7 @@ def test_locked_joint_leaves_no_information():
         design(problem(family=fourier_family((4, 4, 0, 4, 4, 4, 4), 15.0)), starts=1, evaluations=30)
 
 
+@pytest.mark.slow
 def test_interrupting_keeps_the_best_so_far():
     calls = []
 

@@ -77,7 +77,7 @@ def test_evaluation_without_tables_agrees(family):
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=IDS)
-@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("order", [pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow), 3])
 def test_derivative_bound_is_not_idle(family, order):
     """The bound on a derivative holds and is not idle."""
     for seed in range(5):

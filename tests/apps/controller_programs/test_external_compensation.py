@@ -40,6 +40,7 @@ def fitted(tmp_path_factory) -> tuple[Path, Chain]:
     return folder / "fit", chain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["fanuc", "krl"])
 def test_joint_targets_on_a_rail_are_compensated(tmp_path, fitted, name):
     folder, chain = fitted
@@ -57,6 +58,7 @@ def test_joint_targets_on_a_rail_are_compensated(tmp_path, fitted, name):
     assert error.max() < 5e-5 < 5e-4 < nominal_error.max()
 
 
+@pytest.mark.slow
 def test_poses_of_an_arm_on_a_rail_are_refused(tmp_path, fitted, capsys):
     folder, _ = fitted
     program = tmp_path / "p.src"
@@ -65,6 +67,7 @@ def test_poses_of_an_arm_on_a_rail_are_refused(tmp_path, fitted, capsys):
     assert "line 2: poses of an arm with external axes are not compensated" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_offsets_of_a_rail_are_in_millimetres(fitted, capsys):
     folder, _ = fitted
     assert cli.run(["deliver", str(folder), "--for", "krl"]) == 0

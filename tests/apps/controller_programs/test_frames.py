@@ -170,6 +170,7 @@ def test_stated_frame_needs_3_or_6_numbers():
 MAKERS = {"fanuc": "fanuc", "abb": "rapid", "kroshu": "krl", "kuka": "krl", "motoman": "yaskawa", "universal": "ur"}
 
 
+@pytest.mark.slow
 def test_rules_match_makers_descriptions(data):
     """Of all public arms with a link `base`: the controller's rule puts its base there, too."""
     folder = data / "public_arms"

@@ -105,6 +105,7 @@ def test_gaps_of_program_named_or_stated(fitted, tmp_path, capsys):
     assert code == 2 and "the active tool" in err and "the active user frame" in err
 
 
+@pytest.mark.slow
 def test_foreign_configuration_is_said(fitted, tmp_path, capsys):
     """A configuration that is not the pose's is said with its line."""
     folder, chain = fitted

@@ -101,6 +101,7 @@ def test_a_bent_and_a_loose_tool_are_named() -> None:
     assert not [one for one in tools({name: row for name, row in used.items() if row[0] == "T2"}) if one.findings()]
 
 
+@pytest.mark.slow
 def test_few_agreeing_arms_accuse_no_tool() -> None:
     """Of three arms with each of two equal tools, 2.6 σ are exceeded as seldom as said, in distance and in error.
 

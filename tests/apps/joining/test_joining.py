@@ -86,6 +86,7 @@ def test_shuffled_points_found_by_geometry(tmp_path, joints, arm, q):
     )
 
 
+@pytest.mark.slow
 def test_wrong_order_or_arm_is_noticed(tmp_path, joints, arm, q):
     """A wrong order of rows is noticed, and points of another arm are refused."""
     points = seen(arm, q)
@@ -143,6 +144,7 @@ def test_systematic_names_need_no_options(tmp_path, arm, q):
     np.testing.assert_allclose(joined.table.numbers("A3", "angle"), q[joined.poses, 2], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_joints_as_a_controller_shows_them(tmp_path):
     """Joint values as a FANUC shows them are named as such, and converted where the options say so."""
     robot = Path(__file__).parents[1] / "controller_programs/fanuc_m20ia.urdf"
@@ -197,6 +199,7 @@ def planned(tmp_path: Path, q: np.ndarray) -> Session:
     return session
 
 
+@pytest.mark.slow
 def test_session_takes_points_alone(planned, arm, q):
     """A session takes points alone with the planned joints."""
     path = write(planned.path("3-measured/points.csv"), POINT, seen(arm, q)[SHUFFLED])
@@ -208,6 +211,7 @@ def test_session_takes_points_alone(planned, arm, q):
     np.testing.assert_allclose(block.q, q[sorted(SHUFFLED)], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_interrupted_run_has_a_second_file(planned, arm, q):
     """An interrupted run goes on in a second file."""
     points = seen(arm, q)

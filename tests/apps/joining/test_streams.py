@@ -268,6 +268,7 @@ def test_instrument_clock_step_is_refused(tmp_path, files, size):
     check_step(files[0], stream, "ur5", size, "s.csv", row)
 
 
+@pytest.mark.slow
 def test_log_clock_step_is_found_in_the_log(tmp_path, files):
     """A step of the log's clock is found in the log."""
     log, row = stepped(files[0], tmp_path / "l.csv", 0.6, 0.05)
@@ -357,7 +358,10 @@ REFUSED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", REFUSED)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(case, marks=[pytest.mark.slow] * (case in ("too short", "a jump of the clock"))) for case in REFUSED],
+)
 def test_unjoinable_is_refused_with_cause(tmp_path, files, case):
     """What cannot be joined is refused with the cause."""
     change, header, says = REFUSED[case]
@@ -365,6 +369,7 @@ def test_unjoinable_is_refused_with_cause(tmp_path, files, case):
         joined(files[0], changed(files[1], tmp_path / "t.csv", change, header))
 
 
+@pytest.mark.slow
 def test_stream_of_other_motion_is_refused(tmp_path, files):
     """A stream of another motion, or a log at rest, is refused."""
     other, _ = recorded(tmp_path, rigid(perturbed_cell(load("ur5"), 3)), 5)

@@ -154,6 +154,7 @@ def test_the_same_log_is_not_counted_twice(identified: Path, tmp_path: Path):
     assert update.state.bank.count == once.state.bank.count
 
 
+@pytest.mark.slow
 def test_logs_are_taken_in_the_order_of_their_dates(identified: Path, tmp_path: Path):
     early, late = log(tmp_path, "2026-03-01", 14), log(tmp_path, "2026-03-09", 15)
     update = update_dynamics(identified, [late, early])
@@ -201,6 +202,7 @@ def test_a_sketch_recognises_a_part_of_a_log():
     assert common_share(hashes + np.uint64(1), sketch(hashes)) == 0.0
 
 
+@pytest.mark.slow
 def test_the_log_of_the_identification_is_not_counted_twice(identified: Path, tmp_path: Path):
     series = planted.series(0)
     half = {name: values[: len(values) // 2 : 2] for name, values in series.items()}
@@ -232,6 +234,7 @@ def from_home(folder: Path, date: str, seed: int) -> str:
     return str(path)
 
 
+@pytest.mark.slow
 def test_two_logs_from_the_same_rest_are_two_logs(identified: Path, tmp_path: Path):
     first, second = from_home(tmp_path, "2026-03-05", 13), from_home(tmp_path, "2026-03-06", 14)
     series = [np.load(path) for path in (first, second)]

@@ -94,6 +94,7 @@ def test_sigma_covers_the_errors(tmp_path, in_hand):
     assert 0.8 < np.sqrt(np.mean(np.square(scaled))) < 1.25
 
 
+@pytest.mark.slow
 def test_detector_poses_with_joints_are_read_as_their_inverse(tmp_path, capsys):
     """Poses of the board in a camera on the arm are read as their inverse, and weighed as they were measured."""
     arm = calib.load("ur5").chain
@@ -123,7 +124,7 @@ def test_detector_poses_with_joints_are_read_as_their_inverse(tmp_path, capsys):
         (("vector", "rvec"), "{0}_{1}", 1.0),
         (("kuka", "matrix"), "{1}_{0}", 1.0),
         (("zyz", "vector"), "{0}.{1}", 1e3),
-        (("w first", "quaternion"), "{0}_{1}", 1e2),
+        pytest.param(("w first", "quaternion"), "{0}_{1}", 1e2, marks=pytest.mark.slow),
     ],
 )
 def test_conventions_and_units_are_found_by_what_agrees(tmp_path, forms, names, mm):
@@ -165,10 +166,16 @@ def opencv(path: Path, robot, seen, in_hand: bool):
     storage.release()
 
 
-@pytest.mark.parametrize("in_hand", [True, False])
+@pytest.mark.parametrize("in_hand", [pytest.param(True, marks=pytest.mark.slow), False])
 @pytest.mark.parametrize(
     ("write", "name"),
-    [(easy_handeye, "s.yaml"), (moveit, "s.yaml"), (opencv, "s.yml"), (opencv, "s.xml"), (opencv, "s.json")],
+    [
+        (easy_handeye, "s.yaml"),
+        (moveit, "s.yaml"),
+        (opencv, "s.yml"),
+        pytest.param(opencv, "s.xml", marks=pytest.mark.slow),
+        pytest.param(opencv, "s.json", marks=pytest.mark.slow),
+    ],
 )
 def test_files_of_other_tools(tmp_path, write, name, in_hand):
     """Samples of easy_handeye, MoveIt and OpenCV are read, also where the robot's poses are stored as their inverse."""
@@ -208,6 +215,7 @@ def test_closed_form_agrees(tmp_path):
     assert np.abs(off(fit.transforms[0], park_martin(robot, seen))).max() < 1.5e-3
 
 
+@pytest.mark.slow
 def test_camera_turned_halfway_is_named_with_its_row(tmp_path):
     """A camera that was turned by 180° between two rows is named, with the rows."""
     robot, seen = sampled(6, 14)
@@ -255,6 +263,7 @@ def test_drift_and_errors_of_the_arm_are_no_steps():
         assert small_step(bent, inv(seen[order])) is None
 
 
+@pytest.mark.slow
 def test_first_of_two_turns_is_named(tmp_path):
     """Of two turns, the first is named with its rows."""
     robot, camera = turned_later(3, 24, np.pi / 2, 8, 16)
@@ -262,7 +271,8 @@ def test_first_of_two_turns_is_named(tmp_path):
     assert "rows 1–8 and 9–" in text
 
 
-@pytest.mark.parametrize(("lag", "first"), [(3, 0), (-1, 8)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("lag", "first"), [pytest.param(3, 0, marks=pytest.mark.slow), (-1, 8)])
 def test_rows_that_lag_are_named_with_the_first_of_them(tmp_path, lag, first):
     """Camera rows that lag behind the robot's, or lead them, are named with lag and row, whichever the mounting."""
     robot, seen = sampled(10, 24, in_hand=lag > 0)
@@ -277,6 +287,7 @@ def test_rows_that_lag_are_named_with_the_first_of_them(tmp_path, lag, first):
     assert f"with the robot's poses {rows}" in str(fit)
 
 
+@pytest.mark.slow
 def test_mounting_that_nothing_says_is_asked_for(tmp_path):
     """Poses that agree as they are may be of a board on the arm, or of a camera in the board: it is asked."""
     path = table(tmp_path / "pairs.csv", *sampled(7, in_hand=False))
@@ -296,6 +307,7 @@ def test_too_few_pairs_are_refused(tmp_path):
             calib.hand_eye(None, table(tmp_path / "pairs.csv", robot[:count], seen[:count]))
 
 
+@pytest.mark.slow
 def test_failed_frames_are_not_for_use(tmp_path, capsys):
     """With the verdict fail no frame is written for a controller or into a URDF; the verdict states an error once."""
     robot, seen = sampled(6, 14)
@@ -314,6 +326,7 @@ def test_failed_frames_are_not_for_use(tmp_path, capsys):
     assert run(["hand-eye", str(path)]) == 2 and "1 pair of poses" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_turns_about_one_axis_leave_positions_open(tmp_path, capsys):
     """With turns about one axis only, positions are not identifiable, and no frame is offered for use."""
     path = table(tmp_path / "pairs.csv", *sampled(8, turns=(0.0, 0.0, 1.0)))
@@ -326,6 +339,7 @@ def test_turns_about_one_axis_leave_positions_open(tmp_path, capsys):
         assert np.isnan(frame.sigma[:3]).all()
 
 
+@pytest.mark.slow
 def test_pass_prints_no_error_above_the_tolerance(tmp_path):
     """Held-out poses within the tolerance do not make a pass of fitted poses above it."""
     robot, seen = sampled(8, 36)
@@ -340,6 +354,7 @@ def test_pass_prints_no_error_above_the_tolerance(tmp_path):
     assert judged.verdict == "marginal" and "rms on the fitted poses, above the tolerance" in str(judged)
 
 
+@pytest.mark.slow
 def test_result_is_written_into_a_urdf(tmp_path, capsys):
     """The URDF with camera and board has both frames where the result says."""
     source = tmp_path / "arm.urdf"
@@ -357,7 +372,9 @@ def test_result_is_written_into_a_urdf(tmp_path, capsys):
 
 
 @pytest.mark.skipif(not CASE.is_dir(), reason=f"no data: {CASE}")
-@pytest.mark.parametrize("name", ["pairs.csv", "samples.yaml", "joints_cam_in_board.csv"])
+@pytest.mark.parametrize(
+    "name", ["pairs.csv", "samples.yaml", pytest.param("joints_cam_in_board.csv", marks=pytest.mark.slow)]
+)
 def test_reported_case(name):
     """The public reports' pairs give the camera at 30, -60, 45 mm."""
     carried, _ = calib.hand_eye(CASE / "arm.urdf", CASE / name).transforms

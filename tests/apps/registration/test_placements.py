@@ -26,6 +26,7 @@ def measured(seed: int, count: int = 12, noise: float = 1e-4) -> Poses:
     return Poses(q, ARM.joint_names, position, turns.as_quat())
 
 
+@pytest.mark.slow
 def test_frames_are_recovered_within_sigma():
     """Frames are recovered within their sigma."""
     truths = {"tool": TOOL, "base": STATION, "instrument": invert(STATION)}
@@ -49,7 +50,7 @@ def test_positions_leave_orientation_open():
     np.testing.assert_allclose(tool.pose[:3, 3], TOOL[:3, 3], atol=5e-4)
 
 
-@pytest.mark.parametrize(("limit", "level"), [(1.0, "pass"), (0.01, "fail")])
+@pytest.mark.parametrize(("limit", "level"), [(1.0, "pass"), pytest.param(0.01, "fail", marks=pytest.mark.slow)])
 def test_command_says_what_function_says(tmp_path, capsys, limit, level):
     """The command says what the function says."""
     full, path = measured(2), tmp_path / "m.csv"

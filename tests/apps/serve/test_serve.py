@@ -115,6 +115,7 @@ def points_and_joints(session: Session, count: int = 16) -> tuple[bytes, bytes, 
     return "\n".join(points).encode("utf-16"), "\n".join(joints).encode(), q
 
 
+@pytest.mark.slow
 def test_joints_and_points_apart_are_joined_in_the_page(session: Session, client: TestClient) -> None:
     """Columns are asked for, the pairing is shown, and taken as the measurement of the step."""
     points, joints, q = points_and_joints(session)
@@ -156,6 +157,7 @@ def halves_of_a_log() -> tuple[bytes, bytes]:
     return contents[0], contents[1]
 
 
+@pytest.mark.slow
 def test_two_logs_of_one_motion_are_joined_in_the_page(tmp_path: Path) -> None:
     """Half a recording waits for the other half; both are paired by time, shown, and taken under the awaited name."""
     payloads = stated_payloads(["load=3.28 at 0,0,0.05"])
@@ -233,6 +235,7 @@ def test_halves_are_told_by_columns_and_names(header: tuple[str, ...], stem: str
     assert split_logs.half_of(header, stem) == half
 
 
+@pytest.mark.slow
 def test_mistakes_in_files_are_shown_with_their_cure(session: Session, client: TestClient) -> None:
     """What cannot be read is no measurement; the page says why, and what to do."""
     names = ",".join(f"joint{k}" for k in range(1, 8))
@@ -460,6 +463,7 @@ def test_in_a_browser_nothing_is_lost(session: Session, browser: Any) -> None:
         served.process.wait(20)
 
 
+@pytest.mark.slow
 def test_the_view_is_of_this_computer_only(session: Session, client: TestClient) -> None:
     """Rerun's viewer and its data listen here alone; another computer is told so, and a session without a recording."""
     rerun = pytest.importorskip("rerun")

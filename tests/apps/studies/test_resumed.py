@@ -44,6 +44,7 @@ def timeless(rows: list[TrialRow]) -> list[str]:
     return sorted(str({k: v for k, v in asdict(row).items() if k not in ("seconds", "cpu")}) for row in rows)
 
 
+@pytest.mark.slow
 def test_existing_rows_are_not_run_again(study: Path, tmp_path: Path):
     """More runs are added; a file edited half-way keeps what its new conditions share with the old."""
     first = run_study([study], tmp_path / "out", runs=1, plots=False)
@@ -58,6 +59,7 @@ def test_existing_rows_are_not_run_again(study: Path, tmp_path: Path):
     assert run_study([study], tmp_path / "out", runs=2, plots=False).progress.done == 0
 
 
+@pytest.mark.slow
 def test_only_changed_method_is_run_again(study: Path, tmp_path: Path, monkeypatch):
     """Its old rows do not count, in a report alone neither; a row of today states the change."""
     run_study([study], tmp_path / "out", runs=2, plots=False)

@@ -46,6 +46,7 @@ def test_rows_are_read_during_writes(tmp_path: Path):
         assert len(read_rows(tmp_path)) == 3
 
 
+@pytest.mark.slow
 def test_kill_during_write_loses_no_row(tmp_path: Path):
     """The process dies with a transaction open: the next command finds the rows that were kept, and goes on."""
     script = f"""

@@ -119,6 +119,7 @@ def test_start_values_run_from_each_guess(tmp_path: Path):
     assert seeds == {"wls": [0, 3, 6], "hopfield": list(range(9))}
 
 
+@pytest.mark.slow
 def test_guesses_are_same_for_every_data_set():
     """Guesses are the same for every data set."""
     one, two, three = (make_experiment(replace(SHORT, guesses=2), seed).problem for seed in range(3))

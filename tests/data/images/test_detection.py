@@ -174,11 +174,13 @@ def test_the_old_charuco_pattern_is_read_and_named():
     [
         ("new", {"columns": 7, "rows": 9}, "columns and rows are exchanged; they fit columns = 9, rows = 7"),
         ("new", {"columns": 8, "rows": 6}, "squares are counted, not inner corners; they fit columns = 9, rows = 7"),
-        ("new", {"columns": 6, "rows": 8}, "exchanged, and squares are counted"),
-        ("new", {"columns": 12, "rows": 5}, "they fit a board of 9 columns"),
+        pytest.param("new", {"columns": 6, "rows": 8}, "exchanged, and squares are counted", marks=pytest.mark.slow),
+        pytest.param("new", {"columns": 12, "rows": 5}, "they fit a board of 9 columns", marks=pytest.mark.slow),
         ("old", {"columns": 7, "rows": 5, "legacy": False}, "they fit columns = 8, rows = 6, legacy = true"),
         ("tags", {"columns": 3, "rows": 4}, "columns and rows are exchanged; they fit columns = 4, rows = 3"),
-        ("chessboard", {"columns": 9, "rows": 6}, "a chessboard of 10 x 7 squares is seen"),
+        pytest.param(
+            "chessboard", {"columns": 9, "rows": 6}, "a chessboard of 10 x 7 squares is seen", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_board_stated_wrongly_is_named(kind, stated, words):

@@ -174,6 +174,7 @@ def write_bag(path, compressed: bool, moving: int) -> None:
                 stamp += 10_000_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compressed", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_images_of_bag_take_stamped_joints(compressed, folder, tmp_path):
     """Images of a bag take the joints of their stamps."""

@@ -109,6 +109,7 @@ def test_a_velocity_that_stands_is_found():
     assert (fault.kind, fault.joint) == ("velocity", JOINT)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
 def test_only_clipped_recordings_are_found():
     """Open recordings are sound, and clipped ones are found."""

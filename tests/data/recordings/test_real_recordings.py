@@ -15,9 +15,9 @@ UR = "ur10e_innopolis/ur-20_02_19_14harm50sec"
 @pytest.mark.parametrize(
     ("file", "samples", "joints", "kind", "clock"),
     [
-        (PANDA, 12326, 7, "torque", "counted"),
+        pytest.param(PANDA, 12326, 7, "torque", "counted", marks=pytest.mark.slow),
         (LWR, 5027, 7, "torque", "even"),
-        ("staubli_tx40/tx40_first_5p4s.npz", 27000, 6, "torque", "stamps"),
+        pytest.param("staubli_tx40/tx40_first_5p4s.npz", 27000, 6, "torque", "stamps", marks=pytest.mark.slow),
         ("kuka_kr300_tuk/traj_A.npz", 2501, 6, "torque", "stamps"),
         ("tiago_laas/dynamic.npz", 5870, 8, "current", "even"),
         (f"{UR}.npz", 4772, 6, "current", "stamps"),
@@ -44,6 +44,7 @@ def test_lwr_repeats_at_one_frequency(data):
     assert repeats(*halves) > 0.8
 
 
+@pytest.mark.slow
 def test_panda_and_ur10e_do_not_repeat(data):
     """The Panda and the UR10e do not repeat, but a loaded run does."""
     first, rest = (make_motion(read_recording(f"{data / PANDA}@{part}")) for part in ("0:9.4", "9.4:"))

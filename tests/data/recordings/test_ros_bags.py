@@ -90,7 +90,7 @@ def dynamic(bag: Bag, time: int, q: np.ndarray, v: np.ndarray, tau: np.ndarray, 
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3"])
-@pytest.mark.parametrize("effort", ["effort", "torque", "current"])
+@pytest.mark.parametrize("effort", ["effort", pytest.param("torque", marks=pytest.mark.slow), "current"])
 def test_dynamic_joint_states_have_the_torques(filled, series, kind, effort):
     """Where joint states have NaN efforts, those of the dynamic joint states count; currents are named so."""
 

@@ -220,6 +220,7 @@ def test_shifted_repeat_is_recognised():
     assert repeats(training, other) < 0.2
 
 
+@pytest.mark.slow
 def test_quiet_velocities_keep_the_corner():
     """A joint reverses against Coulomb friction: the filter that suits accelerations alone makes Ia 1 % too large."""
     ia, fv, fc, rate, fine = 0.8, 1.0, 2.0, 1000.0, 10

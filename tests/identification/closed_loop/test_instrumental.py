@@ -94,6 +94,7 @@ def test_instruments_are_right_unlike_ols():
     assert all(result.verdict.biased() and result.valid for result in results)
 
 
+@pytest.mark.slow
 def test_mean_of_noisy_sign_is_restored(monkeypatch):
     """A velocity noise of many widths of the Coulomb sign shrinks its column of W: IV makes up by too much Fc."""
     case = log(3e-3, 0, 0.02)
@@ -123,7 +124,9 @@ def test_noisy_sign_where_simulation_lags():
     assert np.abs(relative).max() < 0.06
 
 
-@pytest.mark.parametrize(("runs", "accused"), [(1, 0), pytest.param(12, 1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("runs", "accused"), [pytest.param(1, 0, marks=pytest.mark.slow), pytest.param(12, 1, marks=pytest.mark.slow)]
+)
 def test_exact_positions_clear_least_squares(runs, accused):
     """At 1 %: of 12 honest runs at most one is accused."""
     results = [found(log(0.0, seed)) for seed in range(runs)]
@@ -133,6 +136,7 @@ def test_exact_positions_clear_least_squares(runs, accused):
         assert error(result.fit.estimate) < 1e-2
 
 
+@pytest.mark.slow
 def test_didim_agrees_with_constraints():
     """DIDIM and constraints come to the same."""
     case = log(1e-3, 3)
@@ -143,6 +147,7 @@ def test_didim_agrees_with_constraints():
     assert error(plain.ordinary.estimate) > 2.0 * error(plain.fit.estimate)
 
 
+@pytest.mark.slow
 def test_binding_bound_removes_spread():
     """A bound that binds leaves no spread of its parameter, and less of the others."""
     case = log(1e-3, 3, np.inf)
@@ -158,7 +163,9 @@ def test_binding_bound_removes_spread():
     assert held.constrained is not None and held.constrained.findings[0].code == "on-its-bound"
 
 
-@pytest.mark.parametrize("method", ["iv", "didim"])
+@pytest.mark.parametrize(
+    "method", [pytest.param("iv", marks=pytest.mark.slow), pytest.param("didim", marks=pytest.mark.slow)]
+)
 def test_curved_constraint_holds_in_rounds(method):
     """A curved constraint holds in every round."""
     case = log(1e-3, 3)
@@ -172,13 +179,16 @@ def test_curved_constraint_holds_in_rounds(method):
     assert held.constrained is not None and [one.name for one in held.constrained.binding] == ["Fv1 * Fv2 >= 0.7"]
 
 
-@pytest.mark.parametrize("wrong", [PD.slower(3.0), controllers.pd(1.4 * PD.kp, 0.7 * PD.kd)])
+@pytest.mark.parametrize(
+    "wrong", [PD.slower(3.0), pytest.param(controllers.pd(1.4 * PD.kp, 0.7 * PD.kd), marks=pytest.mark.slow)]
+)
 def test_wrong_controller_still_serves(wrong):
     """A wrong controller, down to a third of the bandwidth, still serves."""
     result = found(log(1e-3, 4), Loop(wrong, motion(), EVERY))
     assert error(result.fit.estimate) < 0.05 < error(result.ordinary.estimate)
 
 
+@pytest.mark.slow
 def test_loop_ends_soon_wherever_it_starts():
     """The loop ends in few rounds, wherever it starts."""
     case = log(1e-3, 2)
@@ -187,6 +197,7 @@ def test_loop_ends_soon_wherever_it_starts():
     assert np.allclose(near.fit.estimate.values, far.fit.estimate.values, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_gains_of_other_inertia_follow():
     """Half the gains, stated for half the inertia, are the robot's own once the estimate is."""
 
@@ -220,6 +231,7 @@ def test_the_controller_is_read_from_its_log():
     assert np.allclose(result.controller.kp, cascade.kp, rtol=0.2)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_done_is_said():
     case = log(1e-4, 1)
     with pytest.raises(UsageError, match="not one of iv, didim"):
@@ -237,6 +249,7 @@ def test_what_cannot_be_done_is_said():
     assert instrumental_variables.settled(found(case).fit, found(case).fit)
 
 
+@pytest.mark.slow
 def test_unexcited_parameters_are_named():
     """Instruments that do not excite a parameter are named."""
     still = controllers.Reference(motion().t, motion().q * [1.0, 0.0], motion().v * [1.0, 0.0], motion().a * [1.0, 0.0])

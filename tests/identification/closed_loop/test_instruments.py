@@ -77,6 +77,7 @@ def test_columns_as_instruments_give_ols():
     assert found.covariance == pytest.approx(ordinary.covariance, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_instruments_are_unbiased_unlike_ols():
     """Instruments are unbiased where least squares is not, and their covariance is true."""
     errors, sizes, naive = [], [], []
@@ -106,6 +107,7 @@ def test_noise_in_columns_is_cured_too():
     assert np.abs(np.mean(cured, axis=0)).max() < 4 * np.std(cured) / np.sqrt(60)
 
 
+@pytest.mark.slow
 def test_durbin_wu_hausman_keeps_its_level():
     """The Durbin-Wu-Hausman test keeps its level where least squares is right."""
     verdicts = [exogeneity(instrument(*planted(seed, miss=0.3))) for seed in range(400)]
@@ -135,6 +137,7 @@ def test_explained_columns_go_untested():
     assert exogeneity(instrument(z, w, y)).degrees[0] == 2
 
 
+@pytest.mark.slow
 def test_autocorrelation_needs_inflation():
     """Autocorrelated noise needs the inflation to keep the level."""
 
@@ -221,6 +224,7 @@ def test_constrained_forms_match_formulas():
         assert found == pytest.approx(np.append(free[:2] + moved, 0.4), rel=1e-9)
 
 
+@pytest.mark.slow
 def test_forms_part_where_a_bound_is_wrong():
     """Weak instruments: 0.24 σ apart at the true bound, 2.4 σ with one 6 σ off, where the slides' form errs less."""
     apart, errors = [], []

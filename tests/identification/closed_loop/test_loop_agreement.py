@@ -52,6 +52,7 @@ def test_velocity_formed_otherwise_is_named():
     np.testing.assert_allclose(found.factor, 1.0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_noise_beyond_smoothed_sign_is_borne():
     """Noise in the loop wider than the smoothed sign is told, and leaves IV right."""
     noisy = problem(0, 1e-3, v0=0.005)
@@ -83,6 +84,7 @@ def test_robust_estimates_get_a_note(name: str):
     np.testing.assert_allclose(test.found.stray, 0.5, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_loop_explaining_too_little_is_named():
     """0.8 of the reference's velocity, whose gains no tracking error tells: 4 for 2 %, and 6 for 0.8."""
     _, test = judged("iv", 1e-5, 0.05, share=0.8, timing="stated")
@@ -91,6 +93,7 @@ def test_loop_explaining_too_little_is_named():
     assert [row[-10:] for row in said.values["rows"]] == ["at joint 1", "at joint 2"]
 
 
+@pytest.mark.slow
 def test_weak_instruments_are_named():
     """Positions of 1.5 mrad noise: Cragg-Donald 8.8; of 2 mrad the estimate does not settle."""
     _, test = judged("iv", 1.5e-3, 0.05)

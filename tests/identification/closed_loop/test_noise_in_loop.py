@@ -60,13 +60,13 @@ def identified(noise: float, in_loop: bool, seed: int, rows: TorqueRows = MOTOR)
     return identify_instrumental(model, base, loops.pairs, case.motion.decimator)
 
 
-@pytest.mark.parametrize("in_loop", [True, False])
-def test_torques_tell_where_noise_is(in_loop):
+@pytest.mark.parametrize("rows", [MOTOR, pytest.param(LINK, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("in_loop", [pytest.param(True, marks=pytest.mark.slow), False])
+def test_torques_tell_where_noise_is(in_loop, rows):
     """Torques answer the noise of the loop, and no noise of the log; link rows have the motors' torques beside them."""
-    for rows in (MOTOR, LINK):
-        noise = identified(1e-3, in_loop, 0, rows).noise[0]
-        np.testing.assert_allclose(noise.share, float(in_loop), atol=0.03)
-        np.testing.assert_allclose(np.hypot(noise.loop, noise.log), 1e-3, rtol=0.05)
+    noise = identified(1e-3, in_loop, 0, rows).noise[0]
+    np.testing.assert_allclose(noise.share, float(in_loop), atol=0.03)
+    np.testing.assert_allclose(np.hypot(noise.loop, noise.log), 1e-3, rtol=0.05)
 
 
 @pytest.mark.slow

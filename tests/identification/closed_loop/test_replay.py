@@ -37,7 +37,7 @@ def recorded() -> tuple[controllers.Reference, np.ndarray, Case]:
     return asked, push, make_case("log", motion)
 
 
-@pytest.mark.parametrize("share", [0.8, 1.0])
+@pytest.mark.parametrize("share", [pytest.param(0.8, marks=pytest.mark.slow), 1.0])
 def test_replay_tracks_as_the_true_robot(share):
     """A model whose friction falls short, fed forward on the true robot, pushed as it was: the same rms within 10 %."""
     _, push, case = recorded()
@@ -70,6 +70,7 @@ def test_better_models_track_better():
     assert errors[0] > errors[1] > errors[2]
 
 
+@pytest.mark.slow
 def test_impossible_model_gets_inertia_added():
     """Motor inertia off the last joint until its own is negative: errors of the true robot's are met within a third."""
     _, push, case = recorded()
@@ -88,6 +89,7 @@ def test_impossible_model_gets_inertia_added():
     assert not sound.inertia_added.any()
 
 
+@pytest.mark.slow
 def test_the_command_reports_it(robot, tmp_path, capsys):
     train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
     out = tmp_path / "out"

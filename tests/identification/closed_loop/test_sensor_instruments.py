@@ -84,6 +84,7 @@ def test_instruments_with_sensors_are_right(rows):
     assert found.valid and found.explains and found.verdict.biased() and not len(found.off)
 
 
+@pytest.mark.slow
 def test_bodiless_rows_have_no_instruments():
     """Rows without bodies have no instruments."""
     model = replace(model_of(BOTH)[0], torque_rows=DRIVE)

@@ -204,7 +204,13 @@ EVERYTHING = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("shape", EVERYTHING)
+# those like another one
+SIMILAR = {"speed", "cubic", "root", "cosine", "cosine_band", "position_table"}
+
+
+@pytest.mark.parametrize(
+    "shape", [pytest.param(shape, marks=[pytest.mark.slow] * (shape in SIMILAR)) for shape in EVERYTHING]
+)
 def test_all_known_friction_is_simulated(shape):
     """What is recorded obeys the identification model.
 

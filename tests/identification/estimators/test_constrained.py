@@ -207,6 +207,7 @@ def test_slides_relation_is_not_the_optimum():
     assert np.abs(slides - solved.values).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_restricted_covariance_over_noises():
     """The restricted covariance is that of estimates over many noises."""
     rng = np.random.default_rng(3)

@@ -50,6 +50,7 @@ def by_joint(data):
     return wls(collect(*rows, np.tile(np.arange(data.target.shape[1]), len(data.target))))
 
 
+@pytest.mark.slow
 def test_correlated_joints_tell_more():
     """Correlated joints tell more together."""
 
@@ -60,7 +61,7 @@ def test_correlated_joints_tell_more():
     assert np.all(gain > 2.0)  # 1 / (1 - 0.9²) = 5.3 where no other joint tells the same
 
 
-@pytest.mark.parametrize("seeds", [50, pytest.param(120, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seeds", [pytest.param(50, marks=pytest.mark.slow), pytest.param(120, marks=pytest.mark.slow)])
 def test_covariance_is_true_on_normal_noise(seeds):
     """The covariance of the estimate is true on normal noise."""
     sizes = []
@@ -71,6 +72,7 @@ def test_covariance_is_true_on_normal_noise(seeds):
     assert np.mean(sizes) == pytest.approx(4.0, abs=4 * np.sqrt(8 / seeds) + 0.2)
 
 
+@pytest.mark.slow
 def test_ten_percent_outliers_do_no_harm():
     """Ten percent of gross outliers are found, and do no harm."""
     harm, clean, sizes = [], [], []

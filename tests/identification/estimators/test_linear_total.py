@@ -58,6 +58,7 @@ def test_scaled_columns_scale_values_only():
     assert scaled.covariance * np.outer(scale, scale) == pytest.approx(plain.covariance, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_tls_is_unbiased_unlike_ols():
     """Total least squares is unbiased where least squares is not, and its covariance is true."""
     errors, sizes, naive = [], [], []

@@ -44,6 +44,7 @@ def errors(name: str, problem: IdentificationProblem) -> tuple[np.ndarray, np.nd
     return found.values - problem.base.transform @ planted.truth(), found.sigma
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise", [*(pytest.param(noise, marks=pytest.mark.slow) for noise in (0.0, 1e-4)), 3e-4])
 def test_maximum_likelihood_sigma_covers(noise):
     """Least squares' own is missed by several sigmas at the last level."""
@@ -59,6 +60,7 @@ def test_maximum_likelihood_beats_ols():
     assert size["ml"] < 0.5 * min(size["wls"], size["tls"])
 
 
+@pytest.mark.slow
 def test_generalised_tls_cures_column_noise():
     """Nearer the truth than least squares and TLS, within its sigma; the same as wls where positions are exact."""
     away = {name: [errors(name, noisy(seed, 3e-4)) for seed in range(3)] for name in ("wls", "tls", "gtls")}
@@ -76,6 +78,7 @@ def test_noise_that_hides_columns_is_told():
     assert found.status is EstimateStatus.RANK_DEFICIENT and "noise of the encoders alone" in str(found.failure)
 
 
+@pytest.mark.slow
 def test_bounded_error_intervals_hold_truth():
     """Intervals of bounded errors hold the truth, and are those of all rows."""
     rng = np.random.default_rng(0)
@@ -122,6 +125,7 @@ def test_neuron_minimises_along_the_gradient(problem):
     assert np.allclose(moved[1], 0.5 * moved[0])
 
 
+@pytest.mark.slow
 def test_neuron_gains_nothing_from_more_data():
     """The survey's variance above ten times that of least squares: so it is with enough samples, the neuron's stays."""
     rng, truth, spread = np.random.default_rng(0), np.array([1.0, -2.0, 0.5, 3.0]), {}
@@ -149,7 +153,9 @@ def test_network_rests_at_least_squares(problem):
     assert np.allclose(rest / norms, size.values, atol=0.01 * size.sigma.min()) and steps < 200_000
 
 
-@pytest.mark.parametrize("name", ["adaline", "hopfield"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("adaline", marks=pytest.mark.slow), pytest.param("hopfield", marks=pytest.mark.slow)]
+)
 def test_network_sigma_covers_training_error(name):
     """The stated sigma of the networks covers their error of training."""
     for seed in range(3):

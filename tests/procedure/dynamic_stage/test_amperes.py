@@ -75,6 +75,7 @@ def test_currents_and_torques_do_not_mix(robot, tmp_path, capsys):
     assert "one model cannot use both" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 def test_identified_gains_are_kept(robot, tmp_path):
     plain, loaded = currents(tmp_path, "run.npz", 0), currents(tmp_path, "load.npz", 1, payload=True)
     options, out = tmp_path / "options.toml", tmp_path / "out"
@@ -111,6 +112,7 @@ def test_options_that_cannot_be_are_told(robot, tmp_path, capsys, text, said):
     assert said in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ZZ1R", pytest.param("ZZ1", marks=pytest.mark.slow)])
 def test_a_regrouped_parameter_has_two_names(robot, tmp_path, name):
     train, options, out = planted.write(tmp_path, "train.npz", 0), tmp_path / "options.toml", tmp_path / "out"

@@ -55,6 +55,7 @@ def test_the_folder_keeps_its_contract(robot, tmp_path, capsys):
     assert not (out / "plot_torque_3.svg").exists(), "plots of the earlier run are gone"
 
 
+@pytest.mark.slow
 def test_a_repeat_is_no_evidence(robot, tmp_path, capsys):
     train = planted.write(tmp_path, "train.npz", 0)
     out = tmp_path / "out"
@@ -66,7 +67,13 @@ def test_a_repeat_is_no_evidence(robot, tmp_path, capsys):
     assert "is no evidence" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("options", "said"), [("rows = 'power'", False), ("[payload.tool]\nmass = 2.0", True)])
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        pytest.param("rows = 'power'", False, marks=pytest.mark.slow),
+        pytest.param("[payload.tool]\nmass = 2.0", True, marks=pytest.mark.slow),
+    ],
+)
 def test_uncarried_payload_is_said(robot, tmp_path, options, said):
     """Power is explained, and a payload that is never carried is said."""
     train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
@@ -78,6 +85,7 @@ def test_uncarried_payload_is_said(robot, tmp_path, options, said):
     assert ("payload-never" in {one["code"] for one in found["noticed"]}) is said
 
 
+@pytest.mark.slow
 def test_calibrated_folder_serves(tmp_path):
     """The calibrated robot's folder serves, and the nominal one chooses columns."""
     from calib.robot import description
@@ -111,6 +119,7 @@ def test_impossible_input_writes_nothing(robot, tmp_path, capsys, spoil, said):
     assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".out*"))
 
 
+@pytest.mark.slow
 def test_reversed_torques_are_refused(robot, tmp_path, capsys):
     """Reversed torques are refused, and one reversed joint fails."""
     good = planted.series(0)
@@ -123,6 +132,7 @@ def test_reversed_torques_are_refused(robot, tmp_path, capsys):
     assert "friction of joint 3 adds energy" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_unlike_units_are_pointed_at(robot, tmp_path, capsys):
     """Columns in different units are pointed at."""
     good = planted.series(0)
@@ -147,7 +157,7 @@ def test_unlike_units_are_pointed_at(robot, tmp_path, capsys):
         ("drives = ['Ia', 'Fv']", "drives: 2 values for 3 joints"),
         ("drives = 'Ia Fx'", "drive term 'Fx'"),
         ("prior = 'cad'\nmethod = 'iv'", "controller"),
-        ("keep = ['ZZ9']", "ZZ9"),
+        pytest.param("keep = ['ZZ9']", "ZZ9", marks=pytest.mark.slow),
         ("gains = [1.0, 2.0]", "gains: 2 values for 3 joints"),
         ("[gain_identification]\nunloaded = 'train.npz'\nloaded = 'train.npz'", "payload"),
         ("not toml", "is not a TOML file"),
@@ -212,7 +222,9 @@ def test_model_reads_back_and_predicts_alike(robot, tmp_path):
         read_dynamics(out)
 
 
-@pytest.mark.parametrize("kind", ["mcap", pytest.param("sqlite3", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "kind", [pytest.param("mcap", marks=pytest.mark.slow), pytest.param("sqlite3", marks=pytest.mark.slow)]
+)
 def test_two_publisher_bag_equals_archive(robot, tmp_path, kind):
     """A bag of two publishers tells what the archive tells."""
     from rosbags.rosbag2 import StoragePlugin, Writer

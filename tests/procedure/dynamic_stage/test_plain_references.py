@@ -47,6 +47,7 @@ def test_no_comparison_without_plain_values():
     assert worse_than_plain({"a": PlainReferences(5.0, np.nan, np.nan)}) == []
 
 
+@pytest.mark.slow
 def test_identification_stores_references(robot, tmp_path):
     """Of rich motion with simple friction plain least squares is as good; the nominal masses lack friction."""
     train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)

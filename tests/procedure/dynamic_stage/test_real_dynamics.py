@@ -332,6 +332,7 @@ LOGS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("log", [pytest.param(one, marks=[pytest.mark.slow] * ("tx40" not in one)) for one in LOGS])
 def test_sound_recordings_are_not_accused(data, log):
     """No sign and no order of a sound recording is called wrong."""

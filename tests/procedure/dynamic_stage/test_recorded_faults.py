@@ -42,6 +42,7 @@ def test_faults_are_named_with_their_file(robot, tmp_path, capsys):
     assert "loaded.npz: an unstated payload of 2" in words
 
 
+@pytest.mark.slow
 def test_sound_payload_recordings_are_clear(robot, tmp_path, capsys):
     """Sound recordings with a stated payload are accused of nothing."""
     plain = planted.write(tmp_path, "plain.npz", 0)
@@ -57,9 +58,9 @@ def test_sound_payload_recordings_are_clear(robot, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("stated", "code"),
     [
-        ("mass = 2.0\ncom = [0.05, 0.025, 0.1]", None),
-        ("mass = 3.0", "payload-mass"),
-        ("mass = 2.0\ncom = [0.05, 0.025, 0.3]", "payload-centre"),
+        pytest.param("mass = 2.0\ncom = [0.05, 0.025, 0.1]", None, marks=pytest.mark.slow),
+        pytest.param("mass = 3.0", "payload-mass", marks=pytest.mark.slow),
+        pytest.param("mass = 2.0\ncom = [0.05, 0.025, 0.3]", "payload-centre", marks=pytest.mark.slow),
     ],
 )
 def test_wrongly_stated_payload_is_named(robot, tmp_path, stated, code):
@@ -76,6 +77,7 @@ def test_wrongly_stated_payload_is_named(robot, tmp_path, stated, code):
     assert codes == ({code} if code else set())
 
 
+@pytest.mark.slow
 def test_standing_joint_is_no_fault(robot, tmp_path, capsys):
     """A joint that stands is no fault and no obstacle."""
     t, q, v, a = (np.array(series) for series in planted.motion(0))

@@ -85,7 +85,9 @@ def held(model: pinocchio.Model, q: np.ndarray, **options: object) -> np.ndarray
     return gravity + random.uniform(-STICTION, STICTION, q.shape) + random.normal(0.0, 0.02, q.shape)
 
 
-@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize(
+    "separator", [pytest.param(",", marks=pytest.mark.slow), ";", pytest.param("\t", marks=pytest.mark.slow)]
+)
 def test_a_table_of_poses_identifies_gravity(tmp_path, arm, separator):
     """No stamps: one row per pose. The exported URDF has the real arm's gravity, within the band of friction."""
     urdf, _, model = arm
@@ -137,6 +139,7 @@ def test_payload_from_two_files(tmp_path, arm, monkeypatch, capsys):
     assert abs(values[3] - 2.5) < 0.1
 
 
+@pytest.mark.slow
 def test_a_log_that_stands_is_averaged_and_one_that_moves_is_not(tmp_path, arm):
     urdf, _, model = arm
     q = drawn(60)
@@ -287,7 +290,7 @@ def test_the_needed_number_contains_the_held_out_poses(tmp_path, arm):
     ("order", "signs", "words"),
     [
         ([0, 1, 2, 3, 4, 5, 6], [1, -1, 1, 1, 1, 1, 1], "tau2 the other sign"),
-        ([0, 1, 2, 3, 4, 5, 6], [1, 1, 1, -1, 1, 1, 1], "tau4 the other sign"),
+        pytest.param([0, 1, 2, 3, 4, 5, 6], [1, 1, 1, -1, 1, 1, 1], "tau4 the other sign", marks=pytest.mark.slow),
         ([0, 3, 2, 1, 4, 5, 6], [1, 1, 1, 1, 1, 1, 1], "tau2 and tau4 exchanged"),
         ([0, 1, 2, 3, 4, 5, 6], [-1, -1, -1, -1, -1, -1, -1], r"gravity = \[0, 0, 9.81\]"),
     ],

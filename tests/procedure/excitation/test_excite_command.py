@@ -114,6 +114,7 @@ def earlier(designed, tmp_path_factory) -> Path:
     return motion_folder.write_design(designed, tmp_path_factory.mktemp("excited") / "e")
 
 
+@pytest.mark.slow
 def test_motions_before_count(earlier, tmp_path):
     """Designed with what is known, the two motions together tell more than twice the first one would."""
     before = coefficients.read(earlier)
@@ -137,6 +138,7 @@ def test_motions_before_count(earlier, tmp_path):
     assert 0.9 < np.median(ratio) < 1.02
 
 
+@pytest.mark.slow
 def test_validation_motion_stays_in_earlier(earlier):
     """And is another motion: joint by joint its positions are not those of the first."""
     few = replace(SHORT, period=12.0, evaluations=10, within=str(earlier), seed=5, outlook=False)
@@ -190,6 +192,7 @@ def test_held_joint_columns_have_full_rank():
     assert np.linalg.cond(scaled[:, held.columns]) < 200
 
 
+@pytest.mark.slow
 def test_motion_in_a_log_is_read_by_identify(earlier, tmp_path, cell, calib):
     """A motion is recalled from a log, and read by identify."""
     reference = coefficients.read(earlier)
@@ -212,6 +215,7 @@ def test_motion_in_a_log_is_read_by_identify(earlier, tmp_path, cell, calib):
     assert np.allclose(table.q, q[:1600], atol=1e-6) and table.kind == "torque"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -239,6 +243,7 @@ def test_recall_never_writes_onto_its_log(earlier, cell, calib):
     assert Path("log.npz").read_bytes() == kept
 
 
+@pytest.mark.slow
 def test_a_motion_folder_is_written_whole(designed, tmp_path):
     """A disk that fills in the middle leaves what was there: nothing, or the motion of before."""
 
@@ -429,13 +434,21 @@ def test_design_is_for_the_model_to_identify():
     assert "rows = 'power'" in notes and "NOT checked: torques with payload 'load'" in notes
 
 
-@pytest.mark.parametrize("solver", ["mma", "ccsaq", "auglag"])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        pytest.param("mma", marks=pytest.mark.slow),
+        pytest.param("ccsaq", marks=pytest.mark.slow),
+        pytest.param("auglag", marks=pytest.mark.slow),
+    ],
+)
 def test_other_solvers_keep_the_limits_too(solver):
     """Other solvers end within the limits, too."""
     found = design.excite("ur10e", replace(SHORT, solver=solver, evaluations=10, samples=60, outlook=False))
     assert found.proof.feasible and np.isfinite(found.condition.raw)
 
 
+@pytest.mark.slow
 def test_stated_noise_weighs_rows():
     """The default share of the torque limits, stated by joint, predicts the same; --noise beside it is refused."""
     limits = read_inputs("lwr4plus", SHORT).limits.torque
@@ -475,6 +488,7 @@ def test_identification_of_other_arm_fails(tmp_path):
             use()
 
 
+@pytest.mark.slow
 def test_a_goal_out_of_reach_is_named():
     found = design.excite("lwr4plus", replace(SHORT, goals=("raw=300", "joint7=0.5"), evaluations=12, outlook=False))
     said = " ".join(found.notes)
@@ -491,6 +505,7 @@ def test_a_front_serves_the_goals():
     assert missed[found.front.designed].max() < missed.max(axis=1).min() + 0.02 and found.proof.feasible
 
 
+@pytest.mark.slow
 def test_ctrl_c_after_the_search_is_heard(monkeypatch):
     """The motion stands without predictions; a session, which would go on with its next step, is told."""
 

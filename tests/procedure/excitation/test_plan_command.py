@@ -71,6 +71,7 @@ def test_an_identified_model_is_planned_with(room, capsys):
     assert not (room / "out" / "approach.csv").exists()
 
 
+@pytest.mark.slow
 def test_model_and_stated_drives_plan_alike(room):
     """Model and stated drives plan the same motion."""
     one = planning.plan("lwr4plus", room / "way.csv", model=room / "model")
@@ -81,6 +82,7 @@ def test_model_and_stated_drives_plan_alike(room):
     assert bare.track.duration < one.track.duration and "friction unknown" in bare.notes[1]
 
 
+@pytest.mark.slow
 def test_lines(room):
     points = WAYPOINTS[0] + 0.3 * (WAYPOINTS - WAYPOINTS[0])
     write_waypoints(points)
@@ -92,12 +94,14 @@ def test_lines(room):
     assert np.linalg.norm(tool - corner, axis=1).min() < 1e-4
 
 
+@pytest.mark.slow
 def test_shapes(room):
     shaped = planning.plan("lwr4plus", room / "way.csv", PlanSettings(shorten=4, stray=0.1), model=room / "model")
     found = motion_folder.plan_metrics(shaped)["shortened"]
     assert found["after"] <= found["before"] and found["evaluations"] >= 4
 
 
+@pytest.mark.slow
 def test_waypoints_of_the_tool(room, capsys):
     """Places are met exactly: with an orientation, without one, and in the configuration that joints beside it say."""
     poses = forward(CHAIN, WAYPOINTS)
@@ -176,6 +180,7 @@ def test_a_damaged_model_is_refused(room, capsys):
     assert "no identified model" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_uncertain_model_keeps_torque_free(room, capsys):
     """Only Ia2 is uncertain, so sigma is its own times the largest acceleration of joint 2."""
     files.write_table(
@@ -193,6 +198,7 @@ def test_uncertain_model_keeps_torque_free(room, capsys):
     assert "the margin for torque uncertainty" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_payload_on_board_takes_longer(room):
     place = room / "model" / "dynamics.json"
     table = json.loads(place.read_text())
@@ -242,7 +248,14 @@ def test_impossible_robot_gets_no_plan(room, capsys, change, message):
         assert planning.plan(CalibratedChain(wrong), Path("way.csv"), limits=limits).limits.velocity[3] == np.pi / 2
 
 
-@pytest.mark.parametrize("stated", ["", '[velocity]\nall = "30 deg/s"\n', "[acceleration]\nq1 = 5.0\n"])
+@pytest.mark.parametrize(
+    "stated",
+    [
+        pytest.param("", marks=pytest.mark.slow),
+        pytest.param('[velocity]\nall = "30 deg/s"\n', marks=pytest.mark.slow),
+        "[acceleration]\nq1 = 5.0\n",
+    ],
+)
 def test_plan_needs_acceleration_limits(room, capsys, stated):
     """Masses are not known of a UR10e, so nothing but the limits file can say how fast its joints may gather speed."""
     write_waypoints([[0, -1.6, 1.6, -1.6, -1.6, 0], [0.7, -1.2, 1.4, -1.7, -1.6, 0.3]], header="q1,q2,q3,q4,q5,q6")

@@ -25,7 +25,7 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
 
 SHORT = ExcitationSettings(
-    starts=1, evaluations=30, period=10.0, harmonics=4, rate=100.0, samples=100, repeat=2,
+    starts=1, evaluations=10, period=10.0, harmonics=4, rate=100.0, samples=100, repeat=2,
     drives="Ia Fv Fc off",
 )  # fmt: skip
 
@@ -58,6 +58,7 @@ def outcome(designed: design.Designed) -> identify.IdentificationOutcome:
     return identify.run(inputs.gather("lwr4plus", [log], options=options))
 
 
+@pytest.mark.slow
 def test_geometry_part_is_of_identification(designed, outcome):
     """Of independent errors of all elements: sigma_geometry as `propagate` finds it from the log."""
     chain, given = outcome.inputs.chain, designed.inputs
@@ -73,6 +74,7 @@ def test_geometry_part_is_of_identification(designed, outcome):
     assert len(ratios) > 40 and 0.9 < np.median(ratios) < 1.1 and np.quantile(np.abs(np.log(ratios)), 0.9) < 0.3
 
 
+@pytest.mark.slow
 def test_stated_sigmas_are_near_predicted(motion, outcome):
     """The sigmas stated are those predicted, within a factor."""
     with (motion / prediction.NAME).open() as file:
@@ -103,6 +105,7 @@ def test_sigmas_go_with_the_noise(designed):
     assert more.by_period == ()
 
 
+@pytest.mark.slow
 def test_missing_prediction_is_refused(motion, outcome, tmp_path):
     """A folder without a prediction is refused."""
     with pytest.raises(UsageError, match=r"has no prediction\.csv"):

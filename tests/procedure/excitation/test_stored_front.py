@@ -7,20 +7,25 @@ import pytest
 
 import calib
 from calib.errors import UsageError
-from calib.procedure.excitation import coefficients, stored_front
+from calib.procedure.excitation import coefficients, design, stored_front
 from calib.procedure.excitation.settings import ExcitationSettings
 
 SETTINGS = ExcitationSettings(
-    goals=("wrist=0.15", "raw=30"), period=6.0, harmonics=3, rate=250.0, starts=1, evaluations=20,
+    goals=("wrist=0.15", "raw=30"), period=6.0, harmonics=3, rate=250.0, starts=1, evaluations=10,
     front=3, outlook=False,
 )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return calib.design_excitation("tx40", SETTINGS).save(tmp_path_factory.mktemp("front") / "motion", plots=False)
+    with pytest.MonkeyPatch.context() as patch:
+        # the ends of the front take most of the time, and nothing here is said of how good they are
+        patch.setattr(design, "END_EVALUATIONS", 15)
+        found = calib.design_excitation("tx40", SETTINGS)
+    return found.save(tmp_path_factory.mktemp("front") / "motion", plots=False)
 
 
+@pytest.mark.slow
 def test_each_row_has_its_motion(folder: Path) -> None:
     """Rows differ, each has a motion, and the designed one is that of the folder."""
     front = stored_front.read(folder)
@@ -32,6 +37,7 @@ def test_each_row_has_its_motion(folder: Path) -> None:
     np.testing.assert_allclose(q, designed, atol=0.05)
 
 
+@pytest.mark.slow
 def test_picked_motion_is_the_front_s(folder: Path) -> None:
     """Without a search the picked motion has the condition number of its row, and the front stays."""
     front = stored_front.read(folder)
@@ -46,6 +52,7 @@ def test_picked_motion_is_the_front_s(folder: Path) -> None:
     assert f"motion {number} of the {len(front.motions)} of the front" in str(picked)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "settings", "number", "message"),
     [
@@ -67,6 +74,7 @@ def test_design_without_front_is_refused(tmp_path: Path) -> None:
         calib.design_excitation("tx40", SETTINGS, pick=(tmp_path, 1))
 
 
+@pytest.mark.slow
 def test_locked_joint_is_read_again(tmp_path: Path) -> None:
     """A motion whose joint 4 is locked is written and read."""
     settings = ExcitationSettings(

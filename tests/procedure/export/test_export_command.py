@@ -74,6 +74,7 @@ def test_pinocchio_reads_the_calibrated_arm(cell, calib, fitted):
         assert np.abs(data.oMf[tip].homogeneous - forward(chain, q[None])[0]).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_table_fit_goes_into_a_urdf(cell, calib, fitted):
     """Also after a second fit that started from the first one's folder: the first nominal is remembered."""
     file = cell.write("b.csv", cell.measure(60, 3))
@@ -93,6 +94,7 @@ def test_another_robots_urdf_is_refused(cell, calib, fitted):
     assert (code, "not describe the nominal robot" in err, Path("new.urdf").exists()) == (2, True, False)
 
 
+@pytest.mark.slow
 def test_offsets_are_those_of_a_fit_of_offsets_alone(cell, calib, fitted):
     """The table of a fit of the full geometry has the offsets of ``--model offsets``, and says so."""
     code, out, _ = calib("export", fitted, "--offsets", "offsets.csv")
@@ -131,6 +133,7 @@ def test_offsets_serve_the_nominal_arm_better_than_those_of_the_full_geometry(ce
     assert error(mastering.cell.chain) < min(full_offsets, error(nominal))
 
 
+@pytest.mark.slow
 def test_offsets_are_left_out_with_the_reason(cell, calib, fitted):
     """Where frames alone were fitted there are no offsets: the export says so, and is still one."""
     assert calib("fit", "source.urdf", "a.csv", "--model", "frames", "--out", "placed")[0] == 0
@@ -174,7 +177,8 @@ def test_the_source_is_never_written_over(cell, calib, fitted):
     assert Path("source.urdf").read_bytes() == before and not Path("n.urdf").exists()
 
 
-@pytest.mark.parametrize("old", [False, True])
+@pytest.mark.slow
+@pytest.mark.parametrize("old", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_flange_is_outside_ur_kinematics(cell, calib, old):
     """A flange 0.109 m behind the last joint, as in ur10_ipa; URDFs of old have UR's own d6 there instead."""
     text, name = write_new(cell.nominal), "wrist_3_joint"
@@ -229,6 +233,7 @@ def test_failed_result_exports_with_code_1(cell, calib, fitted):
     assert "verdict fail" not in Path("x/README.txt").read_text() + Path("x/robot.urdf").read_text()
 
 
+@pytest.mark.slow
 def test_marginal_result_exports_its_reason(cell, calib, fitted):
     """A marginal result is exported with what made it marginal."""
     rows = [row | {"q3": row["q3"] + 0.3} for row in cell.measure(60)]

@@ -24,7 +24,14 @@ def origins(text: str) -> dict[str, np.ndarray]:
     return poses
 
 
-@pytest.mark.parametrize("base", [None, "base_link", "base_link_inertia"])
+@pytest.mark.parametrize(
+    "base",
+    [
+        None,
+        pytest.param("base_link", marks=pytest.mark.slow),
+        pytest.param("base_link_inertia", marks=pytest.mark.slow),
+    ],
+)
 def test_ur_descriptions_keep_their_origins(data, base):
     """UR's own descriptions give back their origins."""
     paths = sorted((data / "public_arms").glob("[uU]niversal*.urdf"))

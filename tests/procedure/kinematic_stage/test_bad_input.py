@@ -113,6 +113,7 @@ def test_impossible_urdf(cell, calib, text, options, word):
     assert not Path("done").exists()
 
 
+@pytest.mark.slow
 def test_foreign_folder_is_unchanged(cell, calib):
     """A folder that holds other things is left alone."""
     file = cell.write("a.csv", cell.measure(40))
@@ -152,6 +153,7 @@ def test_full_disk_leaves_nothing(cell, calib, monkeypatch):
     assert [path.name for path in cell.folder.iterdir()] == ["a.csv"]
 
 
+@pytest.mark.slow
 def test_a_killed_fit_leaves_no_folder(cell):
     file = cell.write("a.csv", cell.measure(400))
     command = [sys.executable, "-m", "calib", "fit", "ur5", str(file), "--out", "done"]
@@ -173,6 +175,7 @@ def test_infinite_number_is_never_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_poses_copied_ten_times_are_twenty(cell, calib):
     """Poses copied ten times are twenty poses."""
     rows = cell.measure(20)

@@ -175,6 +175,7 @@ def test_the_robots_file_is_parsed_once(cell, fitted, here, calib, monkeypatch):
     assert parsed == [(fitted / "robot.toml").read_text()]
 
 
+@pytest.mark.slow
 def test_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
     """Placed where it fits best, the nominal robot is off by what the fit reports as its error, and by no more."""
     write(here / "t.csv", Q, drawn(cell, 200, 7))
@@ -189,6 +190,7 @@ def test_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
     assert f"({own} from the arm itself" in " ".join(said["base"].split()) and "the arm itself" not in said["nominal"]
 
 
+@pytest.mark.slow
 def test_positions_are_sought_near_a_start(cell, fitted, here, calib):
     """Positions alone are sought near a start."""
     q = drawn(cell, 8, 8) * 0.3 + np.array([0.0, -1.2, 1.5, -1.0, -1.4, 0.3])
@@ -203,6 +205,7 @@ def test_positions_are_sought_near_a_start(cell, fitted, here, calib):
     assert all(row["left [mrad]"] == "" for row in rows)
 
 
+@pytest.mark.slow
 def test_tool_in_numbers_is_the_flange_moved(cell, fitted, here, calib):
     """A tool given by numbers is the flange moved."""
     q = drawn(cell, 30, 9)
@@ -216,6 +219,7 @@ def test_tool_in_numbers_is_the_flange_moved(cell, fitted, here, calib):
     assert np.abs(numbers(commands("a.csv"), Q) - numbers(commands("b.csv"), Q)).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_unreachable_stops_all_or_is_empty(cell, fitted, here, calib):
     """What is out of reach stops all, or is left empty."""
     q = drawn(cell, 3, 10)
@@ -251,15 +255,15 @@ def test_joint_limits_are_kept(cell, fitted, here, calib):
     ("text", "said"),
     [
         ("", "is empty"),
-        ("q1,q2,q3,q4,q5,q6\n", "no data rows"),
+        pytest.param("q1,q2,q3,q4,q5,q6\n", "no data rows", marks=pytest.mark.slow),
         ("q1,q2,q3,q4,q5,q6\n0,0,nan,0,0,0\n", "row 1, column 'q3'"),
         ("q1,q2,q3,q4,q5,q6\n10,-90,90,0,45,90\n20,-80,90,0,45,90\n", "deg"),
-        ("x,y,z\n500,200,300\n", "name the column 'x [mm]'"),
-        ("x,y\n0.5,0.2\n", "column 'z'"),
+        pytest.param("x,y,z\n500,200,300\n", "name the column 'x [mm]'", marks=pytest.mark.slow),
+        pytest.param("x,y\n0.5,0.2\n", "column 'z'", marks=pytest.mark.slow),
         ("a,b,c\n1,2,3\n", "no targets found"),
-        ("qx,qy,qz,qw\n0,0,0,1\n", "a target needs a position"),
+        pytest.param("qx,qy,qz,qw\n0,0,0,1\n", "a target needs a position", marks=pytest.mark.slow),
         ("x,y,z,qx,qy,qz,qw\n0.4,0.1,0.3,0,0,0,2\n", "norm 2"),
-        ("q1,q2,q3,q4,q5\n0,0,0,0,0\n", "column 'q6'"),
+        pytest.param("q1,q2,q3,q4,q5\n0,0,0,0,0\n", "column 'q6'", marks=pytest.mark.slow),
     ],
 )
 def test_bad_targets_are_refused(fitted, here, calib, text, said):
@@ -269,6 +273,7 @@ def test_bad_targets_are_refused(fitted, here, calib, text, said):
     assert said in err
 
 
+@pytest.mark.slow
 def test_unsuited_folders_and_words_fail(fitted, here, calib):
     """Folders and words that do not serve are refused."""
     write(here / "t.csv", Q, np.zeros((1, 6)) + 0.5)
@@ -291,6 +296,7 @@ def test_unsuited_folders_and_words_fail(fitted, here, calib):
     assert code == 2 and "t.csv is an input and would be overwritten" in err
 
 
+@pytest.mark.slow
 def test_one_or_repeated_targets_are_targets(fitted, here, calib):
     """One target, and the same one twice, are targets."""
     for count in (1, 3):
@@ -355,6 +361,7 @@ LIN {{X {6:.6f}, Y {7:.6f}, Z {8:.6f}, A {9:.6f}, B {10:.6f}, C {11:.6f}, S 2, T
 """
 
 
+@pytest.mark.slow
 def test_targets_in_a_program_are_rewritten(cell, fitted, here, calib):
     """A joint target becomes the command that meets it, a pose the one that the nominal robot has there."""
     q = drawn(cell, 20, 5)[:1]

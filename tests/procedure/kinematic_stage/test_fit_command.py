@@ -60,6 +60,7 @@ def test_planted_arm_is_found(cell, calib):
     assert "verdict: pass" in out and "day2.csv" in out
 
 
+@pytest.mark.slow
 def test_files_of_a_fit_hold_the_same_robot(cell, calib):
     """The files of a fit hold the same robot."""
     file = cell.write("day1.csv", cell.measure(60))
@@ -92,6 +93,7 @@ def test_files_of_a_fit_hold_the_same_robot(cell, calib):
         assert np.isclose(np.sqrt(float(own[row["name"]])), float(row["sigma"]), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_residuals_are_those_of_the_metrics(cell, calib):
     rows = cell.measure(60)
     rows[7]["x"] += 0.01
@@ -109,6 +111,7 @@ def test_residuals_are_those_of_the_metrics(cell, calib):
     assert 9.0 < worst["size_mm"] < 11.0
 
 
+@pytest.mark.slow
 def test_holdout_is_end_of_the_permutation(cell, calib):
     """Holdout keeps the last share of the permutation."""
     file = cell.write("day1.csv", cell.measure(60))
@@ -129,6 +132,7 @@ def test_holdout_is_end_of_the_permutation(cell, calib):
     assert {out for *_, out in unseen} <= {0.0, 1.0} and all(0 < sigma < radius for _, sigma, radius, _ in unseen)
 
 
+@pytest.mark.slow
 def test_other_station_needs_refitted_frames(cell, calib):
     """A pose file from another station needs refitted frames."""
     elsewhere = from_xyz_rpy([-2.0, 1.0, 0.0], [0.0, 0.4, 1.0])
@@ -151,11 +155,12 @@ def test_two_files_have_two_stations(cell, calib):
     """Two files have two stations unless one is asked for."""
     file, other = cell.write("a.csv", cell.measure(40)), cell.write("b.csv", cell.measure(40, 1))
     assert calib("fit", "ur5", file, other, "--model", "frames", "--out", "each")[0] == 0
-    assert installation.read("each").station_names == ("a", "b")
-    assert calib("fit", "ur5", file, other, "--stations", "one", "--model", "frames", "--out", "one")[0] == 0
-    assert installation.read("one").station_names == ("station",)
-    assert calib("fit", "ur5", file, other, "--tools", "each", "--model", "frames", "--out", "tools")[0] == 0
-    assert installation.read("tools").tool_names == ("a tool", "b tool")
+    placed = installation.read("each")
+    assert (placed.station_names, len(placed.tool_names)) == (("a", "b"), 1)
+    asked = ("--stations", "one", "--tools", "each")
+    assert calib("fit", "ur5", file, other, *asked, "--model", "frames", "--out", "one")[0] == 0
+    placed = installation.read("one")
+    assert (placed.station_names, placed.tool_names) == (("station",), ("a tool", "b tool"))
 
 
 @pytest.mark.slow
@@ -168,6 +173,7 @@ def test_one_station_of_a_moved_instrument(cell, calib):
     assert "with stations 'each'" not in calib(*start)[1]
 
 
+@pytest.mark.slow
 def test_repeated_rows_prove_nothing(cell, calib):
     """Rows that count twice are said, and copies prove nothing."""
     rows = cell.measure(40)
@@ -181,6 +187,7 @@ def test_repeated_rows_prove_nothing(cell, calib):
     assert "with the numbers" not in calib("fit", "ur5", cell.write("b.csv", cell.measure(40, 5)), *start[3:])[1]
 
 
+@pytest.mark.slow
 def test_validation_files_share_an_option(cell, calib):
     """Validation files may follow one option, or each its own."""
     file = cell.write("a.csv", cell.measure(40))
@@ -197,6 +204,7 @@ def test_validation_files_share_an_option(cell, calib):
     assert found["three"]["fit"] == found["one"]["fit"]
 
 
+@pytest.mark.slow
 def test_same_seed_gives_the_same_numbers(cell, calib):
     """The same seed gives the same numbers."""
     file = cell.write("a.csv", cell.measure(40))
@@ -206,6 +214,7 @@ def test_same_seed_gives_the_same_numbers(cell, calib):
     assert Path("one/estimate.csv").read_bytes() == Path("two/estimate.csv").read_bytes()
 
 
+@pytest.mark.slow
 def test_calibrated_folder_is_a_robot(cell, calib):
     """A calibrated folder is a robot, and a worse arm fails."""
     file = cell.write("a.csv", cell.measure(60))
@@ -225,7 +234,9 @@ def test_calibrated_folder_is_a_robot(cell, calib):
     ) and "verdict: fail" in out
 
 
-@pytest.mark.parametrize("deliverable", ["urdf", "corrections"])
+@pytest.mark.parametrize(
+    "deliverable", [pytest.param("urdf", marks=pytest.mark.slow), pytest.param("corrections", marks=pytest.mark.slow)]
+)
 def test_deliverable_comes_first_everywhere(cell, calib, deliverable):
     """The deliverable's figure comes first in each, the alternative's has its words; plots show the deliverable."""
     file = cell.write("a.csv", cell.measure(90))
@@ -249,6 +260,7 @@ def test_deliverable_comes_first_everywhere(cell, calib, deliverable):
     assert f"{nominal:.3g} mm rms before, {judged:.3g} mm after" == histogram.panels[0].title
 
 
+@pytest.mark.slow
 def test_deflection_table_comes_back(cell, calib):
     """Deflections go out as a table with its formula, and come back."""
     file = cell.write("a.csv", cell.measure(90))
@@ -286,6 +298,7 @@ def test_deflection_table_comes_back(cell, calib):
     assert not Path("done/robot_for_corrections.urdf").exists()
 
 
+@pytest.mark.slow
 def test_fixed_parameters_stay(cell, calib):
     file = cell.write("a.csv", cell.measure(60))
     Path("o.toml").write_text('fix = ["theta2", "theta3"]\n')
@@ -315,6 +328,7 @@ def test_gross_rows_stay_out_of_deliverables(cell, calib):
     assert alone[1] < 1.2 * alone[0] and radius[1] < 1.5 * radius[0]
 
 
+@pytest.mark.slow
 def test_refitting_own_folder_is_no_failure(cell, calib):
     """Refitting a fit's own folder is no failure."""
     file = cell.write("a.csv", cell.measure(60))
@@ -325,6 +339,7 @@ def test_refitting_own_folder_is_no_failure(cell, calib):
     assert (code, "verdict: fail" in out) == (0, False)
 
 
+@pytest.mark.slow
 def test_tolerance_is_tested_on_unseen_rows(cell, calib):
     """A tolerance is held against unseen rows, and named."""
     file = cell.write("a.csv", cell.measure(60))
@@ -336,6 +351,7 @@ def test_tolerance_is_tested_on_unseen_rows(cell, calib):
     assert calib(*start, "--tolerance", "-1")[0] == 2
 
 
+@pytest.mark.slow
 def test_orientations_are_tested_on_the_arm(cell, calib):
     """Orientations are held against the arm."""
     rows = cell.measure(40)
@@ -355,6 +371,7 @@ def test_orientations_are_tested_on_the_arm(cell, calib):
         assert (code, words in err) == (2 if words else 0, True), err
 
 
+@pytest.mark.slow
 def test_turned_orientations_fail(cell, calib):
     """Ten degrees about changing axes: not another convention, and no orientation of an arm."""
     rows, columns = cell.measure(60), list(cell.measure(1)[0])
@@ -378,6 +395,7 @@ def _directions(count: int) -> np.ndarray:
     return axes / np.linalg.norm(axes, axis=1)[:, None]
 
 
+@pytest.mark.slow
 def test_placement_has_its_validation_frames(cell, calib):
     """A placement alone is validated with frames of its own."""
     file, other = cell.write("a.csv", cell.measure(60)), cell.write("b.csv", cell.measure(40, 1))
@@ -440,6 +458,7 @@ def test_a_kind_calibrates(cell, calib, measure, count, nature, poses):
         assert unseen["calibrated"]["distance_mm"] is None
 
 
+@pytest.mark.slow
 def test_unfinished_placement_proves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The optimiser gets one linearisation for the file's own frames: what it leaves there means nothing."""
     cell = perturbed_cell(load("ur10"), 0, SimulatedInstrument("6-D probe", 30e-6, 1e-4), hidden=0.3)
@@ -465,6 +484,7 @@ def test_unfinished_placement_proves_nothing(monkeypatch: pytest.MonkeyPatch) ->
     assert name not in again.verdict.reason and "cross-validation" in again.verdict.reason
 
 
+@pytest.mark.slow
 def test_self_explaining_file_proves_nothing(cell, calib) -> None:
     """Six positions are eighteen numbers, base and tool nine parameters; twelve positions leave enough."""
     file, other = cell.write("a.csv", cell.measure(60)), cell.measure(12, 1)
@@ -475,7 +495,14 @@ def test_self_explaining_file_proves_nothing(cell, calib) -> None:
         assert ("on few.csv, unseen" in out) is scored
 
 
-@pytest.mark.parametrize(("count", "frames"), [(6, ["--refit-frames"]), (7, []), (8, [])])
+@pytest.mark.parametrize(
+    ("count", "frames"),
+    [
+        pytest.param(6, ["--refit-frames"], marks=pytest.mark.slow),
+        pytest.param(7, [], marks=pytest.mark.slow),
+        pytest.param(8, [], marks=pytest.mark.slow),
+    ],
+)
 def test_unseen_poses_of_a_changed_arm_contradict_the_fit(cell, calib, count, frames) -> None:
     """Joint 3 moved by 4 mrad since the fit: few poses fail as many do, also where the placement is fitted to them."""
     file = cell.write("a.csv", cell.measure(60))
@@ -486,6 +513,7 @@ def test_unseen_poses_of_a_changed_arm_contradict_the_fit(cell, calib, count, fr
     assert "moved.csv: " in out and "times expected" in out
 
 
+@pytest.mark.slow
 def test_few_unseen_poses_are_said_and_decide_nothing(cell, calib) -> None:
     """Seven poses are named on the console, in the verdict and on the certificate; eight decide it."""
     file, other = cell.write("a.csv", cell.measure(60)), cell.measure(8, 1)

@@ -119,7 +119,10 @@ def test_every_form_is_read_with_some_separator():
     assert {name for name, _, _ in READ} == set(FORMS)
 
 
-@pytest.mark.parametrize(("name", "separator", "mark"), READ)
+@pytest.mark.parametrize(
+    ("name", "separator", "mark"),
+    [pytest.param(*form, marks=[pytest.mark.slow] * (form[0] in DECIDED_BY_ARM)) for form in READ],
+)
 def test_one_reading_is_taken_and_said(arm, tmp_path, name, separator, mark):
     chain, q, position, rotation = arm
     path = written(tmp_path / "m.csv", *FORMS[name](q, position, rotation), separator, mark)
@@ -131,6 +134,7 @@ def test_one_reading_is_taken_and_said(arm, tmp_path, name, separator, mark):
     assert block.notes
 
 
+@pytest.mark.slow
 def test_what_is_not_told_is_asked_by_a_line_to_paste(arm, tmp_path):
     chain, q, position, _ = arm
     path = written(tmp_path / "a.csv", [*numbered("M{}"), "x", "y", "z"], [q, position])
@@ -310,7 +314,10 @@ def test_numbered_columns_of_a_torso_with_two_arms(tmp_path):
         load_robot(tmp_path / "two.urdf", path, FitOptions())
 
 
-@pytest.mark.parametrize(("per_turn", "zero"), [(4096, 2048), (10_000, 0), (2**20, 0)])
+@pytest.mark.parametrize(
+    ("per_turn", "zero"),
+    [pytest.param(4096, 2048, marks=pytest.mark.slow), pytest.param(10_000, 0, marks=pytest.mark.slow), (2**20, 0)],
+)
 def test_encoder_counts_are_told_by_the_arm(arm, tmp_path, per_turn, zero):
     """Whole numbers too large for deg are read by the usual encoder that agrees with the arm, or asked for."""
     chain, q, position, _ = arm
@@ -323,6 +330,7 @@ def test_encoder_counts_are_told_by_the_arm(arm, tmp_path, per_turn, zero):
         read_measurements(path, chain.joint_names)
 
 
+@pytest.mark.slow
 def test_counts_from_an_odd_zero_are_asked_for(arm, tmp_path):
     """Counts from a zero that no usual encoder has are asked for joint by joint, and read as stated."""
     chain, q, position, _ = arm

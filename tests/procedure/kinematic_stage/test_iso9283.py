@@ -129,6 +129,7 @@ def files(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_fit_states_iso_beside_its_errors(files, capsys):
     """The fit states the figures of ISO 9283 beside its own errors."""
     arguments = ["fit", "ur5", "fit.csv", "--validate", "iso.csv", "--model", "geometry", "--out", "done", "--no-plots"]
@@ -145,6 +146,7 @@ def test_fit_states_iso_beside_its_errors(files, capsys):
     assert len(table.rows) == 5 and "100 or more" in table.note
 
 
+@pytest.mark.slow
 def test_validation_at_fit_joints_is_void(files, capsys):
     """A validation at the fit's joints proves nothing."""
     code = cli.run(

@@ -71,7 +71,7 @@ def test_frames_alone_are_judged_too(cell, calib, change, name):
 @pytest.mark.parametrize(
     ("model", "reversed_ones"),
     [
-        ("frames", (2, 5)),
+        pytest.param("frames", (2, 5), marks=pytest.mark.slow),
         ("geometry", (4,)),
         *(pytest.param("frames", joints, marks=SLOW) for joints in ((1,), (4,))),
         *(pytest.param("geometry", joints, marks=SLOW) for joints in ((1,), (2, 5))),
@@ -109,11 +109,26 @@ def test_angles_of_another_convention_named(cell, calib):
 @pytest.mark.parametrize(
     ("change", "code", "values"),
     [
-        ({"q3": ("q3", "q2", 1.0)}, "joint-coupled", {"joint": "elbow_joint", "way": "-", "rival": None}),
-        ({"q3": ("q3", "q2", -1.0)}, "joint-coupled", {"joint": "elbow_joint", "way": "+", "rival": None}),
-        ({"q2": ("q3", "q3", 0.0), "q3": ("q2", "q2", 0.0)}, "joints-exchanged", {"rival": None}),
+        pytest.param(
+            {"q3": ("q3", "q2", 1.0)},
+            "joint-coupled",
+            {"joint": "elbow_joint", "way": "-", "rival": None},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"q3": ("q3", "q2", -1.0)},
+            "joint-coupled",
+            {"joint": "elbow_joint", "way": "+", "rival": None},
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            {"q2": ("q3", "q3", 0.0), "q3": ("q2", "q2", 0.0)},
+            "joints-exchanged",
+            {"rival": None},
+            marks=pytest.mark.slow,
+        ),
     ],
-)  # fmt: skip
+)
 def test_coupled_or_swapped_joints_are_named(cell, calib, change, code, values, model):
     """Joints that count from another or are exchanged are named."""
     rows = cell.measure(COUNT)
@@ -128,7 +143,9 @@ def test_coupled_or_swapped_joints_are_named(cell, calib, change, code, values, 
     assert model != "frames" or accepted(calib, out)[0] == 0
 
 
-@pytest.mark.parametrize("degrees", [90, 180])
+@pytest.mark.parametrize(
+    "degrees", [pytest.param(90, marks=pytest.mark.slow), pytest.param(180, marks=pytest.mark.slow)]
+)
 def test_quarter_turn_zeros_are_named(cell, calib, degrees):
     """The full geometry explains it by axes that are turned by 180°, or nearly so."""
     rows = [row | {"q3": row["q3"] + np.radians(degrees)} for row in cell.measure(COUNT)]
@@ -151,7 +168,13 @@ def test_joint_from_another_zero_is_told(cell, calib):
 
 
 @pytest.mark.parametrize(
-    ("first", "way"), [(1, "down"), (1, "up"), pytest.param(20, "down", marks=SLOW), pytest.param(20, "up", marks=SLOW)]
+    ("first", "way"),
+    [
+        pytest.param(1, "down", marks=pytest.mark.slow),
+        pytest.param(1, "up", marks=pytest.mark.slow),
+        pytest.param(20, "down", marks=SLOW),
+        pytest.param(20, "up", marks=SLOW),
+    ],
 )
 def test_misaligned_rows_are_named(cell, calib, first, way):
     """A point that was lost or measured twice moves all later ones against the joints."""
@@ -166,6 +189,7 @@ def test_misaligned_rows_are_named(cell, calib, first, way):
     assert (found["by"], found["way"]) == (1, way) and abs(found["first"] - max(first - 1, 1)) <= 1
 
 
+@pytest.mark.slow
 def test_rows_of_two_targets_are_sorted(cell, calib):
     rows = cell.measure(COUNT)
     second = [k for k in range(COUNT) if k % 3 == 0]
@@ -195,10 +219,16 @@ def with_targets(rows: list[dict], change) -> None:
 @pytest.mark.parametrize(
     ("change", "codes"),
     [
-        (lambda k, first, second: second, set()),
-        (lambda k, first, second: first, {"target-copied"}),
-        (lambda k, first, second: first if k in (3, 9, 21) else second, {"target-copied"}),
-        (lambda k, first, second: [0, 0, 0] if k in (3, 9, 21) else second, {"reading-repeated"}),
+        pytest.param(lambda k, first, second: second, set(), marks=pytest.mark.slow),
+        pytest.param(lambda k, first, second: first, {"target-copied"}, marks=pytest.mark.slow),
+        pytest.param(
+            lambda k, first, second: first if k in (3, 9, 21) else second, {"target-copied"}, marks=pytest.mark.slow
+        ),
+        pytest.param(
+            lambda k, first, second: [0, 0, 0] if k in (3, 9, 21) else second,
+            {"reading-repeated"},
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_copied_readings_are_named(cell, calib, change, codes):
@@ -213,7 +243,15 @@ def test_copied_readings_are_named(cell, calib, change, codes):
         assert "2" in found["target-copied"].values["name"] and "1" in found["target-copied"].values["other"]
 
 
-@pytest.mark.parametrize("factor, level", [(1.0, None), (1.05, "fail"), (0.98, "marginal"), (1.003, "note")])
+@pytest.mark.parametrize(
+    "factor, level",
+    [
+        pytest.param(1.0, None, marks=pytest.mark.slow),
+        (1.05, "fail"),
+        pytest.param(0.98, "marginal", marks=pytest.mark.slow),
+        pytest.param(1.003, "note", marks=pytest.mark.slow),
+    ],
+)
 def test_common_factor_has_two_causes(cell, calib, factor, level):
     """One factor on all lengths is the instrument's or another robot's."""
     fitted(cell, calib, changed(cell, lambda place: factor * place), "frames")
@@ -224,7 +262,10 @@ def test_common_factor_has_two_causes(cell, calib, factor, level):
         assert found[0].values["factor"] == pytest.approx(factor, abs=5e-4)
 
 
-@pytest.mark.parametrize("factor, told", [(1.0, False), (1.002, True)])
+@pytest.mark.parametrize(
+    "factor, told",
+    [pytest.param(1.0, False, marks=pytest.mark.slow), pytest.param(1.002, True, marks=pytest.mark.slow)],
+)
 def test_lengths_that_grow_alike_are_noted(cell, calib, factor, told):
     """0.2 % is hidden in the errors of joints here, so that one factor explains little of what the nominal leaves."""
     rows = cell.measure(COUNT)
@@ -238,6 +279,7 @@ def test_lengths_that_grow_alike_are_noted(cell, calib, factor, told):
         assert size["factor"] == pytest.approx(factor, abs=3 * size["sigma"] + 5e-4) and level_of(found) == "note"
 
 
+@pytest.mark.slow
 def test_hidden_length_factor_is_other_robot(cell, calib):
     """The nominal arm's error is mostly that of two joints here; the fitted lengths have one factor all the same."""
     near, off = {"q1": 0.0, "q2": -1.2, "q3": 1.3}, {"q2": 0.05, "q3": -0.05, "q5": 0.05}
@@ -253,6 +295,7 @@ def computed(cell) -> np.ndarray:
     return forward(cell.nominal, q)[:, :3, 3]
 
 
+@pytest.mark.slow
 def test_computed_positions_are_noted(cell, calib):
     rounding = 3e-7 * np.random.default_rng(0).normal(size=(COUNT, 3))
     rows = changed(cell, lambda _: computed(cell) + rounding)
@@ -261,6 +304,7 @@ def test_computed_positions_are_noted(cell, calib):
     assert verdict()[2] == ["commanded"] and lines_of([noticed()["commanded"]])[0] in out
 
 
+@pytest.mark.slow
 def test_exact_positions_leave_no_gain(cell, calib):
     """No step is better than the start here: the residuals are rounding."""
     rows = changed(cell, lambda _: computed(cell))

@@ -42,6 +42,7 @@ def write_poses(path: str, count: int, seed: int) -> None:
     np.savetxt(path, q, delimiter=",", header=",".join(load("ur5").joint_names), comments="")
 
 
+@pytest.mark.slow
 def test_selection_is_near_the_bound(cell, calib, monkeypatch):
     """The selection is better than chance, and near the bound."""
     choose, selections = selection.choose, []
@@ -104,6 +105,7 @@ def test_gradient_is_central_difference(cell):
     assert checked == 7  # height, axis, reach, orientation, collision, cone of sight, view past the arm
 
 
+@pytest.mark.slow
 def test_existing_poses_count(cell, calib):
     write_poses("first.csv", 10, 0)
     code, out, err = calib(

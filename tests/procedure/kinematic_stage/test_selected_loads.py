@@ -39,6 +39,7 @@ def chosen(folder):
     return choose
 
 
+@pytest.mark.slow
 def test_compliance_is_told_better_with_loads_than_without(chosen):
     loads = chosen().loads
     assert loads.share < 0.9 * loads.unloaded_share < 0.9
@@ -48,6 +49,7 @@ def test_compliance_is_told_better_with_loads_than_without(chosen):
     assert np.all(np.array(record["sigma"]) <= 1.001 * np.array(record["prior"]))
 
 
+@pytest.mark.slow
 def test_each_load_is_attached_once(chosen):
     masses = chosen().loads.masses
     assert set(masses) <= {0.0, 2.5, 5.0} and len(set(masses)) > 1
@@ -55,10 +57,12 @@ def test_each_load_is_attached_once(chosen):
     assert len(chosen().run.ways) == 13
 
 
+@pytest.mark.slow
 def test_a_single_load_is_carried_in_all_poses(chosen):
     assert chosen(loads=(2.5,)).loads.masses.tolist() == [2.5] * 14
 
 
+@pytest.mark.slow
 def test_the_csv_states_the_load_of_each_pose_and_is_no_measurement(chosen, tmp_path):
     path = selection.write(chosen(), tmp_path / "poses.csv")
     with path.open(newline="") as file:
@@ -72,12 +76,14 @@ def test_the_csv_states_the_load_of_each_pose_and_is_no_measurement(chosen, tmp_
     assert filled_in(path, 7)
 
 
+@pytest.mark.slow
 def test_a_load_that_the_joints_cannot_hold_is_left_out_or_refused(chosen):
     assert chosen(loads=(0.0, 25.0)).loads.excluded > 0
     with pytest.raises(UsageError, match="500 kg: more than such an arm carries"):
         chosen(loads=(0.0, 500.0))
 
 
+@pytest.mark.slow
 def test_an_arm_without_masses_is_said_to_need_torques(chosen):
     assert any("has no masses" in note for note in chosen("unweighed").notes)
     assert not any("has no masses" in note for note in chosen().notes)
@@ -109,6 +115,7 @@ def test_columns_of_compliance_are_derivatives_of_the_predicted_position():
         assert np.allclose(jacobian[:, :, first + column], slope, rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_the_command_takes_loads_and_says_what_they_tell(folder, calib, cell):
     arguments = ("-m", "12", "--candidates", "40", "--without", "self-collision", "--no-plots", "--out", "p.csv")
     code, out, err = calib("select", str(folder / "weighed.urdf"), *arguments, "--loads", "0,5")

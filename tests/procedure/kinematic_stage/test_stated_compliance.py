@@ -69,6 +69,7 @@ def contradicted(fit):
     return [note for note in fit.outcome.findings.noticed if note.code == "compliance-contradicted"]
 
 
+@pytest.mark.slow
 def test_few_poses_and_the_table_predict_better_than_the_poses_alone(folder, arm, stated):
     alone = fitted(folder, "few.csv")
     assert unseen_rms(stated) < 0.7 * unseen_rms(alone)
@@ -101,6 +102,7 @@ def test_a_table_that_is_too_stiff_is_told_from_what_bearings_would_give(folder,
         assert 2.0 < note.values["times"] < 5.0
 
 
+@pytest.mark.slow
 def test_a_saved_fit_predicts_with_the_compliance(folder, stated, tmp_path):
     terms = calibrated.read(stated.save(tmp_path / "fit", plots=False)).deflection.terms
     assert [term.basis for term in terms[:2]] == ["torque", "torque"]

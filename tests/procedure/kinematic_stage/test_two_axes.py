@@ -48,6 +48,7 @@ def test_sound_table_needs_no_exchange():
     assert wrong_columns(*measured(0.0), mirrored=True) is None
 
 
+@pytest.mark.slow
 def test_the_public_positioner(data, calib, tmp_path, monkeypatch):
     """205 poses: 0.38 mm mean by the URDF, 0.15 mm with joint corrections."""
     monkeypatch.chdir(tmp_path)
@@ -59,8 +60,8 @@ def test_the_public_positioner(data, calib, tmp_path, monkeypatch):
     assert found["fit"]["calibrated"]["position_mm"]["mean"] < 0.15
 
 
-@pytest.mark.parametrize("step", [1, 17])
-@pytest.mark.parametrize("holdout", [(), ("--holdout", "0.25")])
+@pytest.mark.parametrize("step", [1, pytest.param(17, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("holdout", [pytest.param((), marks=pytest.mark.slow), ("--holdout", "0.25")])
 def test_twelve_positioner_rows_are_answered(data, calib, tmp_path, monkeypatch, holdout, step):
     """Of the first twelve rows one joint stands still, and no model of the arm can be better than the nominal one."""
     monkeypatch.chdir(tmp_path)

@@ -57,6 +57,7 @@ def codes(fit):
     return {finding.code: finding.values for finding in fit.assessment.noticed}
 
 
+@pytest.mark.slow
 def test_masses_described_2_5_times_too_large_are_seen_and_the_unseen_load_is_predicted(tmp_path):
     """With the described masses the error was twice the noise, and nothing was said."""
     fit = fitted(tmp_path, 2.5)
@@ -73,6 +74,7 @@ def test_masses_described_2_5_times_too_large_are_seen_and_the_unseen_load_is_pr
     assert np.allclose(driven.fit[0].torque, fit.inputs.fit[0].torque)
 
 
+@pytest.mark.slow
 def test_right_masses_are_kept(tmp_path):
     fit = fitted(tmp_path, 1.0)
     (rows,) = fit.validation.values()
@@ -80,6 +82,7 @@ def test_right_masses_are_kept(tmp_path):
     assert "masses-scaled" not in codes(fit)
 
 
+@pytest.mark.slow
 def test_under_one_load_the_doubt_of_the_masses_remains(tmp_path):
     """One load tells the product of compliance and masses alone: the interval is that of the prior."""
     fit = fitted(tmp_path, 1.4, loads=(2.5,))
@@ -87,6 +90,7 @@ def test_under_one_load_the_doubt_of_the_masses_remains(tmp_path):
     assert "masses-scaled" not in codes(fit)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factor", [1.0, 0.4, 0.0])
 def test_nearly_equal_loads_leave_the_doubt_of_the_masses(tmp_path, factor):
     """Ten grams more tell no masses: the prior of compliance made them large, by which the interval was too narrow."""
@@ -109,6 +113,7 @@ def test_a_common_factor_leaves_changed_centres_of_mass():
     assert np.allclose(heavier.masses, 2.0 * moved.masses)
 
 
+@pytest.mark.slow
 def test_bodies_without_described_mass_are_unknown_beside_one_with(tmp_path):
     """They were kept without mass: the unseen load's error was larger than with no mass described at all."""
     described = description(1.0)
@@ -121,6 +126,7 @@ def test_bodies_without_described_mass_are_unknown_beside_one_with(tmp_path):
     assert "masses-scaled" not in codes(fit)
 
 
+@pytest.mark.slow
 def test_an_arm_described_as_too_light_for_one_kilogram_is_fitted(tmp_path):
     """Of 0.3 kg, it may carry three times its mass; more was asked of it to find how well a deflection is known."""
     fit = fitted(tmp_path, 0.015, loads=(0.0, 0.9), unseen=0.6)

@@ -41,6 +41,7 @@ def cell() -> camera.CameraCell:
     return camera.camera_cell(arm, lens=camera.DEMO_LENS, reach_of_arm=0.75)
 
 
+@pytest.mark.slow
 def test_view_has_to_hold_the_whole_board(cell):
     """Against the projection of every corner; the places in the file are rounded to centimetres."""
     with camera.limits_of(cell) as path:

@@ -64,6 +64,7 @@ def test_candidates_are_seen_and_keep_clear(name, tmp_path):
     assert not is_feasible(space, random_joints(chain, 300)).all()
 
 
+@pytest.mark.slow
 def test_several_reflectors_show_more_poses(tmp_path):
     """Several reflectors let more poses be seen, and only seen rows count."""
     sides = "[target]\nfacing = [[0, 0, 1], [1, 0, 0], [-1, 0, 0]]\n" + CELL
@@ -123,6 +124,7 @@ def test_answers_that_cannot_be(answers, words):
         cell_tables(**answers)
 
 
+@pytest.mark.slow
 def test_selection_is_drawn_beside_its_poses(tmp_path, capsys):
     """A selection is drawn beside its poses, never onto what is read."""
     given = ["select", "lwr4plus", "-m", "12", "--candidates", "150", "--out"]
@@ -184,6 +186,7 @@ def test_predicted_sigma_is_of_many_fits():
     assert not np.isfinite(predicted(seen, seen(q[:5]), typical).rms)
 
 
+@pytest.mark.slow
 def test_selection_tells_run_and_prediction(tmp_path):
     """A selection tells the run, the prediction and what seeing costs."""
     (tmp_path / "c.toml").write_text(CELL)
@@ -250,6 +253,7 @@ def poses(count: int, seed: int, side: float) -> np.ndarray:
     return q
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("index", ["O1", pytest.param("O3", marks=pytest.mark.slow)])
 def test_hidden_poses_are_replaced_cheaply(index):
     """Poses behind a wall are replaced by those that cost least."""
@@ -268,6 +272,7 @@ def test_hidden_poses_are_replaced_cheaply(index):
     assert found.words.startswith(f"poses {named[0]}, {named[1]} replaced")
 
 
+@pytest.mark.slow
 def test_pose_on_another_turn_is_kept():
     """The same pose on another turn is kept."""
     room, seen = walls(6.0), observation(targets_of(CHAIN))
@@ -278,6 +283,7 @@ def test_pose_on_another_turn_is_kept():
     assert found.value[0] == pytest.approx(found.value[1], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_replaced_is_told():
     room, seen = walls(2.8), observation(targets_of(CHAIN))
     q = np.concatenate([poses(5, 1, 1.0), poses(1, 2, -1.0)])

@@ -87,6 +87,7 @@ def test_session_columns_have_units(whole: Session) -> None:
     assert seen > 100 and not list(whole.folder.glob("*/validation.csv"))
 
 
+@pytest.mark.slow
 def test_later_dynamics_keep_the_geometry(waiting: Session) -> None:
     """Dynamics asked for afterwards keep the geometry."""
     found = kinds(waiting)
@@ -96,6 +97,7 @@ def test_later_dynamics_keep_the_geometry(waiting: Session) -> None:
     assert not waiting.path("6-export").exists() and waiting.path("9-export/robot.urdf").exists()
 
 
+@pytest.mark.slow
 def test_two_lines_say_what_to_play_and_log(waiting: Session) -> None:
     """Two lines say what to play and what to log."""
     state = next(state for state in steps.states(waiting) if state.kind == steps.WAITING)
@@ -105,6 +107,7 @@ def test_two_lines_say_what_to_play_and_log(waiting: Session) -> None:
     assert "7-recorded/training_log.csv" in second and "q_joint1 [deg]" in second and "tau_joint7 [Nm]" in second
 
 
+@pytest.mark.slow
 def test_no_plan_means_no_designed_motion(waiting: Session) -> None:
     """Without a plan no motion is designed or presented."""
     shutil.rmtree(waiting.path("6-excitation"))
@@ -118,6 +121,7 @@ def test_no_plan_means_no_designed_motion(waiting: Session) -> None:
     assert "a different one for validation" in commands.asks(session, stopped)[0]
 
 
+@pytest.mark.slow
 def test_recorded_motion_survives_a_refit(waiting: Session) -> None:
     """A motion that was recorded stays when the geometry is fitted again."""
     for brought, kept in ((False, False), (True, True)):
@@ -220,20 +224,29 @@ def another(table: np.ndarray, header: list[str]) -> np.ndarray:
     return table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         (reheaded(lambda header: [name.replace("[deg]", "[rad]") for name in header]), "looks like deg"),
-        (reheaded(swapped), r"columns are swapped \(the column of joint3 contains joint2, .*joint2 contains joint3"),
+        pytest.param(
+            reheaded(swapped),
+            r"columns are swapped \(the column of joint3 contains joint2, .*joint2 contains joint3",
+            marks=pytest.mark.slow,
+        ),
         (scaled("t [", 2.0), "0.5 times its speed"),
         (scaled("tau_joint", -1.0), "reverse their sign"),
-        (scaled("tau_joint4", -1.0), "training_log.csv: torque of joint4 .* reverse the sign of the column of joint4"),
+        pytest.param(
+            scaled("tau_joint4", -1.0),
+            "training_log.csv: torque of joint4 .* reverse the sign of the column of joint4",
+            marks=pytest.mark.slow,
+        ),
         (numbers(counted_from_the_horizontal), r"if joint3, joint2 are combined \(-\)"),
-        (scaled("tau_joint", 1e-2), "times those of the nominal masses"),
+        pytest.param(scaled("tau_joint", 1e-2), "times those of the nominal masses", marks=pytest.mark.slow),
         (scaled("tau_joint", 1e3), "every joint exceeds 3 times its limit: N mm"),
-        (in_milli_but_the_last, "joint2, joint3.* are they in mNm"),
+        pytest.param(in_milli_but_the_last, "joint2, joint3.* are they in mNm", marks=pytest.mark.slow),
         (numbers(another), "does not contain the motion designed in this session"),
-        (numbers(lambda table, header: table[:1000]), "shorter than one period"),
+        pytest.param(numbers(lambda table, header: table[:1000]), "shorter than one period", marks=pytest.mark.slow),
         (reheaded(lambda header: [name.replace("q_joint4", "x4") for name in header]), "joint"),
     ],
     ids=[
@@ -259,6 +272,7 @@ def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], st
     assert kinds(recorded)["excite"] == steps.DONE and not recorded.path("8-dynamics/dynamics.json").exists()
 
 
+@pytest.mark.slow
 def test_loose_or_rare_playback_is_noted(recorded: Session) -> None:
     """A motion played too seldom and loosely is noted."""
     path, motion = recorded.path("7-recorded/training_log.csv"), designed_motions(recorded)["training"]
@@ -268,6 +282,7 @@ def test_loose_or_rare_playback_is_noted(recorded: Session) -> None:
     assert found.periods == 2 and [one.code for one in noted] == ["repetitions-missing", "tracking-loose"]
 
 
+@pytest.mark.slow
 def test_training_and_validation_stay_apart(recorded: Session) -> None:
     """The validation motion is not learnt from, and the training motion is no proof."""
     one, two = recorded.path("7-recorded/training_log.csv"), recorded.path("7-recorded/validation_log.csv")
@@ -276,6 +291,7 @@ def test_training_and_validation_stay_apart(recorded: Session) -> None:
         go_on(recorded)
 
 
+@pytest.mark.slow
 def test_recordings_keep_their_plan(recorded: Session) -> None:
     """Recordings keep the plan that they were made to."""
     before = recorded.path("6-excitation/training/trajectory.csv").read_text()
@@ -284,6 +300,7 @@ def test_recordings_keep_their_plan(recorded: Session) -> None:
     assert recorded.path("6-excitation/training/trajectory.csv").read_text() == before
 
 
+@pytest.mark.slow
 def test_guided_demo_stops_for_an_engineer(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     """A guided demonstration stops where an engineer would."""
     out = str(tmp_path / "cell")

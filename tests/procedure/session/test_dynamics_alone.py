@@ -70,6 +70,7 @@ def test_certificate_judges_exported_robot(session: Session) -> None:
     assert f"leaves {said:.2f} %" in session.path("9-export/README.txt").read_text()
 
 
+@pytest.mark.slow
 def test_ampere_torques_only_predict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Torques in amperes are good for prediction only."""
     session = recorded(tmp_path, "i")

@@ -49,6 +49,7 @@ def identified(tmp_path_factory) -> Path:
     return calib.identify_dynamics(robot, log, settings).save(folder / "out", plots=False)
 
 
+@pytest.mark.slow
 def test_masses_have_true_gravity_torques(identified):
     """Identified masses have the true gravity torques."""
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (50, planted.N))
@@ -57,6 +58,7 @@ def test_masses_have_true_gravity_torques(identified):
     assert np.abs(found - true).max() < 0.05 < 1.0 < np.abs(wrong - true).max()
 
 
+@pytest.mark.slow
 def test_identified_masses_fix_compliance(identified, tmp_path):
     """Compliance is right with identified masses, and wrong with those of the data sheet."""
     poses = measured(1, 50)
@@ -75,6 +77,7 @@ def test_identified_masses_fix_compliance(identified, tmp_path):
     assert np.sqrt(read.corrections.covariance[own, own]) == pytest.approx(sigma, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_masses_of_another_arm_are_refused(identified, tmp_path):
     """Masses of another arm or of no folder are refused."""
     with pytest.raises(UsageError, match="has 7"):

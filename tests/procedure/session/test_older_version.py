@@ -76,6 +76,7 @@ def test_older_fit_exports_and_compensates(cell: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(now, then, 1e-6)
 
 
+@pytest.mark.slow
 def test_dynamics_on_an_older_fit_stay(cell: Path, tmp_path: Path) -> None:
     """Dynamics identified on an older fit are those it gave."""
     logs = cell / "7-recorded"

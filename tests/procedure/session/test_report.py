@@ -141,6 +141,7 @@ def test_report_numbers_are_those_of_the_fit(finished_folder: Path) -> None:
     assert found.noise["position"] == pytest.approx(60e-6 * np.sqrt(3))
 
 
+@pytest.mark.slow
 def test_fit_certificate_names_its_files(finished_folder: Path, tmp_path: Path) -> None:
     """A fit's own certificate names its files."""
     given = ("1-robot/robot.toml", "3-measured/measured.csv")
@@ -191,6 +192,7 @@ def changed(names, units, changes, sigmas) -> list[fit_report.FittedParameter]:
     ]
 
 
+@pytest.mark.slow
 def test_figures_are_drawn_from_plain_arrays(tmp_path: Path) -> None:
     """Every figure is drawn from plain arrays."""
     rng = np.random.default_rng(0)
@@ -220,7 +222,15 @@ def test_figures_are_drawn_from_plain_arrays(tmp_path: Path) -> None:
     assert sorted(path.suffix for path in tmp_path.iterdir()) == [".png"] * len(drawn)
 
 
-@pytest.mark.parametrize("name", ["$q_1$", "5 $", "gelenk_€ $\\frac{1}$", "a^b_c$$"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "$q_1$",
+        pytest.param("5 $", marks=pytest.mark.slow),
+        "gelenk_€ $\\frac{1}$",
+        pytest.param("a^b_c$$", marks=pytest.mark.slow),
+    ],
+)
 def test_a_dollar_in_a_name_is_a_dollar(name: str) -> None:
     """Matplotlib would read what stands between two of them as mathematics, and fail where it is none."""
     changes, units = np.array([1e-3, 2e-3]), ["m", "rad"]
@@ -230,6 +240,7 @@ def test_a_dollar_in_a_name_is_a_dollar(name: str) -> None:
     assert [(label.get_text(), label.get_parse_math()) for label in labels] == [(name, False)] * 2
 
 
+@pytest.mark.slow
 def test_paper_is_white_and_peaks_are_kept() -> None:
     one, two = (sheets.png(drawing.figure(geometry_figures.singular_values(np.ones(3), 3))) for _ in range(2))
     assert one == two, "drawn the same twice"

@@ -47,6 +47,7 @@ def test_two_lines_say_what_to_do_and_bring(planned: Session) -> None:
     )
 
 
+@pytest.mark.slow
 def test_fit_waits_for_validation(measured: Session) -> None:
     """The fit waits for validation, but not the other way round."""
     validation = measured.path("3-measured/validation_measured.csv").rename(measured.folder / "later.csv")
@@ -59,6 +60,7 @@ def test_fit_waits_for_validation(measured: Session) -> None:
     assert measured.path("4-fit/robot.toml").stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_measurement_makes_dependents_stale(finished: Session) -> None:
     """A changed measurement makes stale what rests on it."""
     path = finished.path("3-measured/measured.csv")
@@ -72,6 +74,7 @@ def test_measurement_makes_dependents_stale(finished: Session) -> None:
     assert "1 of 20 planned poses remain to be measured: 20" in finished.path("3-measured/checked.txt").read_text()
 
 
+@pytest.mark.slow
 def test_changed_setting_makes_readers_stale(finished: Session) -> None:
     """A changed setting makes stale only what reads it."""
     edit(finished.path("session.toml"), 'model = "geometry"', 'model = "offsets"')
@@ -81,6 +84,7 @@ def test_changed_setting_makes_readers_stale(finished: Session) -> None:
     assert json.loads(finished.path("4-fit/metrics.json").read_text())["model"] == "offsets"
 
 
+@pytest.mark.slow
 def test_measured_plan_is_not_replaced(finished: Session) -> None:
     """A plan is not replaced once it was measured."""
     before = finished.path("2-poses/poses.csv").read_text()
@@ -128,6 +132,7 @@ def test_redo_repeats_a_step_and_all_behind(finished: Session) -> None:
         steps.find(finished, "identify")
 
 
+@pytest.mark.slow
 def test_killed_session_goes_on_from_there(measured: Session, finished_folder: Path) -> None:
     """Killed at any step, it goes on from there."""
     for name in ("measure", "fit", "validate", "certificate"):
@@ -177,6 +182,7 @@ def test_lock_of_a_killed_command_is_taken(planned: Session) -> None:
     assert "process 999999" in said[0] and not planned.path("session.lock").exists()
 
 
+@pytest.mark.slow
 def test_failing_step_changes_no_session(measured: Session) -> None:
     """A failing step leaves the session as it was."""
     go_on(measured)
@@ -226,6 +232,7 @@ def _verdicts(content: Any) -> list[tuple[str, str]]:
     return own + [each for value in content.values() for each in _verdicts(value)]
 
 
+@pytest.mark.slow
 def test_poses_are_held_out_by_default(measured: Session) -> None:
     """Without a validation file, a share of the poses is held out; five are too few for the verdict, which says so."""
     measured.path("3-measured/validation_measured.csv").unlink()
@@ -310,7 +317,13 @@ def test_a_read_only_folder_is_said(planned: Session) -> None:
 
 
 @pytest.mark.parametrize(
-    "gone", ["4-fit/robot.toml", "4-fit/metrics.json", "5-validation/metrics.json", "6-export/robot.urdf"]
+    "gone",
+    [
+        pytest.param("4-fit/robot.toml", marks=pytest.mark.slow),
+        pytest.param("4-fit/metrics.json", marks=pytest.mark.slow),
+        "5-validation/metrics.json",
+        "6-export/robot.urdf",
+    ],
 )
 def test_step_with_a_lost_file_is_made_again(finished: Session, gone: str) -> None:
     """A step that lost a file is made again."""

@@ -21,6 +21,7 @@ def recorded(folder: Path, duration: float = 10.0) -> tuple[Path, Path]:
     return folder / "a.npz", folder / "b.npz"
 
 
+@pytest.mark.slow
 def test_methods_are_ranked_by_unseen_motion(robot: Path, tmp_path: Path):
     """What cannot be distinguished is as good; a fast one of these is taken, with the verdict of an identification."""
     train, other = recorded(tmp_path)
@@ -58,6 +59,7 @@ def test_learnt_motion_ranks_nothing(robot: Path, tmp_path: Path):
     assert "copy.npz" in caveats(beside, [both])[-1].text
 
 
+@pytest.mark.slow
 def test_no_method_worse_than_no_model(robot: Path, tmp_path: Path):
     """No method is chosen that predicts no better than no model."""
     train, other = recorded(tmp_path)
@@ -69,6 +71,7 @@ def test_no_method_worse_than_no_model(robot: Path, tmp_path: Path):
     assert "add training motion" in caveats(given, [found])[-1].text
 
 
+@pytest.mark.slow
 def test_error_of_one_method_costs_no_other(robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """One method's error costs no other result."""
     from calib.apps.studies import method_comparison

@@ -177,6 +177,7 @@ def rigid_behind(root: ET.Element, link: str) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 @needs_arms
 def test_public_arms_end_at_their_flanges():
     rows = list(csv.DictReader((PUBLIC / "arms.csv").open()))

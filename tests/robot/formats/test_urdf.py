@@ -287,7 +287,13 @@ REAL = sorted(DATA.glob("*/*.urdf"))
 
 
 @pytest.mark.skipif(not REAL, reason=f"no URDFs of real robots at {DATA} (set CALIB_DATA)")
-@pytest.mark.parametrize("path", REAL, ids=lambda path: f"{path.parent.name}/{path.stem}")
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(path, id=f"{path.parent.name}/{path.stem}", marks=[pytest.mark.slow] * (number % 4 > 0))
+        for number, path in enumerate(REAL)
+    ],
+)
 def test_real_robots_against_pinocchio(path):
     agrees(path.read_text())
     source, chain = path.read_text(), urdf.read(path)

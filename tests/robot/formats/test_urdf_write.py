@@ -15,6 +15,11 @@ from calib.robot.kinematics import forward
 from calib.robot.library import load
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
+# one in eight quickly
+REAL_ROBOTS = [
+    pytest.param(path, id=f"{path.parent.name}/{path.stem}", marks=[pytest.mark.slow] * (number % 8 != 0))
+    for number, path in enumerate(sorted(DATA.glob("*/*.urdf")))
+]
 AWKWARD = """<?xml version='1.0' encoding="utf-8"?>
 <!-- a comment with <joint name="a"><origin xyz="9 9 9"/></joint> in it -->
 <robot name="awkward" xmlns:xacro="http://www.ros.org/wiki/xacro">
@@ -99,7 +104,7 @@ def test_missing_origin_is_inserted():
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no URDFs of real robots at {DATA} (set CALIB_DATA)")
-@pytest.mark.parametrize("path", sorted(DATA.glob("*/*.urdf")), ids=lambda path: f"{path.parent.name}/{path.stem}")
+@pytest.mark.parametrize("path", REAL_ROBOTS)
 def test_real_robots_read_back_by_pinocchio(path, tmp_path):
     nominal = urdf.read(path)
     calibrated = disturbed(nominal, 1)

@@ -35,6 +35,7 @@ def test_tool_runs_straight(chain):
     np.testing.assert_allclose(found.path(np.zeros(1))[0], start, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_redundancy_stays_near_the_start():
     """Of all postures with the tool at the end of the line none near by is nearer to the start."""
     start = WAYPOINTS[0] + 0.2
@@ -47,6 +48,7 @@ def test_redundancy_stays_near_the_start():
     assert abs(null @ (q[0] - start)) < 1e-8
 
 
+@pytest.mark.slow
 def test_line_out_of_reach_says_where():
     """A line out of reach says where and by how much."""
     goal = forward(CHAIN, WAYPOINTS[:1])[0].copy()

@@ -26,6 +26,7 @@ def test_double_integrator_is_time_optimal(velocity, expected):
     assert found.active_share > 0.999
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("viscous", "coulomb"),
     [
@@ -63,7 +64,10 @@ def test_planned_torques_reach_the_limits():
     np.testing.assert_allclose(np.diff(motion.q, axis=0) * 1000, (motion.v[1:] + motion.v[:-1]) / 2, atol=5e-3)
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(0, marks=pytest.mark.slow), 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))],
+)
 def test_any_path_is_timed_at_a_limit(seed):
     """Strong friction and accelerations limited, by turns; the sampling is other than that of the search."""
     from calib.trajectories.timing.profile import dense
@@ -82,6 +86,7 @@ def test_any_path_is_timed_at_a_limit(seed):
     assert np.isclose(checked.weights.sum(), found.duration)
 
 
+@pytest.mark.slow
 def test_faster_than_slowed_polynomials():
     """A quintic rest-to-rest law on the same path, slowed until it keeps the limits, takes longer."""
     path, bounds, law = spline(WAYPOINTS), limits(), lwr()

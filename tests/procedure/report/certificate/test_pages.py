@@ -184,7 +184,16 @@ def test_report_shows_paths_of_this_machine():
     assert one.setup == [Entry("description", "robot.urdf")]
 
 
-@pytest.mark.parametrize("entry", ["", "W" * MAX_LETTERS, "🤖 漢字 " * 28, "مستشعر الليزر " * 14, "שלום-SN-123 " * 16])
+@pytest.mark.parametrize(
+    "entry",
+    [
+        "",
+        pytest.param("W" * MAX_LETTERS, marks=pytest.mark.slow),
+        pytest.param("🤖 漢字 " * 28, marks=pytest.mark.slow),
+        pytest.param("مستشعر الليزر " * 14, marks=pytest.mark.slow),
+        "שלום-SN-123 " * 16,
+    ],
+)
 def test_any_entries_fit_four_pages(entry):
     """Everything at its bound: empty, long without a blank, emoji, Chinese, right to left."""
     details = CertificateSection(*[entry[:MAX_LETTERS].strip()] * 12)
