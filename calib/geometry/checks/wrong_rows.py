@@ -17,16 +17,24 @@ import numpy as np
 
 from calib.column_changes import Change
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, take
+from calib.errors import CalibError
+from calib.geometry.accuracy import errors
 from calib.geometry.checks import row_lags
+from calib.geometry.first_guess import install
+from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
+from calib.geometry.weighing import Settings
 from calib.records import evenly
 from calib.robot.kinematics import forward
 from calib.transforms import from_quaternion
 
 # shifts in rows between measurements and joint values that are tried, as by a lost point or a header line
 SHIFTS = (1, -1, 2, -2)
-# smallest number of shifted rows (our choice)
-MIN_SHIFTED = 3
+# smallest number of shifted rows that have joint values: within a few mm, of a range of a metre, none fits by chance
+MIN_SHIFTED = 1
+# largest rms error of the shifted rows, over that of the rows in place: the errors of a nominal arm at different poses
+# (our choice)
+MAX_TIMES_IN_PLACE = 3.0
 # smallest ratio of the rms errors without a repeated reading, and with a shift there (our choice)
 MIN_SLIP = 3.0
 # smallest share of the shifted rows whose joint values are available, not held out (our choice)
@@ -47,6 +55,8 @@ COLUMN_ROUNDING = 1e-10
 # the same of sums of products of orthonormal columns, as their eigenvalues: a combination of 1e-5 of the largest size,
 # whose square is that far above rounding (our choice)
 PRODUCT_ROUNDING = 1e-10
+# a robust fit, since orientations with angles beyond the range of a convention were lost, and a few rows are gross
+ROBUST = Settings(loss="cauchy", limit=40, passes=4)
 Blocks = Sequence[PoseMeasurements]
 
 
@@ -126,20 +136,51 @@ def _shifts(nominal: Installation, block: Positions) -> Iterator[tuple[int, int]
         nominal: the nominal arm.
         block: measured positions, or poses.
     """
+    candidates: list[tuple[int, int | None]] = []
     if isinstance(block, Poses) and len(np.unique(block.tool)) == 1 and len(np.unique(block.rows)) == len(block):
         arm, measured = (
             _by_row(forward(nominal.chain, block.q), block),
             _by_row(from_quaternion(block.position, block.quaternion), block),
         )
-        shift = row_lags.last_lag(arm, measured)
-        if shift:
-            first = row_lags.first_of_lag(arm, measured, shift)
-            yield shift, int(block.rows.min()) + first
-        return
-    for shift in SHIFTS:
-        first = _best_first(nominal, block, shift)
-        if first is not None:
+        lag = row_lags.last_lag(arm, measured)
+        if lag:
+            candidates.append((lag, int(block.rows.min()) + row_lags.first_of_lag(arm, measured, lag)))
+    # of poses, too: angles choose no lag of the last few rows
+    candidates += [(shift, _best_first(nominal, block, shift)) for shift in SHIFTS]
+    for shift, first in candidates:
+        if first is not None and _better_than_in_place(nominal, block, first, shift):
             yield shift, first
+
+
+def _better_than_in_place(nominal: Installation, block: Positions, first: int, shift: int) -> bool:
+    """Return whether rows fit far better shifted than in place, and about as well as the rows before them.
+
+    Rows in place are compared without those that a shift leaves without joint values: to leave out a gross last row is
+    no shift.
+
+    Args:
+        nominal: the nominal arm.
+        block: measured positions.
+        first: row number from which on the joint values are shifted.
+        shift: number of rows; negative: rows further up.
+    """
+    shifted = _shifted(block, first, shift)
+    in_place = take(block, np.flatnonzero(np.isin(block.rows, shifted.rows)))
+    before = float(least_error(nominal, [in_place])[0])
+    after = float(least_error(nominal, [shifted])[0])
+    # as few rows as the model has columns are fitted exactly in any order
+    if POSITION_ROUNDING**2 < before < MIN_SLIP**2 * after:
+        return False
+    is_shifted = shifted.rows >= first
+    if is_shifted.all():
+        return True
+    try:
+        placed = polish_frames(install(nominal.chain, [shifted]), [shifted], ROBUST).cell
+    except CalibError:
+        # too few rows to place an instrument
+        return False
+    squares = errors(placed, [shifted]).main ** 2
+    return bool(squares[is_shifted].mean() < MAX_TIMES_IN_PLACE**2 * squares[~is_shifted].mean())
 
 
 def slips(nominal: Installation, block: Positions, row: int) -> bool:

@@ -393,7 +393,7 @@ def _check_convergence(selection: ModelSelection, inputs: Inputs, options: FitOp
     if status.good:
         return
     nominal = selection.nominal.cell
-    contradictions = plausibility.findings(nominal, selection.fit, inputs.fit, None, nominal.reach)
+    contradictions = plausibility.findings(nominal, selection.fit, inputs.fit, None, nominal.reach, inputs.files)
     reasons = [sentence(reason) for reason in settle(contradictions, options.accept) if level_of(reason) == "fail"]
     message = f"the fit of model '{selection.chosen}' did not converge: {status.value}"
     raise NotConverged("; ".join([message, *reasons]), selection.fit)
@@ -429,7 +429,8 @@ def _findings(
     """
     nominal = selection.nominal.cell
     cross_validated = selection.cross_validated
-    contradictions = plausibility.findings(nominal, selection.fit, inputs.fit, cross_validated, nominal.reach)
+    reach = nominal.reach
+    contradictions = plausibility.findings(nominal, selection.fit, inputs.fit, cross_validated, reach, inputs.files)
     noticed = [*contradictions, *notes]
     if selection.folds.blind:
         noticed.append(finding("transfer-by-regions", stations=selection.folds.blind))
@@ -441,7 +442,7 @@ def _findings(
         cross_validated=cross_validated,
         nominal_cross_validated=selection.nominal_step.cross_validated,
         outlier_share=len(outlier_rows) / row_count,
-        reach=nominal.reach,
+        reach=reach,
         noticed=settle(noticed, accepted),
         blind=selection.folds.blind,
         rigid_cross_validated=selection.rigid_cross_validated,

@@ -186,26 +186,26 @@ def findings(
     blocks: Sequence[PoseMeasurements],
     cross_validated: float | None,
     reach: float,
+    files: Sequence[PoseMeasurements],
 ) -> list[Finding]:
     """Return findings on measurements that contradict the arm, the most likely cause first.
 
     Args:
         nominal: the arm before the fit, with base and tool placed.
         fit: fit of the calibrated arm.
-        blocks: the rows.
+        blocks: the fitted rows.
         cross_validated: error of the chosen model [m]; None if not computed.
         reach: reach of the arm [m].
+        files: the fitted rows with those that were held out: faults of a file show in the order of all its rows.
     """
     before = errors(nominal, blocks).rms
     after = errors(fit.cell, blocks).rms
     remains = after
     if cross_validated is not None:
         remains = min(cross_validated, max(after, _position_rms(fit)))
-    sample = []
-    for block, rows in zip(blocks, sampled(blocks, JUDGED_POSES)):
-        sample.append(_as_positions(take(block, rows)))
-
-    misread = _misread(nominal, sample) + _wrong_columns(nominal, sample, before, reach)
+    sample = _judged_sample(blocks)
+    file_sample = sample if files is blocks else _judged_sample(files)
+    misread = _misread(nominal, file_sample) + _wrong_columns(nominal, file_sample, reach)
     result = base_motion(blocks) + repeated_readings(nominal, sample) + (misread or _large_changes(fit, reach))
     result.append(finding("unexplained", rms=remains, reach=reach, share=remains / reach))
     if 0.0 < after < TOO_GOOD:
@@ -223,6 +223,14 @@ def findings(
     return list(filter(level_of, result))
 
 
+def _judged_sample(blocks: Sequence[PoseMeasurements]) -> list[PoseMeasurements]:
+    """Return the rows of each block by which measurements are judged, with positions for images."""
+    sample = []
+    for block, rows in zip(blocks, sampled(blocks, JUDGED_POSES)):
+        sample.append(_as_positions(take(block, rows)))
+    return sample
+
+
 def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
     """Return a block of measurements with positions.
 
@@ -236,9 +244,7 @@ def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
     return pnp_poses(take(block, rows))
 
 
-def _wrong_columns(
-    nominal: Installation, blocks: Sequence[PoseMeasurements], before: float, reach: float
-) -> list[Finding]:
+def _wrong_columns(nominal: Installation, blocks: Sequence[PoseMeasurements], reach: float) -> list[Finding]:
     """Return a finding if the nominal arm explains the rows after a change of columns or rows.
 
     Otherwise, the list is empty.
@@ -246,9 +252,9 @@ def _wrong_columns(
     Args:
         nominal: the arm before the fit, with base and tool placed.
         blocks: the rows.
-        before: rms error of the nominal arm [m].
         reach: reach of the arm [m].
     """
+    before = errors(nominal, blocks).rms
     if not before > FLOOR * reach:
         return []
     mirrored = before > limit("unexplained", "share") * reach
