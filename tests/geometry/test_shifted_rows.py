@@ -7,25 +7,36 @@ import pytest
 from planted import cell, perturb
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.measurements import Positions, take
+from calib.data.poses.measurements import Poses, Positions, take
 from calib.geometry.checks import row_lags
 from calib.geometry.checks.readings import without_unseen
 from calib.geometry.checks.wrong_rows import MIN_SHIFTED, SHIFTS, TIED, _best_first, _CutErrors, _shifted, least_error
+from calib.geometry.diagnosis import wrong_columns
 from calib.geometry.first_guess import install
 from calib.geometry.installation import see
 from calib.robot.calibrated import evaluate
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward
 from calib.robot.library import load
+from calib.transforms import to_quaternion
 
 
-def measured(count, name="ur5", seed=1, errors=(0.5e-3, 1e-3)):
+def measured(count, name="ur5", seed=1, errors=(0.5e-3, 1e-3), q=None):
     """Return an arm, and positions of a target in another arm's cell, whose geometry has errors [m, rad]."""
     arm = load(name)
     truth = cell(perturb(arm, seed, *errors), seed)
-    q = random_joints(arm, count, np.random.default_rng(seed))
+    if q is None:
+        q = random_joints(arm, count, np.random.default_rng(seed))
     seen = see(truth, q, 0, np.zeros(count, dtype=int), evaluate(truth.deflection, q, None))
     return arm, Positions(q, arm.joint_names, seen.point.T, file="measured.csv")
+
+
+def measured_poses(count, name, seed):
+    """Return an arm, and poses of the tip of an arm whose geometry has errors."""
+    arm = load(name)
+    q = random_joints(arm, count, np.random.default_rng(seed))
+    tip = forward(perturb(arm, seed, 0.5e-3, 1e-3), q)
+    return arm, Poses(q, arm.joint_names, tip[:, :3, 3], to_quaternion(tip), file="measured.csv")
 
 
 @pytest.mark.parametrize("variant", ["whole", "shifted", "held out", "two tools", "other order"])
@@ -111,3 +122,35 @@ def test_no_rows_have_no_error():
     nominal = install(arm, [block])
     np.testing.assert_array_equal(least_error(nominal, [take(block, np.arange(0))]), [0.0])
     assert _CutErrors.of(nominal, block, -1).at(np.array([0])) >= 0.0
+
+
+@pytest.mark.parametrize("name", ["ur5", "lwr4plus"])
+@pytest.mark.parametrize("kind", [Positions, Poses])
+@pytest.mark.parametrize("slip", [2, 10, 17])
+def test_a_slip_in_a_short_file_is_named_at_its_row(name, kind, slip):
+    """Of 20 rows, and where two rows only have the joint values of the rows behind them."""
+    arm, target = measured_poses(21, name, seed=slip)
+    source = np.where(np.arange(20) < slip, np.arange(20), np.arange(20) + 1)
+    block = take(target, np.arange(20))
+    block = replace(block, position=target.position[source], quaternion=target.quaternion[source])
+    if kind is Positions:
+        block = Positions(block.q, block.joint_names, block.position, file="measured.csv")
+    explanation = wrong_columns(install(arm, [block]), [block])
+    assert explanation is not None and explanation.code == "rows-shifted"
+    values = explanation.changes[0].values
+    assert (values["first"], values["by"], values["way"]) == (slip + 1, 1, "down")
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+@pytest.mark.parametrize("gross", [1, 2])
+def test_gross_last_rows_are_no_slip(seed, gross):
+    """Neighbouring poses are near each other, so that rows beside the gross ones nearly fit to both."""
+    random = np.random.default_rng(seed)
+    start, end = random_joints(load("ur5"), 2, random)
+    path = start + np.linspace(0.0, 1.0, 40)[:, None] * (end - start) + 0.1 * np.sin(np.arange(40.0)[:, None])
+    arm, block = measured(40, seed=seed, q=path)
+    position = np.array(block.position)
+    position[-gross:] += 0.3 * random.normal(size=(gross, 3))
+    block = replace(block, position=position)
+    explanation = wrong_columns(install(arm, [block]), [block])
+    assert explanation is None or explanation.code != "rows-shifted"

@@ -26,7 +26,7 @@ from calib.geometry.observability import unidentified
 from calib.geometry.observation import fixed_parameters, stated_prior
 from calib.geometry.static_torques.load_errors import DESCRIBED, WEIGHED
 from calib.geometry.static_torques.mass_factors import SETTLED, MassFactors, several_loads
-from calib.geometry.static_torques.sources import MODELLED, torques_used
+from calib.geometry.static_torques.sources import MODELLED, torques_used, weightless_payloads
 from calib.geometry.weighing import GeometricFit, Settings, calibrated_chain
 from calib.procedure.findings import Verdict, level_of, sentence, settle
 from calib.procedure.kinematic_stage.inputs import Inputs, plain_reference
@@ -216,6 +216,8 @@ def run(
             notes += parted_set_up(inputs.chain, block)
     if mass_factors is not None:
         notes += mass_factors.findings()
+    stated = [*inputs.fit, *(rows.block for rows in inputs.unseen.values() if not rows.held_out)]
+    notes += weightless_payloads(inputs.chain, stated)
     by_loads = mass_factors is not None
     notes += torques_used(selection.fit.cell.deflection, inputs.gravity, inputs.torques, by_loads)
     if inputs.compliance is not None:

@@ -40,7 +40,7 @@ def with_row_off(nominal, calibrated, nominal_off, calibrated_off) -> Comparison
     found = rows(nominal, calibrated)
     for each, off in zip(found.errors, (nominal_off, calibrated_off)):
         each.main[7] = 1e-3 * off
-    return replace(found, blocks=(SimpleNamespace(rows=np.arange(50), load=None),))
+    return replace(found, blocks=(SimpleNamespace(rows=np.arange(50), load=None, file="unseen.csv"),))
 
 
 FITTED = Findings("geometry", 1e-4, None, 0.0, np.inf)
@@ -179,7 +179,7 @@ def test_the_reason_names_what_its_errors_are_of():
     small = {"g3.csv": replace(few_rows(1.0, 0.1), few=3), "g7.csv": few_rows(1.0, 0.1)}
     fit = rows(1.0, 0.01, False)
     verdict = judge(fit, small, FITTED, cross_validated=1e-4)
-    assert "(too few unseen poses: 3 in g3.csv, 7 in g7.csv)" in verdict.reason
+    assert "(too few unseen poses: g3.csv 3 of 8, g7.csv 7 of 8)" in verdict.reason
     assert "error by cross-validation 10.0 times" in verdict.reason
     many = judge(fit, {"a": rows(1.0, 0.1)}, FITTED, cross_validated=1e-4)
     assert "error on unseen poses 10.0 times" in many.reason
