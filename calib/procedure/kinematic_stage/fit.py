@@ -366,8 +366,9 @@ def _residual_findings(
         scatter = joint_scatter(selection.rigid) if random else None
         if scatter is not None:
             notes.append(scatter_finding(scatter))
-    if rigid_misfit and rigid_misfit.code == "rigid-misfit" and notes:
-        rigid_misfit = replace(rigid_misfit, values={**rigid_misfit.values, "causes": None})
+        elif not rigid_misfit.values["causes"]:
+            excluded = plausibility.excluded_causes(selection, inputs.fit, random)
+            rigid_misfit = replace(rigid_misfit, values={**rigid_misfit.values, "excluded": excluded})
     if rigid_misfit:
         notes.append(rigid_misfit)
     notes += _moved_between(selection.nominal.cell, inputs.fit, weighing)
@@ -378,6 +379,13 @@ def _residual_findings(
             notes.append(scale)
     notes += image_notes(selection.fit)
     return notes
+
+
+def _without_excluded(note: Finding) -> Finding:
+    """Return a finding without the causes that were excluded for it."""
+    if "excluded" not in note.values:
+        return note
+    return replace(note, values={**note.values, "excluded": None})
 
 
 def _check_convergence(selection: ModelSelection, inputs: Inputs, options: FitOptions) -> None:
@@ -433,6 +441,9 @@ def _findings(
     cross_validated = selection.cross_validated
     reach = nominal.reach
     contradictions = plausibility.findings(nominal, selection.fit, inputs.fit, cross_validated, reach, inputs.files)
+    if any(contradiction.code != "unexplained" for contradiction in contradictions):
+        # they name the cause of a misfit
+        notes = [_without_excluded(note) for note in notes]
     noticed = [*contradictions, *notes]
     if selection.folds.blind:
         noticed.append(finding("transfer-by-regions", stations=selection.folds.blind))

@@ -8,6 +8,7 @@ import pytest
 
 from calib.errors import finding
 from calib.geometry.accuracy import Errors
+from calib.geometry.checks.joint_range import JointRange
 from calib.procedure.kinematic_stage.metrics import Findings
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.verdict.comparison import Comparison
@@ -172,6 +173,16 @@ def test_extrapolation_is_no_contradiction(few):
     far = np.where(np.arange(50)[:, None] % 3 == 0, 0.5, 3.0) * np.sign(fitted)
     verdict = judge(fit, {"a": replace(at(rows(9.0, 2.0), far), few=few)}, FITTED, cross_validated=1e-4)
     assert verdict.level == "fail" and "within the fitted range" in verdict.reason
+
+
+@pytest.mark.parametrize(("sigma", "code"), [(0.2e-3, "no-better-known"), (0.05e-3, "")])
+def test_a_geometry_that_is_no_better_known_than_nominal_is_marginal_without_unseen_poses(sigma, code):
+    span = JointRange(("q1",), ("rad",), (-1.0,), (1.0,), (0.4,), sigma=sigma, nominal=0.1e-3, left=0.0)
+    findings = replace(FITTED, joint_range=span)
+    fit = rows(1.0, 0.1, False)
+    verdict = judge(fit, {}, findings, cross_validated=1e-4)
+    assert (verdict.level, verdict.code) == ("marginal" if code else "pass", code)
+    assert judge(fit, {"a": rows(1.0, 0.1)}, findings, cross_validated=1e-4).level == "pass"
 
 
 def test_the_reason_names_what_its_errors_are_of():

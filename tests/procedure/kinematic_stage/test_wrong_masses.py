@@ -95,6 +95,9 @@ def test_nearly_equal_loads_leave_the_doubt_of_the_masses(tmp_path, factor):
     assert rows.intervals.covered >= 0.9
     assert fit.expected.discrepancy.mass_doubt > DESCRIBED
     assert "masses-scaled" not in codes(fit)
+    # without described masses it exceeds the deflection itself, and the verdict says so
+    is_unlearnt = fit.expected.discrepancy.mass_doubt > 1.0
+    assert is_unlearnt is (factor == 0.0) is ("by another load is uncertain" in str(fit.verdict))
 
 
 def test_a_common_factor_leaves_changed_centres_of_mass():
