@@ -136,7 +136,7 @@ def _shifts(nominal: Installation, block: Positions) -> Iterator[tuple[int, int]
         nominal: the nominal arm.
         block: measured positions, or poses.
     """
-    candidates: list[tuple[int, int | None]] = []
+    candidates: list[tuple[int, int]] = []
     if isinstance(block, Poses) and len(np.unique(block.tool)) == 1 and len(np.unique(block.rows)) == len(block):
         arm, measured = (
             _by_row(forward(nominal.chain, block.q), block),
@@ -146,10 +146,28 @@ def _shifts(nominal: Installation, block: Positions) -> Iterator[tuple[int, int]
         if lag:
             candidates.append((lag, int(block.rows.min()) + row_lags.first_of_lag(arm, measured, lag)))
     # of poses, too: angles choose no lag of the last few rows
-    candidates += [(shift, _best_first(nominal, block, shift)) for shift in SHIFTS]
+    columns = _independent(_columns(nominal, block))
+    for shift in SHIFTS:
+        cut = _best_cut(columns, block, shift)
+        if cut is not None and cut.may_be_slip:
+            candidates.append((shift, cut.first))
     for shift, first in candidates:
-        if first is not None and _better_than_in_place(nominal, block, first, shift):
+        if _better_than_in_place(nominal, block, first, shift):
             yield shift, first
+
+
+class _Cut(NamedTuple):
+    """Row from which on a shift explains positions best, and mean squared errors [m²] with it and in place."""
+
+    first: int
+    after: float
+    in_place: float
+
+    @property
+    def may_be_slip(self) -> bool:
+        """Whether the error falls as much as a slip needs, if all of it were that of the rows which a shift keeps."""
+        least = MIN_PAIRED * MIN_SLIP**2 * self.after
+        return self.in_place >= least or self.in_place <= POSITION_ROUNDING**2
 
 
 def _better_than_in_place(nominal: Installation, block: Positions, first: int, shift: int) -> bool:
@@ -209,11 +227,11 @@ def _by_row(poses: np.ndarray, block: Positions) -> np.ndarray:
     return result
 
 
-def _best_first(nominal: Installation, block: Positions, shift: int) -> int | None:
+def _best_cut(columns: np.ndarray, block: Positions, shift: int) -> _Cut | None:
     """Return the row from which on a shift by `shift` rows explains the positions best; None where rows are too few.
 
     Args:
-        nominal: the nominal arm.
+        columns: (m, r) independent columns of the linear position model.
         block: measured positions.
         shift: number of rows by which the joint values are shifted down; negative for up.
     """
@@ -221,13 +239,15 @@ def _best_first(nominal: Installation, block: Positions, shift: int) -> int | No
     if len(numbers) < MIN_SHIFTED or len(_shifted(block, 0, shift)) < MIN_PAIRED * len(block):
         return None
 
-    errors = _CutErrors.of(nominal, block, shift)
+    errors = _CutErrors.of(columns, block, shift)
     coarse = numbers[evenly(len(numbers), MAX_CUTS)]
     best = coarse[np.argmin(errors.at(coarse))]
     around = numbers[np.abs(numbers - best) < max(len(numbers) // MAX_CUTS, 1)]
     best = int(around[np.argmin(errors.at(around))])
     later = numbers[numbers >= best]
-    return _last_as_good(errors.at(later), later, len(block))
+    squares = errors.at(later)
+    in_place = errors.at(np.array([block.rows.max() + 1]))
+    return _Cut(_last_as_good(squares, later, len(block)), float(squares[0]), float(in_place[0]))
 
 
 def _first_rows(block: Positions, shift: int) -> np.ndarray:
@@ -270,9 +290,14 @@ class _CutErrors:
     targets: tuple[_TargetRows, ...]
 
     @classmethod
-    def of(cls, nominal: Installation, block: Positions, shift: int) -> _CutErrors:
-        """Return the errors of a block with joint values shifted by `shift` rows, as of `_shifted`."""
-        columns = _independent(_columns(nominal, block))
+    def of(cls, columns: np.ndarray, block: Positions, shift: int) -> _CutErrors:
+        """Return the errors of a block with joint values shifted by `shift` rows, as of `_shifted`.
+
+        Args:
+            columns: (m, r) independent columns of the linear position model.
+            block: measured positions.
+            shift: number of rows; negative: rows further up.
+        """
         centred = block.position - block.position.mean(axis=0)
         unshifted = _partners(block.rows, block.rows)
         shifted = _partners(block.rows, block.rows + shift)
