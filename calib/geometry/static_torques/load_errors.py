@@ -56,11 +56,13 @@ def unlearnt_share(fit: GeometricFit, measured: Sequence[PoseMeasurements]) -> f
     cell = fit.cell
     chain = cell.chain
     has_torques = any(term.basis in BY_TORQUE for term in cell.merged().deflection.terms)
-    stated = all(isinstance(block, Positions) and block.base is None and block.load is not None for block in measured)
-    if has_torques or not stated or len(load_masses(measured)) < 2 or len(chain.driven) != chain.n:
+    have_loads = all(
+        isinstance(block, Positions) and block.base is None and block.load is not None for block in measured
+    )
+    if has_torques or not have_loads or len(load_masses(measured)) < 2 or len(chain.driven) != chain.n:
         return 1.0
     usual = usual_compliance(chain)
-    moved = np.flatnonzero(usual)
+    elements = np.flatnonzero(usual)
     loads = np.concatenate([block.load for block in measured])
     weighed = replace(chain, inertias=reference_masses(chain))
     rows, motions = [], []
@@ -69,17 +71,17 @@ def unlearnt_share(fit: GeometricFit, measured: Sequence[PoseMeasurements]) -> f
         by_load = load_motions(cell, block)
         by_mean = load_motions(cell, replace(block, load=np.tile(loads.mean(axis=0), (len(block), 1))))
         by_arm = _element_motions(cell, block) * gravity_moments(weighed, block.q, None)[:, None]
-        columns = np.concatenate([by_load[moved], COMMON * by_mean[moved], COMMON * by_arm[moved]])
-        columns *= np.tile(usual[moved], 3)[:, None, None]
-        turned = np.einsum("ij,kjm->kim", cell.stations[prepared.station][:3, :3], columns)
-        stacked = np.concatenate([part.jacobian, turned, part.value[None]])
+        columns = np.concatenate([by_load[elements], COMMON * by_mean[elements], COMMON * by_arm[elements]])
+        columns *= np.tile(usual[elements], 3)[:, None, None]
+        in_station = np.einsum("ij,kjm->kim", cell.stations[prepared.station][:3, :3], columns)[:, :, part.index]
+        stacked = np.concatenate([part.jacobian, in_station, part.value[None]])
         rows.append(stacked.reshape(len(stacked), -1) / max(fit.used_sigmas()[number]["position"], MIN_NOISE))
-        motions.append(turned[: len(moved)].reshape(len(moved), -1))
+        motions.append(in_station[: len(elements)].reshape(len(elements), -1))
     matrix = project_out(np.concatenate(rows, axis=1), np.arange(len(fit.free)))[len(fit.free) :]
     columns, residual = matrix[:-1], matrix[-1]
     covariance = np.linalg.inv(np.eye(len(columns)) + columns @ columns.T)
     mean = covariance @ (columns @ residual)
-    moments = (covariance + np.outer(mean, mean))[: len(moved), : len(moved)]
+    moments = (covariance + np.outer(mean, mean))[: len(elements), : len(elements)]
     effect = np.concatenate(motions, axis=1)
     share = np.sum((moments @ effect) * effect) / max(float(np.sum(effect**2)), 1e-300)
     return float(min(np.sqrt(share), 1.0))

@@ -216,8 +216,8 @@ def run(
             notes += parted_set_up(inputs.chain, block)
     if mass_factors is not None:
         notes += mass_factors.findings()
-    stated = [*inputs.fit, *(rows.block for rows in inputs.unseen.values() if not rows.held_out)]
-    notes += weightless_payloads(inputs.chain, stated)
+    blocks = [*inputs.fit, *(rows.block for rows in inputs.unseen.values() if not rows.held_out)]
+    notes += weightless_payloads(inputs.chain, blocks)
     by_loads = mass_factors is not None
     notes += torques_used(selection.fit.cell.deflection, inputs.gravity, inputs.torques, by_loads)
     if inputs.compliance is not None:
