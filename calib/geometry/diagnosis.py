@@ -22,13 +22,13 @@ from calib.data.poses.plausible import from_angles, to_angles
 from calib.errors import CalibError, Finding, finding
 from calib.geometry.accuracy import errors
 from calib.geometry.checks.mixed_rows import CONVENTIONS, unit_changes
-from calib.geometry.checks.wrong_rows import Blocks, least_error, row_shifts, two_targets
+from calib.geometry.checks.wrong_rows import ROBUST, Blocks, least_error, row_shifts, two_targets
 from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, layout, observe, positions, prepare
 from calib.geometry.residuals import ResidualPart
-from calib.geometry.weighing import GeometricFit, Settings
+from calib.geometry.weighing import GeometricFit
 from calib.records import evenly
 from calib.robot.chain import Chain, element_length
 
@@ -44,8 +44,6 @@ MIN_RATIO = 1.6
 MAX_NEIGHBOUR_SHARE = 0.6
 # ratio of residuals to stated uncertainty, or the inverse, above which a finding is reported (our choice)
 MAX_TIMES = 5.0
-# a robust fit, since orientations with angles beyond the range of a convention were lost
-ROBUST = Settings(loss="cauchy", limit=40, passes=4)
 # largest share of the error that may remain after a change made alone, and after reversing a joint's sign (our choice)
 MAX_LEFT = 1.0 / 3.0
 MAX_LEFT_SIGN = 0.8

@@ -33,7 +33,7 @@ from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.observation import layout, observe, prepare
 from calib.geometry.residuals import ResidualPart
-from calib.geometry.static_torques.load_errors import DESCRIBED, load_masses, load_variance
+from calib.geometry.static_torques.load_errors import DESCRIBED, load_masses, load_variance, unlearnt_share
 from calib.geometry.weighing import GeometricFit
 from calib.records import evenly
 from calib.robot.calibrated import Deflection
@@ -75,6 +75,7 @@ class Discrepancy:
         wider: factors by which the 95 % interval widens below and above each joint's range; empty if unknown.
         loads: masses that the arm carried in the fitted poses beyond its masses [kg]; empty if unknown.
         mass_doubt: standard deviation of the masses by which compliance was fitted, as a share of them.
+        unlearnt: share of a load's usual deflection that the rows leave open, where no compliance by torques is fitted.
     """
 
     parameters: float
@@ -89,6 +90,7 @@ class Discrepancy:
     wider: tuple[tuple[float, float], ...] = ()
     loads: tuple[float, ...] = ()
     mass_doubt: float = DESCRIBED
+    unlearnt: float = 1.0
 
     @property
     def radius(self) -> float:
@@ -167,10 +169,11 @@ class ErrorModel:
         Args:
             rows: the poses.
         """
-        variance = load_variance(self.cell, rows, self.discrepancy.loads, self.discrepancy.mass_doubt)
+        model = self.discrepancy
+        variance = load_variance(self.cell, rows, model.loads, model.mass_doubt, model.unlearnt)
         if variance is None:
             return 0.0
-        return variance / max(self.discrepancy.parameters, SMALLEST_FACTOR)
+        return variance / max(model.parameters, SMALLEST_FACTOR)
 
     def _sigma_and_radius(
         self, parameter_variance: np.ndarray, q: np.ndarray, radii: tuple[float, float]
@@ -342,6 +345,7 @@ def learn_errors(
         wider=samples.wider(weights, wide_radii, reach, rows.poses),
         loads=load_masses(measured),
         mass_doubt=mass_doubt,
+        unlearnt=unlearnt_share(fit, measured),
     )
     return ErrorModel(fit.cell, fit.free, fit.estimate.covariance, q, discrepancy)
 

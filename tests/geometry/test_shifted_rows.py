@@ -7,25 +7,51 @@ import pytest
 from planted import cell, perturb
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.measurements import Positions, take
+from calib.data.poses.measurements import Poses, Positions, take
 from calib.geometry.checks import row_lags
 from calib.geometry.checks.readings import without_unseen
-from calib.geometry.checks.wrong_rows import MIN_SHIFTED, SHIFTS, TIED, _best_first, _CutErrors, _shifted, least_error
+from calib.geometry.checks.wrong_rows import (
+    MIN_SHIFTED,
+    SHIFTS,
+    TIED,
+    _best_cut,
+    _columns,
+    _CutErrors,
+    _independent,
+    _shifted,
+    least_error,
+)
+from calib.geometry.diagnosis import wrong_columns
 from calib.geometry.first_guess import install
 from calib.geometry.installation import see
 from calib.robot.calibrated import evaluate
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import forward
 from calib.robot.library import load
+from calib.transforms import to_quaternion
 
 
-def measured(count, name="ur5", seed=1, errors=(0.5e-3, 1e-3)):
+def measured(count, name="ur5", seed=1, errors=(0.5e-3, 1e-3), q=None):
     """Return an arm, and positions of a target in another arm's cell, whose geometry has errors [m, rad]."""
     arm = load(name)
     truth = cell(perturb(arm, seed, *errors), seed)
-    q = random_joints(arm, count, np.random.default_rng(seed))
+    if q is None:
+        q = random_joints(arm, count, np.random.default_rng(seed))
     seen = see(truth, q, 0, np.zeros(count, dtype=int), evaluate(truth.deflection, q, None))
     return arm, Positions(q, arm.joint_names, seen.point.T, file="measured.csv")
+
+
+def best_first(nominal, block, shift):
+    """Return the row from which on a shift explains positions best."""
+    return _best_cut(_independent(_columns(nominal, block)), block, shift).first
+
+
+def measured_poses(count, name, seed):
+    """Return an arm, and poses of the tip of an arm whose geometry has errors."""
+    arm = load(name)
+    q = random_joints(arm, count, np.random.default_rng(seed))
+    tip = forward(perturb(arm, seed, 0.5e-3, 1e-3), q)
+    return arm, Poses(q, arm.joint_names, tip[:, :3, 3], to_quaternion(tip), file="measured.csv")
 
 
 @pytest.mark.parametrize(
@@ -59,7 +85,7 @@ def test_best_first_row_as_by_a_fit_for_each(variant):
         last = best
         while last + 1 < len(first) and len(block) * errors[last + 1] < (len(block) + TIED) * errors[best]:
             last += 1
-        assert _best_first(nominal, block, shift) == first[last]
+        assert best_first(nominal, block, shift) == first[last]
 
 
 @pytest.mark.parametrize("name", ["ur5", "tx40", "lwr4plus", "ur10"])
@@ -76,7 +102,7 @@ def test_a_slip_is_named_at_its_row_and_no_good_row_is_called_unseen(name, seed)
     read_twice = replace(stored_twice, position=stored_twice.position + 1e-5 * random.normal(size=(50, 3)))
     joints_twice = replace(block, q=block.q[source])
     for slipped, shift in ((stored_twice, -1), (read_twice, -1), (joints_twice, 1)):
-        assert _best_first(nominal, slipped, shift) == first
+        assert best_first(nominal, slipped, shift) == first
     visible, findings = without_unseen(arm, stored_twice)
     assert len(visible) == 50 and not findings
 
@@ -87,7 +113,7 @@ def test_a_slip_in_simulated_positions_of_the_nominal_arm_is_named_at_its_row(se
     arm, block = measured(50, seed=seed, errors=(0.0, 0.0))
     source = np.where(np.arange(50) < 20, np.arange(50), np.arange(50) - 1)
     slipped = replace(block, position=block.position[source])
-    assert _best_first(install(arm, [block]), slipped, -1) == block.rows[20]
+    assert best_first(install(arm, [block]), slipped, -1) == block.rows[20]
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
@@ -119,4 +145,36 @@ def test_no_rows_have_no_error():
     arm, block = measured(40)
     nominal = install(arm, [block])
     np.testing.assert_array_equal(least_error(nominal, [take(block, np.arange(0))]), [0.0])
-    assert _CutErrors.of(nominal, block, -1).at(np.array([0])) >= 0.0
+    assert _CutErrors.of(_independent(_columns(nominal, block)), block, -1).at(np.array([0])) >= 0.0
+
+
+@pytest.mark.parametrize("name", ["ur5", "lwr4plus"])
+@pytest.mark.parametrize("kind", [Positions, Poses])
+@pytest.mark.parametrize("slip", [2, 10, 17])
+def test_a_slip_in_a_short_file_is_named_at_its_row(name, kind, slip):
+    """Of 20 rows, and where two rows only have the joint values of the rows behind them."""
+    arm, target = measured_poses(21, name, seed=slip)
+    source = np.where(np.arange(20) < slip, np.arange(20), np.arange(20) + 1)
+    block = take(target, np.arange(20))
+    block = replace(block, position=target.position[source], quaternion=target.quaternion[source])
+    if kind is Positions:
+        block = Positions(block.q, block.joint_names, block.position, file="measured.csv")
+    explanation = wrong_columns(install(arm, [block]), [block])
+    assert explanation is not None and explanation.code == "rows-shifted"
+    values = explanation.changes[0].values
+    assert (values["first"], values["by"], values["way"]) == (slip + 1, 1, "down")
+
+
+@pytest.mark.parametrize("seed", [3, 4, 5])
+@pytest.mark.parametrize("gross", [1, 2])
+def test_gross_last_rows_are_no_slip(seed, gross):
+    """Neighbouring poses are near each other, so that rows beside the gross ones nearly fit to both."""
+    random = np.random.default_rng(seed)
+    start, end = random_joints(load("ur5"), 2, random)
+    path = start + np.linspace(0.0, 1.0, 40)[:, None] * (end - start) + 0.1 * np.sin(np.arange(40.0)[:, None])
+    arm, block = measured(40, seed=seed, q=path)
+    position = np.array(block.position)
+    position[-gross:] += 0.3 * random.normal(size=(gross, 3))
+    block = replace(block, position=position)
+    explanation = wrong_columns(install(arm, [block]), [block])
+    assert explanation is None or explanation.code != "rows-shifted"

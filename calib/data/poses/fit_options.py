@@ -89,7 +89,7 @@ OF_COLUMNS = (
     "copies",
     "units",
 )
-FINDINGS = ("unexplained", *OF_COLUMNS, "moved", "scale", "commanded", "range")
+FINDINGS = ("unexplained", *OF_COLUMNS, "moved", "scale", "commanded", "range", "payload")
 """Names in ``accept``: those of chapter 1 of the catalogue of findings."""
 
 

@@ -349,3 +349,21 @@ def take(block: Block, index: Sequence[int] | np.ndarray) -> Block:
         values = getattr(block, name)
         rows[name] = None if values is None else values[index]
     return replace(block, **rows)
+
+
+def reunited(block: Block, remainder: Block) -> Block:
+    """Return a block with further rows of the same file, in the order of their numbers.
+
+    Args:
+        block: measurements of one kind.
+        remainder: other rows of them; what only some rows have is left out.
+    """
+    order = np.argsort(np.concatenate([block.rows, remainder.rows]), kind="stable")
+    rows: dict[str, object] = {}
+    for name in block.per_row:
+        values = getattr(block, name)
+        further = getattr(remainder, name)
+        rows[name] = None
+        if values is not None and further is not None:
+            rows[name] = np.concatenate([values, further])[order]
+    return replace(block, **rows)

@@ -17,16 +17,24 @@ import numpy as np
 
 from calib.column_changes import Change
 from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, take
+from calib.errors import CalibError
+from calib.geometry.accuracy import errors
 from calib.geometry.checks import row_lags
+from calib.geometry.first_guess import install
+from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
+from calib.geometry.weighing import Settings
 from calib.records import evenly
 from calib.robot.kinematics import forward
 from calib.transforms import from_quaternion
 
 # shifts in rows between measurements and joint values that are tried, as by a lost point or a header line
 SHIFTS = (1, -1, 2, -2)
-# smallest number of shifted rows (our choice)
-MIN_SHIFTED = 3
+# smallest number of shifted rows that have joint values: within a few mm, of a range of a metre, none fits by chance
+MIN_SHIFTED = 1
+# largest rms error of the shifted rows, over that of the rows in place: the errors of a nominal arm at different poses
+# (our choice)
+MAX_TIMES_IN_PLACE = 3.0
 # smallest ratio of the rms errors without a repeated reading, and with a shift there (our choice)
 MIN_SLIP = 3.0
 # smallest share of the shifted rows whose joint values are available, not held out (our choice)
@@ -47,6 +55,8 @@ COLUMN_ROUNDING = 1e-10
 # the same of sums of products of orthonormal columns, as their eigenvalues: a combination of 1e-5 of the largest size,
 # whose square is that far above rounding (our choice)
 PRODUCT_ROUNDING = 1e-10
+# a robust fit, since orientations with angles beyond the range of a convention were lost, and a few rows are gross
+ROBUST = Settings(loss="cauchy", limit=40, passes=4)
 Blocks = Sequence[PoseMeasurements]
 
 
@@ -126,20 +136,69 @@ def _shifts(nominal: Installation, block: Positions) -> Iterator[tuple[int, int]
         nominal: the nominal arm.
         block: measured positions, or poses.
     """
+    candidates: list[tuple[int, int]] = []
     if isinstance(block, Poses) and len(np.unique(block.tool)) == 1 and len(np.unique(block.rows)) == len(block):
         arm, measured = (
             _by_row(forward(nominal.chain, block.q), block),
             _by_row(from_quaternion(block.position, block.quaternion), block),
         )
-        shift = row_lags.last_lag(arm, measured)
-        if shift:
-            first = row_lags.first_of_lag(arm, measured, shift)
-            yield shift, int(block.rows.min()) + first
-        return
+        lag = row_lags.last_lag(arm, measured)
+        if lag:
+            candidates.append((lag, int(block.rows.min()) + row_lags.first_of_lag(arm, measured, lag)))
+    # of poses, too: angles choose no lag of the last few rows
+    columns = _independent(_columns(nominal, block))
     for shift in SHIFTS:
-        first = _best_first(nominal, block, shift)
-        if first is not None:
+        cut = _best_cut(columns, block, shift)
+        if cut is not None and cut.may_be_slip:
+            candidates.append((shift, cut.first))
+    for shift, first in candidates:
+        if _better_than_in_place(nominal, block, first, shift):
             yield shift, first
+
+
+class _Cut(NamedTuple):
+    """Row from which on a shift explains positions best, and mean squared errors [m²] with it and in place."""
+
+    first: int
+    after: float
+    in_place: float
+
+    @property
+    def may_be_slip(self) -> bool:
+        """Whether the error falls as much as a slip needs, if all of it were that of the rows which a shift keeps."""
+        least = MIN_PAIRED * MIN_SLIP**2 * self.after
+        return self.in_place >= least or self.in_place <= POSITION_ROUNDING**2
+
+
+def _better_than_in_place(nominal: Installation, block: Positions, first: int, shift: int) -> bool:
+    """Return whether rows fit far better shifted than in place, and about as well as the rows before them.
+
+    Rows in place are compared without those that a shift leaves without joint values: to leave out a gross last row is
+    no shift.
+
+    Args:
+        nominal: the nominal arm.
+        block: measured positions.
+        first: row number from which on the joint values are shifted.
+        shift: number of rows; negative: rows further up.
+    """
+    shifted = _shifted(block, first, shift)
+    in_place = take(block, np.flatnonzero(np.isin(block.rows, shifted.rows)))
+    before = float(least_error(nominal, [in_place])[0])
+    after = float(least_error(nominal, [shifted])[0])
+    # as few rows as the model has columns are fitted exactly in any order
+    if POSITION_ROUNDING**2 < before < MIN_SLIP**2 * after:
+        return False
+    is_shifted = shifted.rows >= first
+    if is_shifted.all():
+        return True
+    try:
+        placed = polish_frames(install(nominal.chain, [shifted]), [shifted], ROBUST).cell
+    except CalibError:
+        # too few rows to place an instrument
+        return False
+    squares = errors(placed, [shifted]).main ** 2
+    return bool(squares[is_shifted].mean() < MAX_TIMES_IN_PLACE**2 * squares[~is_shifted].mean())
 
 
 def slips(nominal: Installation, block: Positions, row: int) -> bool:
@@ -168,11 +227,11 @@ def _by_row(poses: np.ndarray, block: Positions) -> np.ndarray:
     return result
 
 
-def _best_first(nominal: Installation, block: Positions, shift: int) -> int | None:
+def _best_cut(columns: np.ndarray, block: Positions, shift: int) -> _Cut | None:
     """Return the row from which on a shift by `shift` rows explains the positions best; None where rows are too few.
 
     Args:
-        nominal: the nominal arm.
+        columns: (m, r) independent columns of the linear position model.
         block: measured positions.
         shift: number of rows by which the joint values are shifted down; negative for up.
     """
@@ -180,13 +239,15 @@ def _best_first(nominal: Installation, block: Positions, shift: int) -> int | No
     if len(numbers) < MIN_SHIFTED or len(_shifted(block, 0, shift)) < MIN_PAIRED * len(block):
         return None
 
-    errors = _CutErrors.of(nominal, block, shift)
+    errors = _CutErrors.of(columns, block, shift)
     coarse = numbers[evenly(len(numbers), MAX_CUTS)]
     best = coarse[np.argmin(errors.at(coarse))]
     around = numbers[np.abs(numbers - best) < max(len(numbers) // MAX_CUTS, 1)]
     best = int(around[np.argmin(errors.at(around))])
     later = numbers[numbers >= best]
-    return _last_as_good(errors.at(later), later, len(block))
+    squares = errors.at(later)
+    in_place = errors.at(np.array([block.rows.max() + 1]))
+    return _Cut(_last_as_good(squares, later, len(block)), float(squares[0]), float(in_place[0]))
 
 
 def _first_rows(block: Positions, shift: int) -> np.ndarray:
@@ -229,9 +290,14 @@ class _CutErrors:
     targets: tuple[_TargetRows, ...]
 
     @classmethod
-    def of(cls, nominal: Installation, block: Positions, shift: int) -> _CutErrors:
-        """Return the errors of a block with joint values shifted by `shift` rows, as of `_shifted`."""
-        columns = _independent(_columns(nominal, block))
+    def of(cls, columns: np.ndarray, block: Positions, shift: int) -> _CutErrors:
+        """Return the errors of a block with joint values shifted by `shift` rows, as of `_shifted`.
+
+        Args:
+            columns: (m, r) independent columns of the linear position model.
+            block: measured positions.
+            shift: number of rows; negative: rows further up.
+        """
         centred = block.position - block.position.mean(axis=0)
         unshifted = _partners(block.rows, block.rows)
         shifted = _partners(block.rows, block.rows + shift)

@@ -184,12 +184,13 @@ class MassFactors:
         return float(np.expm1(LIMIT * of_logarithm)) / LIMIT
 
     def findings(self) -> list[Finding]:
-        """Return a finding if the masses together differ from those of a description of all bodies.
+        """Return findings: the doubt of a load's deflection, and masses that together differ from a description.
 
         Neighbours share the moment of a body: gravity does not tell its mass where theirs are not described.
         """
+        doubt = [finding("load-unlearnt", doubt=self.doubt)]
         if not self.described.all():
-            return []
+            return doubt
         described = np.asarray(self.chain.inertias)[:, 9]
         masses = self.masses[:, 9]
         factor = float(masses.sum() / described.sum())
@@ -197,8 +198,8 @@ class MassFactors:
         n = self.chain.n
         sigma = float(np.sqrt(shares @ self.covariance[:n, :n] @ shares))
         if abs(np.log(factor)) < MIN_SIGMAS * sigma:
-            return []
-        return [finding("masses-scaled", factor=factor, sigma=factor * sigma)]
+            return doubt
+        return [*doubt, finding("masses-scaled", factor=factor, sigma=factor * sigma)]
 
 
 def several_loads(measured: Sequence[PoseMeasurements]) -> bool:

@@ -21,6 +21,11 @@ from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import gravity_torques
 
+# share of the arm's mass below which a stated payload is none: arms lift up to half of their mass, of which a
+# thousandth is left where kg are read as g (our choice)
+LEAST_PAYLOAD_SHARE = 5e-4
+# [kg/m²] mass of an arm without described masses over the square of its length: that of the lightest ones (our choice)
+LIGHTEST = 10.0
 # sources of the torques that drive the compliance
 MEASURED, MODELLED = "measured", "modelled"
 
@@ -120,6 +125,29 @@ def _findings_of_load(block: PoseMeasurements, gravity: GravityFit) -> list[Find
     stated_mass = float(np.nanmean(block.payload[:, 0]))
     if _differs(gravity, mass, sigma, stated_mass) and abs(mass - stated_mass) > STATED_SHARE * max(stated_mass, mass):
         findings.append(finding("payload-differs", file=name, stated=stated_mass, mass=mass, sigma=sigma))
+    return findings
+
+
+def weightless_payloads(chain: Chain, blocks: Sequence[PoseMeasurements]) -> list[Finding]:
+    """Return a finding on each file of which the largest stated payload is too small for the arm to feel it.
+
+    Args:
+        chain: the arm with its masses.
+        blocks: the measurements.
+    """
+    arm_mass = LIGHTEST * chain.stretched_length() ** 2
+    if chain.inertias is not None and chain.inertias[:, 9].sum() > 0.0:
+        arm_mass = float(chain.inertias[:, 9].sum())
+    masses: dict[str, float] = {}
+    for block in blocks:
+        if block.payload is not None:
+            mass = float(np.nan_to_num(block.payload[:, 0]).max(initial=0.0))
+            masses[block.file] = max(mass, masses.get(block.file, 0.0))
+    findings = []
+    for file, mass in masses.items():
+        if mass > 0.0:
+            values = {"mass": mass, "arm_mass": arm_mass, "times": LEAST_PAYLOAD_SHARE * arm_mass / mass}
+            findings.append(finding("payload-weightless", file=Path(file).name, **values))
     return findings
 
 

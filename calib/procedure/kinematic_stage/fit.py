@@ -26,7 +26,7 @@ from calib.geometry.observability import unidentified
 from calib.geometry.observation import fixed_parameters, stated_prior
 from calib.geometry.static_torques.load_errors import DESCRIBED, WEIGHED
 from calib.geometry.static_torques.mass_factors import SETTLED, MassFactors, several_loads
-from calib.geometry.static_torques.sources import MODELLED, torques_used
+from calib.geometry.static_torques.sources import MODELLED, torques_used, weightless_payloads
 from calib.geometry.weighing import GeometricFit, Settings, calibrated_chain
 from calib.procedure.findings import Verdict, level_of, sentence, settle
 from calib.procedure.kinematic_stage.inputs import Inputs, plain_reference
@@ -216,6 +216,8 @@ def run(
             notes += parted_set_up(inputs.chain, block)
     if mass_factors is not None:
         notes += mass_factors.findings()
+    blocks = [*inputs.fit, *(rows.block for rows in inputs.unseen.values() if not rows.held_out)]
+    notes += weightless_payloads(inputs.chain, blocks)
     by_loads = mass_factors is not None
     notes += torques_used(selection.fit.cell.deflection, inputs.gravity, inputs.torques, by_loads)
     if inputs.compliance is not None:
@@ -364,8 +366,9 @@ def _residual_findings(
         scatter = joint_scatter(selection.rigid) if random else None
         if scatter is not None:
             notes.append(scatter_finding(scatter))
-    if rigid_misfit and rigid_misfit.code == "rigid-misfit" and notes:
-        rigid_misfit = replace(rigid_misfit, values={**rigid_misfit.values, "causes": None})
+        elif not rigid_misfit.values["causes"]:
+            excluded = plausibility.excluded_causes(selection, inputs.fit, random)
+            rigid_misfit = replace(rigid_misfit, values={**rigid_misfit.values, "excluded": excluded})
     if rigid_misfit:
         notes.append(rigid_misfit)
     notes += _moved_between(selection.nominal.cell, inputs.fit, weighing)
@@ -376,6 +379,13 @@ def _residual_findings(
             notes.append(scale)
     notes += image_notes(selection.fit)
     return notes
+
+
+def _without_excluded(note: Finding) -> Finding:
+    """Return a finding without the causes that were excluded for it."""
+    if "excluded" not in note.values:
+        return note
+    return replace(note, values={**note.values, "excluded": None})
 
 
 def _check_convergence(selection: ModelSelection, inputs: Inputs, options: FitOptions) -> None:
@@ -393,7 +403,7 @@ def _check_convergence(selection: ModelSelection, inputs: Inputs, options: FitOp
     if status.good:
         return
     nominal = selection.nominal.cell
-    contradictions = plausibility.findings(nominal, selection.fit, inputs.fit, None, nominal.reach)
+    contradictions = plausibility.findings(nominal, selection.fit, inputs.fit, None, nominal.reach, inputs.files)
     reasons = [sentence(reason) for reason in settle(contradictions, options.accept) if level_of(reason) == "fail"]
     message = f"the fit of model '{selection.chosen}' did not converge: {status.value}"
     raise NotConverged("; ".join([message, *reasons]), selection.fit)
@@ -429,7 +439,11 @@ def _findings(
     """
     nominal = selection.nominal.cell
     cross_validated = selection.cross_validated
-    contradictions = plausibility.findings(nominal, selection.fit, inputs.fit, cross_validated, nominal.reach)
+    reach = nominal.reach
+    contradictions = plausibility.findings(nominal, selection.fit, inputs.fit, cross_validated, reach, inputs.files)
+    if any(contradiction.code != "unexplained" for contradiction in contradictions):
+        # they name the cause of a misfit
+        notes = [_without_excluded(note) for note in notes]
     noticed = [*contradictions, *notes]
     if selection.folds.blind:
         noticed.append(finding("transfer-by-regions", stations=selection.folds.blind))
@@ -441,7 +455,7 @@ def _findings(
         cross_validated=cross_validated,
         nominal_cross_validated=selection.nominal_step.cross_validated,
         outlier_share=len(outlier_rows) / row_count,
-        reach=nominal.reach,
+        reach=reach,
         noticed=settle(noticed, accepted),
         blind=selection.folds.blind,
         rigid_cross_validated=selection.rigid_cross_validated,

@@ -13,7 +13,7 @@ from calib.data.pose_pairs.pair_files import read_pairs
 from calib.data.poses import JOINTS, is_image_folder
 from calib.data.poses.columns import Undecided
 from calib.data.poses.fit_options import FileOptions, FitOptions, check_files
-from calib.data.poses.measurements import PoseMeasurements, take
+from calib.data.poses.measurements import PoseMeasurements, reunited, take
 from calib.data.poses.plausible import check_block
 from calib.data.poses.pose_files import joint_columns, read_measurements
 from calib.errors import CalibError, Finding, MeasurementError, UsageError, listing, refuse_option, require
@@ -92,6 +92,14 @@ class Inputs:
     gravity: GravityFit | None = None
     torques: str = MEASURED
     compliance: StatedCompliance | None = None
+
+    @property
+    def files(self) -> tuple[PoseMeasurements, ...]:
+        """Blocks to fit, with the rows of their files that were held out."""
+        held_out = [rows.block for rows in self.unseen.values() if rows.held_out]
+        if not held_out:
+            return self.fit
+        return tuple(map(reunited, self.fit, held_out))
 
     def driven_by(self, source: str) -> "Inputs":
         """Return the inputs whose compliance is driven by measured or by modelled torques.

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -514,6 +515,33 @@ def test_unseen_poses_of_a_changed_arm_contradict_the_fit(cell, calib, count, fr
 
 
 @pytest.mark.slow
+def test_as_many_poses_as_the_verdict_asks_for_beside_a_fitted_placement_decide_it(cell, calib) -> None:
+    """Nine positions have three numbers per parameter of the placement; eight are 24 numbers of 27."""
+    file, other = cell.write("a.csv", cell.measure(60)), cell.measure(9, 1)
+    for count in (6, 8, 9):
+        given = ("ur5", file, "--model", "geometry", "--validate", cell.write("v.csv", other[:count]), "--refit-frames")
+        _, out, err = calib("fit", *given, "--out", "o")
+        assert (f"(too few unseen poses: v.csv {count} of 9)" in out) is (count < 9), err
+        assert ("measure at least 9 such poses" in out) is (count < 9)
+        assert ("on v.csv, unseen" in out) is (count == 9)
+
+
+@pytest.mark.parametrize(
+    "count", [20, pytest.param(28, marks=pytest.mark.slow), pytest.param(40, marks=pytest.mark.slow)]
+)
+def test_the_advised_holdout_leaves_poses_enough_to_decide(cell, calib, count) -> None:
+    """Where it would leave too few poses to fit, it is not advised."""
+    given = ("ur5", cell.write("a.csv", cell.measure(count)), "--model", "geometry", "--out", "o")
+    _, out, err = calib("fit", *given, "--holdout", "0.1")
+    advised = re.search(r"--holdout (0\.\d+)", out)
+    assert "measure at least 8 poses" in out and (advised is None) is (count == 20), err
+    if advised is None:
+        return
+    _, out, err = calib("fit", *given, "--holdout", advised[1])
+    assert "on a.csv, unseen" in out, err
+
+
+@pytest.mark.slow
 def test_few_unseen_poses_are_said_and_decide_nothing(cell, calib) -> None:
     """Seven poses are named on the console, in the verdict and on the certificate; eight decide it."""
     file, other = cell.write("a.csv", cell.measure(60)), cell.measure(8, 1)
@@ -523,5 +551,5 @@ def test_few_unseen_poses_are_said_and_decide_nothing(cell, calib) -> None:
         said = f"v{count}.csv: too few unseen poses ({count} of 8)"
         page = Path(f"o{count}/report.html").read_text()
         assert (said in out) is (said in page) is (count == 7), err
-        assert (f"by cross-validation only (too few unseen poses: {count} in v{count}.csv)" in out) is (count == 7)
+        assert (f"by cross-validation only (too few unseen poses: v{count}.csv {count} of 8)" in out) is (count == 7)
         assert (f"on v{count}.csv, unseen" in out) is (count == 8)

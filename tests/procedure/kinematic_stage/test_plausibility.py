@@ -189,6 +189,40 @@ def test_misaligned_rows_are_named(cell, calib, first, way):
     assert (found["by"], found["way"]) == (1, way) and abs(found["first"] - max(first - 1, 1)) <= 1
 
 
+@pytest.mark.parametrize("seed", ["0", pytest.param("1", marks=pytest.mark.slow)])
+def test_a_slip_is_named_by_all_rows_of_a_file_of_which_some_are_held_out(cell, calib, seed):
+    """Rows beside held-out ones lack the joint values to which they belong: these are in the file."""
+    rows = cell.measure(21)
+    read = ("x", "y", "z")
+    table = []
+    for number in range(20):
+        joints = {name: value for name, value in rows[number].items() if name[0] == "q" and name[1].isdigit()}
+        reading = rows[number + (number >= 10)]
+        table.append(joints | {axis: reading[axis] for axis in read})
+    code, _, err = calib(
+        "fit", "ur5", cell.write("m.csv", table), "--out", "o", "--model", "frames", "--holdout", "0.25", "--seed", seed
+    )
+    assert (code, *verdict()[:2]) == (1, "fail", "rows-shifted"), err
+    found = noticed()["rows-shifted"].values
+    assert (found["first"], found["by"], found["way"]) == (11, 1, "down")
+
+
+@pytest.mark.parametrize(
+    ("unit", "masses", "level"),
+    [("g", (2.5, 5.0), "marginal"), ("kg", (2.5, 5.0), "pass"), ("g", (500.0, 0.0), "pass")],
+)
+def test_kilograms_under_a_header_in_grams_are_named(cell, calib, unit, masses, level):
+    rows = [row | {f"payload [{unit}]": masses[number % 2]} for number, row in enumerate(cell.measure(COUNT))]
+    _, out, err = fitted(cell, calib, rows, "geometry")
+    assert ("payload-weightless" in noticed()) == (level == "marginal"), err
+    assert verdict()[0] == level
+    if level == "marginal":
+        assert "payload [kg]" in out and 'accept = ["payload"]' in out
+        Path("a.toml").write_text('accept = ["payload"]')
+        calib("fit", "ur5", "m.csv", "--out", "o", "--model", "geometry", "--options", "a.toml")
+        assert verdict()[0] == "pass"
+
+
 @pytest.mark.slow
 def test_rows_of_two_targets_are_sorted(cell, calib):
     rows = cell.measure(COUNT)

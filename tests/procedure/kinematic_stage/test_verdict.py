@@ -8,6 +8,7 @@ import pytest
 
 from calib.errors import finding
 from calib.geometry.accuracy import Errors
+from calib.geometry.checks.joint_range import JointRange
 from calib.procedure.kinematic_stage.metrics import Findings
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.verdict.comparison import Comparison
@@ -40,7 +41,7 @@ def with_row_off(nominal, calibrated, nominal_off, calibrated_off) -> Comparison
     found = rows(nominal, calibrated)
     for each, off in zip(found.errors, (nominal_off, calibrated_off)):
         each.main[7] = 1e-3 * off
-    return replace(found, blocks=(SimpleNamespace(rows=np.arange(50), load=None),))
+    return replace(found, blocks=(SimpleNamespace(rows=np.arange(50), load=None, file="unseen.csv"),))
 
 
 FITTED = Findings("geometry", 1e-4, None, 0.0, np.inf)
@@ -174,12 +175,22 @@ def test_extrapolation_is_no_contradiction(few):
     assert verdict.level == "fail" and "within the fitted range" in verdict.reason
 
 
+@pytest.mark.parametrize(("sigma", "code"), [(0.2e-3, "no-better-known"), (0.05e-3, "")])
+def test_a_geometry_that_is_no_better_known_than_nominal_is_marginal_without_unseen_poses(sigma, code):
+    span = JointRange(("q1",), ("rad",), (-1.0,), (1.0,), (0.4,), sigma=sigma, nominal=0.1e-3, left=0.0)
+    findings = replace(FITTED, joint_range=span)
+    fit = rows(1.0, 0.1, False)
+    verdict = judge(fit, {}, findings, cross_validated=1e-4)
+    assert (verdict.level, verdict.code) == ("marginal" if code else "pass", code)
+    assert judge(fit, {"a": rows(1.0, 0.1)}, findings, cross_validated=1e-4).level == "pass"
+
+
 def test_the_reason_names_what_its_errors_are_of():
     """A verdict by cross-validation says so, and names the files that are too small to decide it."""
     small = {"g3.csv": replace(few_rows(1.0, 0.1), few=3), "g7.csv": few_rows(1.0, 0.1)}
     fit = rows(1.0, 0.01, False)
     verdict = judge(fit, small, FITTED, cross_validated=1e-4)
-    assert "(too few unseen poses: 3 in g3.csv, 7 in g7.csv)" in verdict.reason
+    assert "(too few unseen poses: g3.csv 3 of 8, g7.csv 7 of 8)" in verdict.reason
     assert "error by cross-validation 10.0 times" in verdict.reason
     many = judge(fit, {"a": rows(1.0, 0.1)}, FITTED, cross_validated=1e-4)
     assert "error on unseen poses 10.0 times" in many.reason

@@ -12,6 +12,7 @@ from calib.geometry.static_torques.load_errors import DESCRIBED
 from calib.geometry.static_torques.mass_factors import MassFactors
 from calib.procedure.kinematic_stage.folder import FitFolder
 from calib.procedure.kinematic_stage.inputs import gather
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.robot.formats import urdf as urdf_format
 
 COLUMNS = [*HEAD[:10], "payload [kg]"]
@@ -31,12 +32,12 @@ def description(factor: float, own: float = 0.0) -> str:
     )
 
 
-def fitted(path, factor, own=0.0, seed=3, loads=(0.0, 2.5), unseen=5.0):
+def fitted(path, factor, own=0.0, seed=3, loads=(0.0, 2.5), unseen=5.0, settings=None):
     """Return a fit to poses under loads [kg], validated with another one."""
-    return fitted_to(path, description(factor, own), seed, loads, unseen)
+    return fitted_to(path, description(factor, own), seed, loads, unseen, settings)
 
 
-def fitted_to(path, text, seed=3, loads=(0.0, 2.5), unseen=5.0):
+def fitted_to(path, text, seed=3, loads=(0.0, 2.5), unseen=5.0, settings=None):
     """Return a fit of a described arm to poses under loads [kg], validated with another one."""
     arm = GivingArm(seed=seed)
     (path / "arm.urdf").write_text(text)
@@ -44,7 +45,7 @@ def fitted_to(path, text, seed=3, loads=(0.0, 2.5), unseen=5.0):
     tables["unseen"] = loaded(arm, 80, 9, unseen)
     for name, table in tables.items():
         arm.write(path / f"{name}.csv", table, COLUMNS)
-    return calib.fit_geometry(path / "arm.urdf", path / "fit.csv", validate=path / "unseen.csv")
+    return calib.fit_geometry(path / "arm.urdf", path / "fit.csv", settings, validate=path / "unseen.csv")
 
 
 def loaded(arm, count, seed, load):
@@ -99,6 +100,18 @@ def test_nearly_equal_loads_leave_the_doubt_of_the_masses(tmp_path, factor):
     assert rows.intervals.covered >= 0.9
     assert fit.expected.discrepancy.mass_doubt > DESCRIBED
     assert "masses-scaled" not in codes(fit)
+    # without described masses it exceeds the deflection itself, and the verdict says so
+    is_unlearnt = fit.expected.discrepancy.mass_doubt > 1.0
+    assert is_unlearnt is (factor == 0.0) is ("by another load is uncertain" in str(fit.verdict))
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_deflection_that_a_rigid_model_leaves_is_within_the_intervals(tmp_path, seed):
+    """The arm gives way, and the model has no compliance: what the loads show stays in its bound."""
+    fit = fitted(tmp_path, 1.0, seed=seed, settings=FitSettings(model="geometry"))
+    (rows,) = fit.validation.values()
+    assert rows.intervals.covered >= 0.9
+    assert 0.0 < fit.expected.discrepancy.unlearnt < 1.0
 
 
 def test_a_common_factor_leaves_changed_centres_of_mass():

@@ -242,7 +242,7 @@ def test_poses_are_held_out_by_default(measured: Session) -> None:
     found = json.loads(measured.path("5-validation/metrics.json").read_text())
     assert (
         found["validation"]["measured.csv"]["poses"] == 5
-        and "(too few unseen poses: 5 in measured.csv)" in found["reason"]
+        and "(too few unseen poses: measured.csv 5 of 8)" in found["reason"]
     )
     assert json.loads(measured.path("4-fit/metrics.json").read_text())["fit"]["poses"] == 15
 

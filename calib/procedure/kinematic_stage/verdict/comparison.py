@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -130,6 +131,14 @@ class Comparison:
     def may_contradict(self) -> bool:
         """Whether these rows are too few to prove anything, but may contradict the fit."""
         return self.placed_by is not None or (self.proves and self.few is not None)
+
+    @property
+    def least_poses(self) -> int:
+        """Number of such poses from which on errors decide a verdict: beside a fitted placement, more are needed."""
+        if self.placed_by is None:
+            return MIN_UNSEEN
+        measured, parameters = self.placed_by
+        return max(MIN_UNSEEN, math.ceil(MARGIN * parameters * self.poses / measured))
 
     @property
     def of_urdf(self) -> Comparison:

@@ -4,6 +4,7 @@ Few poses, or few numbers beside a placement that was fitted to them, cannot pro
 leads to expect can contradict it all the same. Limits and sentences are in the catalogue of findings, chapter 4.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -12,11 +13,13 @@ from calib.errors import Finding, finding
 from calib.geometry.error_model import outside
 from calib.geometry.static_torques.sources import load_changes
 from calib.procedure.findings import catalogue
-from calib.procedure.kinematic_stage.verdict.comparison import MARGIN, MIN_UNSEEN, Comparison
+from calib.procedure.kinematic_stage.verdict.comparison import MIN_UNSEEN, Comparison
 from calib.procedure.kinematic_stage.verdict.plausibility import TOO_GOOD
 
 # times the median error: a row from which on is probably measured wrongly (our choice)
 OUTLIER_SIGMAS = 8.0
+# largest share of the poses that is advised to be held out: the others have to determine an arm (our choice)
+MAX_HOLDOUT = 0.3
 # error [m] below which none is taken in a ratio
 TINY = 1e-300
 # share of a joint's fitted range by which a pose may be outside without being an extrapolation (our choice)
@@ -33,13 +36,14 @@ def expected_error(fit: Comparison, cross_validated: float | None) -> float:
     return max(fit.errors[1].rms if cross_validated is None else cross_validated, TINY)
 
 
-def small_files(validation: Mapping[str, Comparison], promised: float) -> Iterator[Finding]:
+def small_files(fit: Comparison, validation: Mapping[str, Comparison], promised: float) -> Iterator[Finding]:
     """Yield a finding on each validation file that proves nothing, but may contradict the fit.
 
     Rows that are far off with both arms do not count: they are findings of their own. What a fitted placement leaves is
     a lower bound of the error.
 
     Args:
+        fit: errors of both arms on the fitted rows, some of which may be held out instead.
         validation: name of a validation file -> errors of both arms.
         promised: error that the fit leads to expect [m].
     """
@@ -50,10 +54,25 @@ def small_files(validation: Mapping[str, Comparison], promised: float) -> Iterat
         times = rms / promised
         if rows.placed_by is not None:
             measured, fitted = rows.placed_by
-            values = {"measured": measured, "fitted": fitted, "wanted": MARGIN * fitted}
+            values = {"measured": measured, "fitted": fitted, "least": rows.least_poses}
             yield finding("placement-takes-all", file=name, rms=rms, times=times, **values)
         else:
-            yield finding("few-unseen-poses", where=name, poses=rows.few, least=MIN_UNSEEN, rms=rms, times=times)
+            values = {"poses": rows.few, "least": MIN_UNSEEN, "holdout": _sufficient_holdout(fit, rows)}
+            yield finding("few-unseen-poses", where=name, rms=rms, times=times, **values)
+
+
+def _sufficient_holdout(fit: Comparison, rows: Comparison) -> str | None:
+    """Return a share of the measured poses that is enough to decide a verdict; None if it leaves too few to fit.
+
+    Args:
+        fit: errors on the fitted rows.
+        rows: errors on unseen rows: of the same file, if they were held out.
+    """
+    poses = fit.poses
+    if {block.file for block in rows.blocks} <= {block.file for block in fit.blocks}:
+        poses += rows.poses
+    share = math.ceil(20.0 * MIN_UNSEEN / max(poses, 1)) / 20.0
+    return f"{share:g}" if share <= MAX_HOLDOUT else None
 
 
 def contradicted(fit: Comparison, validation: Mapping[str, Comparison], promised: float) -> Iterator[Finding]:

@@ -14,6 +14,7 @@ import numpy as np
 
 from calib.errors import Finding, finding, listing
 from calib.geometry.checks.file_change import changed_since_fit
+from calib.geometry.checks.joint_range import JointRange
 from calib.geometry.error_model import ErrorModel
 from calib.geometry.fit import without_corrections
 from calib.geometry.installation import Installation
@@ -112,7 +113,7 @@ def judge(
     """
     unseen = {name: comparison for name, comparison in validation.items() if comparison.decides}
     promised = expected_error(fit, cross_validated)
-    few = [*small_files(validation, promised), *_gross_of_few(validation, findings.reach)]
+    few = [*small_files(fit, validation, promised), *_gross_of_few(validation, findings.reach)]
     small = {name: rows for name, rows in validation.items() if rows.may_contradict}
     few += filter(level_of, contradicted(fit, small, promised))
     nominal_rms = fit.errors[0].rms
@@ -129,7 +130,7 @@ def judge(
     if not proofs and cross_validated is not None:
         where = "by cross-validation only"
         if few and all(level_of(note) == "note" for note in few):
-            counts = [f"{rows.few or rows.poses} in {name}" for name, rows in small.items()]
+            counts = [f"{name} {rows.few or rows.poses} of {rows.least_poses}" for name, rows in small.items()]
             where += f" (too few unseen poses: {listing(counts, 2)})"
         proofs = [_Proof(nominal_rms, cross_validated, where)]
     if not proofs and frames_only:
@@ -379,7 +380,21 @@ def _doubts(
             missing=NOMINAL_COVERAGE - chance - covered,
         )
     yield finding("small-gain", left=worst.ratio)
+    if not unseen and findings.model != "frames":
+        yield from _no_better_known(findings.joint_range)
     yield finding("many-outliers", share=findings.outlier_share)
+
+
+def _no_better_known(measured_range: JointRange | None) -> Iterator[Finding]:
+    """Yield a finding on σ of the target over the joints' whole range, compared with what the fit corrects there.
+
+    Args:
+        measured_range: the measured range of the joints, with both; None if unknown.
+    """
+    if measured_range is None or measured_range.sigma is None or measured_range.nominal is None:
+        return
+    sigma, correction = measured_range.sigma, measured_range.nominal
+    yield finding("no-better-known", sigma=sigma, correction=correction, doubt=sigma / max(correction, TINY))
 
 
 @dataclass(frozen=True, eq=False)
@@ -479,9 +494,10 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
     noticed += inputs.noticed
     if deliverable == "urdf" and fitted.alone is not None:
         of_urdf = {name: rows.of_urdf for name, rows in validation.items()}
-        noticed += small_files(of_urdf, expected_error(fitted.of_urdf, findings.rigid_cross_validated))
+        promised = expected_error(fitted.of_urdf, findings.rigid_cross_validated)
+        noticed += small_files(fitted, of_urdf, promised)
     else:
-        noticed += small_files(validation, expected_error(fitted, findings.cross_validated))
+        noticed += small_files(fitted, validation, expected_error(fitted, findings.cross_validated))
     noticed += load_changes(inputs.fit, [rows.block for rows in inputs.unseen.values()])
     copies = _copies(inputs)
     if copies:
