@@ -155,6 +155,10 @@ class IdentificationFolder:
         """Read the names of the essential parameters."""
         return tuple(row.name for row in folders.read_estimate(self.path, _Essential) if row.essential is not None)
 
+    def switched_off(self) -> tuple[str, ...]:
+        """Read the names of the drive terms that the evidence switched off; none where no metrics are stored."""
+        return self.metrics().switched_off if self.numbers.is_file() else ()
+
     def errors(self) -> TorqueErrorModel | None:
         """Read the model of expected torque errors; None if the folder contains no errors or no covariance."""
         discrepancy = self.findings().errors

@@ -283,8 +283,10 @@ def _information_root(inputs: ExcitationInputs, factor: np.ndarray | float = 1.0
         priors = information - data
         if _is_semidefinite(priors, information):
             scaled = priors + data * squared_factors
-    values, V = np.linalg.eigh(scaled)
-    return np.sqrt(np.maximum(values, 0.0))[:, None] * V.T
+    # columns of unit size: what a term that is switched off is known by must not drown the others by rounding
+    size = np.sqrt(np.maximum(np.diag(scaled), 1e-300))
+    values, V = np.linalg.eigh(scaled / np.outer(size, size))
+    return np.sqrt(np.maximum(values, 0.0))[:, None] * V.T * size
 
 
 def _is_semidefinite(difference: np.ndarray, information: np.ndarray) -> bool:

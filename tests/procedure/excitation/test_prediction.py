@@ -158,6 +158,13 @@ def test_priors_are_not_weighed_with_the_rows():
     np.testing.assert_allclose(root.T @ root, data * np.outer(factor, factor) + priors)
 
 
+def test_what_is_known_to_rounding_does_not_drown_the_rest():
+    """A constraint holds the third parameter; the information on the others is 24 decimals less."""
+    information = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 1e24]])
+    root = _information_root(_stored(information, None))
+    np.testing.assert_allclose((root.T @ root)[:2, :2], information[:2, :2], rtol=1e-9)
+
+
 @pytest.mark.parametrize("data", [None, np.diag([8.0, 1.0])], ids=["no rows stored", "covariance of more than torques"])
 def test_all_information_is_weighed_where_the_priors_share_is_not_known(data):
     information = np.array([[4.0, 1.0], [1.0, 2.0]])
