@@ -98,6 +98,7 @@ def identify_dynamics(
     friction: str | None = None,
     options: Path | None = None,
     excitation: Path | None = None,
+    after: Path | None = None,
     with_geometry: bool = False,
     base: str | None = None,
     tip: str | None = None,
@@ -119,6 +120,8 @@ def identify_dynamics(
         options: TOML: drives, payloads, gains, filters, identification
         excitation: folder of calib excite: its prediction is compared with the result; its motion is the reference of
             recordings that have none (methods with a [loop])
+        after: folder of an earlier identification, for whose further motion calib excite --after predicted σ: its
+            friction terms and the sizes of its prior are kept, unless the recordings contradict them
         with_geometry: estimate joint offsets, lengths and the direction of gravity again, together with the dynamics
     """
     from calib.api.dynamic import identify_dynamics as identified
@@ -143,6 +146,7 @@ def identify_dynamics(
             options=options,
             base=base,
             excitation=excitation,
+            after=after,
             with_geometry=with_geometry or None,
             tip=tip,
             seed=seed,
