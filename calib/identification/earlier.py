@@ -7,8 +7,11 @@ if the error on held-out time falls by `CLEAR_GAIN`, and sizes and ridges are ch
 probable.
 """
 
+from __future__ import annotations
+
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from calib.dynamics.drives import DriveTerm
 from calib.errors import UsageError, require
@@ -47,21 +50,34 @@ class EarlierChoice:
         source: name of the earlier identification.
         terms: the additional friction terms.
         choice: groups and ridges of these terms, and the prior.
+        contradiction: logarithm of the evidence of other sizes over that of the earlier ones, where these were left; 0
+            where they are kept.
     """
 
     source: str
     terms: tuple[DriveTerm, ...]
     choice: ModelChoice
+    contradiction: float = 0.0
 
     @property
     def ridges(self) -> dict[str, float]:
         """Ridge of each term by its name."""
         return dict(zip(self.choice.terms, self.choice.ridges))
 
+    def without_prior(self, contradiction: float) -> EarlierChoice:
+        """Return the choice of the terms alone: sizes, ridges and tempering are left.
+
+        Args:
+            contradiction: logarithm of the evidence of other sizes over that of the earlier ones.
+        """
+        ridges = (math.nan,) * len(self.terms)
+        choice = replace(self.choice, ridges=ridges, sizes={})
+        return replace(self, choice=choice, contradiction=contradiction)
+
     def check_sizes(self, names: Sequence[str]) -> None:
-        """Raise a UsageError if the sizes of a prior have other names."""
+        """Raise a UsageError if there are sizes of a prior and those of the recordings have other names."""
         require(
-            set(self.choice.sizes) == set(names),
+            set(self.choice.sizes) in (set(), set(names)),
             f"after {self.source}: it was identified with other drive terms, torque rows or payloads, so that its "
             "prior is of other parameters; identify it again with these options",
             UsageError,

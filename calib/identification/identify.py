@@ -210,8 +210,7 @@ def identify_model(
         robot, source = cad, "cad"
     earlier = settings.earlier
     fixed = None if earlier is None else earlier.choice.sizes
-    find_freely = partial(find_prior, model, base, robot=robot, source=source, noise=noise, effort=effort)
-    find = partial(find_freely, fixed=fixed)
+    find = partial(find_prior, model, base, robot=robot, source=source, noise=noise, effort=effort, fixed=fixed)
     takes_prior = _takes_prior(method, model, settings, source)
     rows, prior, first = _first_fit(rows, find, takes_prior, noise)
     rows = with_weights(rows, first.rest_weights)
@@ -224,7 +223,7 @@ def identify_model(
         if error_as_moving < CLEARLY_LESS**2 * error:
             rows, prior, first = as_moving
             marks_standstills = False
-    if prior is not None and earlier is not None:
+    if prior is not None and earlier is not None and fixed:
         earlier.check_sizes(tuple(prior.sizes))
         prior = find(rows, start=prior, tempering=earlier.choice.tempering)
     elif prior is not None:
@@ -251,13 +250,22 @@ def identify_model(
         richer_rows = with_weights(richer_rows, prior.first.rest_weights)
     ridges = None
     if prior is not None and earlier is not None:
+        if prior.contradiction > np.log(DECISIVE):
+            say("the prior of the earlier identification is left")
+            anew = replace(settings, earlier=earlier.without_prior(prior.contradiction))
+            return identify_model(
+                model,
+                cases,
+                anew,
+                nominal=nominal,
+                states=states,
+                cad=cad,
+                shape=shape,
+                effort=effort,
+                progress=progress,
+            )
         names = [*base.names, *[term.name for term in friction.terms]]
         ridges = np.array([earlier.ridges.get(name, np.nan) for name in names])
-        contradiction = prior.contradiction
-        if contradiction > np.log(DECISIVE):
-            prior = find_freely(richer_rows, groups=groups, start=prior, tempering=prior.tempering)
-            prior = replace(prior, contradiction=contradiction)
-            ridges = None
 
     terms = (*_terms_of(model, base), *friction.terms)
     problem = IdentificationProblem(

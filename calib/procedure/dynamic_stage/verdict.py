@@ -15,7 +15,6 @@ from calib.data.signals.persistency import ExcitationReport
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, finding
 from calib.identification.checks.joint_compliance import encoder_difference
-from calib.identification.earlier import DECISIVE
 from calib.identification.identify import Identification
 from calib.identification.prediction import Dynamics, Score
 from calib.identification.rows import Case
@@ -285,12 +284,12 @@ def model_findings(cases: Sequence[Case], identification: Identification) -> tup
 
 def _left_earlier(identification: Identification[RegressorModel]) -> list[Finding]:
     """Return findings on what the recordings contradict in the choice of an earlier identification."""
-    earlier, prior = identification.settings.earlier, identification.prior
+    earlier = identification.settings.earlier
     if earlier is None:
         return []
     findings = []
-    if prior is not None and prior.contradiction > np.log(DECISIVE):
-        ratio = float(np.exp(min(prior.contradiction, LARGEST_LOG)))
+    if earlier.contradiction > 0.0:
+        ratio = float(np.exp(min(earlier.contradiction, LARGEST_LOG)))
         findings.append(finding("earlier-prior-left", source=earlier.source, ratio=ratio))
     names = [term.name for term in identification.friction.terms if term.name not in earlier.ridges]
     if names:
