@@ -127,10 +127,10 @@ def identify_dynamics(
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.report.dynamics_section import read_lines
 
-    unused = method, friction, excitation
+    unused = method, friction, excitation, after
     if _gravity(robot, recordings, validate or [], out, options, base, tip, seed, unused):
         return
-    check_destination("identify", robot, out, [options, *recordings, *(validate or [])])
+    check_destination("identify", robot, out, [options, after, *recordings, *(validate or [])])
 
     def read(inputs: "IdentificationInputs") -> None:
         check_destination("identify", robot, out, [inputs.source, inputs.source.parent])
@@ -173,12 +173,12 @@ def _gravity(
     base: str | None,
     tip: str | None,
     seed: int,
-    unused: tuple[str | None, str | None, Path | None],
+    unused: tuple[str | None, str | None, Path | None, Path | None],
 ) -> bool:
     """Identify gravity and write it, if all files are standing poses; return whether they are.
 
     Args:
-        unused: method, friction and excitation, which standing poses do not use; None where they are not stated.
+        unused: method, friction, excitation and after, which standing poses do not use; None where they are not stated.
     """
     from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage.inputs import with_choices
@@ -196,10 +196,10 @@ def _gravity(
         return False
     from calib.procedure.dynamic_stage.standing import gravity_result  # slow to load
 
-    method, friction, excitation = unused
+    method, friction, _, _ = unused
     with_choices(read_options(options), method, friction, seed)
-    names = ("method", "friction", "excitation")
-    stated = [f"--{name}" for name, value in zip(names, (method, friction, excitation)) if value is not None]
+    names = ("method", "friction", "excitation", "after")
+    stated = [f"--{name}" for name, value in zip(names, unused) if value is not None]
     if stated:
         say(f"not used for standing poses: {', '.join(stated)}")
     gravity_result.check_target(out, [options, *named])
