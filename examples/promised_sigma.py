@@ -372,12 +372,12 @@ def residue_line(robot: str, rows: Sequence[Ratio], other_ratios: Sequence[np.nd
     return f"| {robot} | {share(within(ratio))} | {share(within(ratio_with_errors))} | {highest:.0f} % | {cover} |"
 
 
-def print_tables(robots: Sequence[str], every: int, anew: bool) -> list[Ratio]:
+def print_tables(robots: Sequence[str], step: int, anew: bool) -> list[Ratio]:
     """Print both tables, a robot's row as soon as it is made, and return what they are made of.
 
     Args:
         robots: names of the robots.
-        every: 1 for all pairs of a robot, 2 for every second one, …
+        step: 1 for all pairs of a robot, 2 for every second one, …
         anew: whether friction and prior are chosen anew from all recordings.
     """
     header = "robot | pairs | parameters | median | within 30 % | after one recording | after several | 10–90 %"
@@ -388,7 +388,7 @@ def print_tables(robots: Sequence[str], every: int, anew: bool) -> list[Ratio]:
         if not robot.urdf.exists():
             print(f"{name} is skipped: no {robot.urdf}", flush=True)
             continue
-        rows_of_robots[name] = [row for pair in robot.pairs[::every] for row in ratios(name, pair, anew)]
+        rows_of_robots[name] = [row for pair in robot.pairs[::step] for row in ratios(name, pair, anew)]
         print(ratio_line(name, rows_of_robots[name]), flush=True)
 
     print("\n| robot | within 30 % | with the torque errors reached | ceiling | 10–90 % of the others: holds |")
@@ -408,7 +408,9 @@ def print_tables(robots: Sequence[str], every: int, anew: bool) -> list[Ratio]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("robots", nargs="*", help="names of robots; all without any")
-    parser.add_argument("--every", type=int, default=1, help="2: every second pair of a robot; 100: the first")
+    parser.add_argument(
+        "--every", dest="step", type=int, default=1, help="2: every second pair of a robot; 100: the first"
+    )
     parser.add_argument("--simulated", action="store_true", help="two simulated arms in place of the real robots")
     parser.add_argument("--anew", action="store_true", help="friction and prior are chosen anew from all recordings")
     parser.add_argument("--csv", help="file for the σ of every parameter")
@@ -420,7 +422,7 @@ def main() -> None:
             arms = simulated(Path(folder))
             ROBOTS.update(arms)
             names = list(arms)
-        rows = print_tables(names, arguments.every, arguments.anew)
+        rows = print_tables(names, arguments.step, arguments.anew)
     if arguments.csv:
         with Path(arguments.csv).open("w", newline="") as file:
             csv.writer(file).writerows([Ratio._fields, *rows])

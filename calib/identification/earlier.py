@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from calib.dynamics.drives import DriveTerm
 from calib.errors import UsageError, require
 
-CLEAR_GAIN = 0.1
+CLEAR_GAIN = 0.2
 """Share by which a step of the friction ladder has to lower a joint's rms error on unseen time, beside terms that an
 earlier identification chose (our choice)."""
 DECISIVE = 100.0
