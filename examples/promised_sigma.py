@@ -1,9 +1,10 @@
 """How the σ that `calib excite --after` predicts for a further motion compare with those reached.
 
-CALIB_DATA=... python examples/promised_sigma.py [--quick | --simulated] [--csv FILE] [ROBOT ...]
+CALIB_DATA=... python examples/promised_sigma.py [--every N | --simulated] [--anew] [--csv FILE] [ROBOT ...]
 
 Recordings of a robot are identified, and another one is taken for the further motion. Its σ are predicted by what
-`calib excite --after` calls; then all of them are identified together. The first table has a row per robot; robots
+`calib excite --after` calls; then all of them are identified together, as `calib identify --after` does, or with
+friction terms and priors chosen anew (--anew). The first table has a row per robot; robots
 without data are skipped. The second table says what the rest is due to: the same with the torque errors reached in
 place of those predicted, and the ceiling, i.e. a prediction that misses by nothing but the sampling of the reached σ.
 """
@@ -36,6 +37,7 @@ from calib.procedure.excitation.inputs import ExcitationInputs, read_inputs
 from calib.procedure.excitation.prediction import REACHED, PredictedSigma, foretell
 from calib.procedure.excitation.settings import ExcitationSettings
 
+FOLDERS = tempfile.TemporaryDirectory()
 DATA = Path(os.environ.get("CALIB_DATA", "../shared/data"))
 WITHIN = 0.3  # a σ predicted well is within this share of the one reached
 RANGE = (0.1, 0.9)  # quantiles of σ reached over σ predicted
@@ -201,16 +203,34 @@ class KnownErrors:
 @cache
 def identified(robot: str, recordings: tuple[str, ...]) -> DynamicsModel:
     """Return the identification of a robot from recordings."""
+    return identified_after(robot, recordings, None)
+
+
+def identified_after(robot: str, recordings: tuple[str, ...], after: Path | None) -> DynamicsModel:
+    """Return the identification of a robot from recordings, which carries on an earlier one; None: none."""
     files = [str(DATA / ROBOTS[robot].folder / name) for name in recordings]
-    return calib.identify_dynamics(ROBOTS[robot].urdf, files, options=parse_options(ROBOTS[robot].options))
+    options = parse_options(ROBOTS[robot].options)
+    return calib.identify_dynamics(ROBOTS[robot].urdf, files, options=options, after=after)
+
+
+def identified_together(robot: str, pair: Pair, anew: bool) -> DynamicsModel:
+    """Return the identification from all recordings of a pair; `anew`: with friction and prior chosen from nothing."""
+    recordings = (*pair.earlier, pair.further)
+    if anew:
+        return identified(robot, recordings)
+    return identified_after(robot, recordings, stored(robot, pair.earlier))
+
+
+@cache
+def stored(robot: str, recordings: tuple[str, ...]) -> Path:
+    """Return the folder of an identification, which lasts as long as the program."""
+    return identified(robot, recordings).save(Path(tempfile.mkdtemp(dir=FOLDERS.name)) / "identified", plots=False)
 
 
 @cache
 def design_inputs(robot: str, earlier: tuple[str, ...]) -> ExcitationInputs:
     """Return the inputs of a design after the identification of earlier recordings."""
-    with tempfile.TemporaryDirectory() as parent:
-        folder = identified(robot, earlier).save(Path(parent) / "identified", plots=False)
-        return read_inputs(ROBOTS[robot].urdf, ExcitationSettings(outlook=False), after=folder)
+    return read_inputs(ROBOTS[robot].urdf, ExcitationSettings(outlook=False), after=stored(robot, earlier))
 
 
 def predicted(inputs: ExcitationInputs, family: RecordedMotion) -> Sequence[PredictedSigma]:
@@ -221,10 +241,10 @@ def predicted(inputs: ExcitationInputs, family: RecordedMotion) -> Sequence[Pred
     return foretell(inputs, settings, cast(Any, problem), cast(Any, motion), cast(Any, None))[1]
 
 
-def ratios(robot: str, pair: Pair) -> Iterator[Ratio]:
+def ratios(robot: str, pair: Pair, anew: bool) -> Iterator[Ratio]:
     """Yield the σ of all parameters that are predicted for a pair of recordings, and identified from both."""
     inputs = design_inputs(robot, pair.earlier)
-    together = identified(robot, (*pair.earlier, pair.further))
+    together = identified_together(robot, pair, anew)
     family = RecordedMotion(together)
     assert inputs.prior is not None and inputs.prior.sigmas is not None
     density = np.array(together.to_dict()["error_density"]) / inputs.prior.sigmas**2
@@ -352,12 +372,13 @@ def residue_line(robot: str, rows: Sequence[Ratio], other_ratios: Sequence[np.nd
     return f"| {robot} | {share(within(ratio))} | {share(within(ratio_with_errors))} | {highest:.0f} % | {cover} |"
 
 
-def print_tables(robots: Sequence[str], quick: bool) -> list[Ratio]:
+def print_tables(robots: Sequence[str], step: int, anew: bool) -> list[Ratio]:
     """Print both tables, a robot's row as soon as it is made, and return what they are made of.
 
     Args:
         robots: names of the robots.
-        quick: whether only the first pair of a robot is taken.
+        step: 1 for all pairs of a robot, 2 for every second one, …
+        anew: whether friction and prior are chosen anew from all recordings.
     """
     header = "robot | pairs | parameters | median | within 30 % | after one recording | after several | 10–90 %"
     print(f"| {header} | within {REACHED[0]:g}–{REACHED[1]:g} |\n|{9 * '---|'}", flush=True)
@@ -367,8 +388,7 @@ def print_tables(robots: Sequence[str], quick: bool) -> list[Ratio]:
         if not robot.urdf.exists():
             print(f"{name} is skipped: no {robot.urdf}", flush=True)
             continue
-        pairs = robot.pairs[:1] if quick else robot.pairs
-        rows_of_robots[name] = [row for pair in pairs for row in ratios(name, pair)]
+        rows_of_robots[name] = [row for pair in robot.pairs[::step] for row in ratios(name, pair, anew)]
         print(ratio_line(name, rows_of_robots[name]), flush=True)
 
     print("\n| robot | within 30 % | with the torque errors reached | ceiling | 10–90 % of the others: holds |")
@@ -388,8 +408,11 @@ def print_tables(robots: Sequence[str], quick: bool) -> list[Ratio]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("robots", nargs="*", help="names of robots; all without any")
-    parser.add_argument("--quick", action="store_true", help="the first pair of a robot alone")
+    parser.add_argument(
+        "--every", dest="step", type=int, default=1, help="2: every second pair of a robot; 100: the first"
+    )
     parser.add_argument("--simulated", action="store_true", help="two simulated arms in place of the real robots")
+    parser.add_argument("--anew", action="store_true", help="friction and prior are chosen anew from all recordings")
     parser.add_argument("--csv", help="file for the σ of every parameter")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -399,7 +422,7 @@ def main() -> None:
             arms = simulated(Path(folder))
             ROBOTS.update(arms)
             names = list(arms)
-        rows = print_tables(names, arguments.quick)
+        rows = print_tables(names, arguments.step, arguments.anew)
     if arguments.csv:
         with Path(arguments.csv).open("w", newline="") as file:
             csv.writer(file).writerows([Ratio._fields, *rows])

@@ -196,6 +196,7 @@ def identify_dynamics(
     terms: Sequence[FrictionTerm] = (),
     options: IdentifyOptions | str | Path | None = None,
     excitation: str | Path | None = None,
+    after: str | Path | None = None,
     with_geometry: bool | None = None,
     base: str | None = None,
     tip: str | None = None,
@@ -224,6 +225,9 @@ def identify_dynamics(
             instead of `settings`; None for no file.
         excitation: folder written by `design_excitation`, for methods that simulate the closed loop ([loop] in the
             options). Its motion is the reference motion for recordings that contain none. None for no folder.
+        after: folder of an earlier identification of this arm, whose choice of friction terms and of the prior's sizes
+            is carried on, unless the recordings contradict it. The σ that `design_excitation` predicts after that
+            identification are then those of the same model. None chooses both from the recordings.
         with_geometry: whether the geometry is estimated again together with the dynamics: the covariance of the fit is
             its prior, and torques of motions with and without a known payload tell joint offsets. ``robot`` of the
             result has the geometry after the torques. None takes the settings' choice.
@@ -254,6 +258,7 @@ def identify_dynamics(
         designed.append(coefficients.read(Path(excitation)))
     stage = stage_of(robot, "identify", base, tip)
     if stage is not None:
+        require(after is None, "after: for arms only; leave it out", UsageError)
         require(not terms, "terms: functions are for arms only; parallel robots have the standard friction", UsageError)
         return stage.run(
             listed(recordings),
@@ -279,6 +284,8 @@ def identify_dynamics(
         designed=designed,
         progress=progress,
     )
+    if after is not None:
+        identification_inputs = folder.continuing(identification_inputs, Path(after))
     if on_read is not None:
         on_read(identification_inputs)
     return as_subclass(identify.run(identification_inputs, progress), DynamicsModel)

@@ -98,6 +98,7 @@ def identify_dynamics(
     friction: str | None = None,
     options: Path | None = None,
     excitation: Path | None = None,
+    after: Path | None = None,
     with_geometry: bool = False,
     base: str | None = None,
     tip: str | None = None,
@@ -119,15 +120,17 @@ def identify_dynamics(
         options: TOML: drives, payloads, gains, filters, identification
         excitation: folder of calib excite: its prediction is compared with the result; its motion is the reference of
             recordings that have none (methods with a [loop])
+        after: folder of an earlier identification, for whose further motion calib excite --after predicted σ: its
+            friction terms and the sizes of its prior are kept, unless the recordings contradict them
         with_geometry: estimate joint offsets, lengths and the direction of gravity again, together with the dynamics
     """
     from calib.api.dynamic import identify_dynamics as identified
     from calib.procedure.report.dynamics_section import read_lines
 
-    unused = method, friction, excitation
+    unused = method, friction, excitation, after
     if _gravity(robot, recordings, validate or [], out, options, base, tip, seed, unused):
         return
-    check_destination("identify", robot, out, [options, *recordings, *(validate or [])])
+    check_destination("identify", robot, out, [options, after, *recordings, *(validate or [])])
 
     def read(inputs: "IdentificationInputs") -> None:
         check_destination("identify", robot, out, [inputs.source, inputs.source.parent])
@@ -143,6 +146,7 @@ def identify_dynamics(
             options=options,
             base=base,
             excitation=excitation,
+            after=after,
             with_geometry=with_geometry or None,
             tip=tip,
             seed=seed,
@@ -169,12 +173,12 @@ def _gravity(
     base: str | None,
     tip: str | None,
     seed: int,
-    unused: tuple[str | None, str | None, Path | None],
+    unused: tuple[str | None, str | None, Path | None, Path | None],
 ) -> bool:
     """Identify gravity and write it, if all files are standing poses; return whether they are.
 
     Args:
-        unused: method, friction and excitation, which standing poses do not use; None where they are not stated.
+        unused: method, friction, excitation and after, which standing poses do not use; None where they are not stated.
     """
     from calib.identification.identify_options import read_options
     from calib.procedure.dynamic_stage.inputs import with_choices
@@ -192,10 +196,10 @@ def _gravity(
         return False
     from calib.procedure.dynamic_stage.standing import gravity_result  # slow to load
 
-    method, friction, excitation = unused
+    method, friction, _, _ = unused
     with_choices(read_options(options), method, friction, seed)
-    names = ("method", "friction", "excitation")
-    stated = [f"--{name}" for name, value in zip(names, (method, friction, excitation)) if value is not None]
+    names = ("method", "friction", "excitation", "after")
+    stated = [f"--{name}" for name, value in zip(names, unused) if value is not None]
     if stated:
         say(f"not used for standing poses: {', '.join(stated)}")
     gravity_result.check_target(out, [options, *named])

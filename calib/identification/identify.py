@@ -20,6 +20,7 @@ from calib.errors import MeasurementError, UsageError, refuse_data, require
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.triangles import condition_numbers
 from calib.identification.closed_loop.simulated import loop_results
+from calib.identification.earlier import DECISIVE, ModelChoice
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
 from calib.identification.loop import LoopResults, per_joint
@@ -84,6 +85,21 @@ class Identification(Generic[Model]):
     prior: Prior | None = None
     ripples: tuple[Ripple, ...] = ()
     loop: LoopResults = field(default_factory=LoopResults)
+
+    @property
+    def choice(self) -> ModelChoice:
+        """Friction terms and prior, for a later identification that carries them on."""
+        terms = self.friction.terms
+        active = [k for k, term in enumerate(terms) if term.name not in self.friction.off]
+        names = tuple(terms[k].name for k in active)
+        groups = tuple(self.friction.groups[k] for k in active)
+        ridges = np.full(len(terms), np.nan)
+        if self.fitted.beforehand is not None:
+            ridges = 1.0 / np.linalg.norm(self.fitted.beforehand[:, self.base.b :], axis=0)
+        stored_ridges = tuple(ridges[active].tolist())
+        if self.prior is None:
+            return ModelChoice(names, groups, stored_ridges, {}, TEMPERING)
+        return ModelChoice(names, groups, stored_ridges, self.prior.sizes, self.prior.tempering)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -193,7 +209,9 @@ def identify_model(
         robot, source = shape, "sizes"
     else:
         robot, source = cad, "cad"
-    find = partial(find_prior, model, base, robot=robot, source=source, noise=noise, effort=effort)
+    earlier = settings.earlier
+    fixed = None if earlier is None else earlier.choice.sizes
+    find = partial(find_prior, model, base, robot=robot, source=source, noise=noise, effort=effort, fixed=fixed)
     takes_prior = _takes_prior(method, model, settings, source)
     rows, prior, first = _first_fit(rows, find, takes_prior, noise)
     rows = with_weights(rows, first.rest_weights)
@@ -206,8 +224,12 @@ def identify_model(
         if error_as_moving < CLEARLY_LESS**2 * error:
             rows, prior, first = as_moving
             marks_standstills = False
-    if prior is not None:
+    if prior is not None and earlier is not None and fixed:
+        earlier.check_sizes(tuple(prior.sizes))
+        prior = find(rows, start=prior, tempering=earlier.choice.tempering)
+    elif prior is not None:
         prior = tempered_prior(find, prior, rows, regimes(rows, cases, decimator))
+    if prior is not None:
         first = prior.first
     rows = with_weights(rows, first.rest_weights)
 
@@ -227,6 +249,24 @@ def identify_model(
         say("sizes beside richer friction")
         prior = find(richer_rows, groups=groups, start=prior, tempering=prior.tempering)
         richer_rows = with_weights(richer_rows, prior.first.rest_weights)
+    ridges = None
+    if prior is not None and earlier is not None:
+        if prior.contradiction > np.log(DECISIVE):
+            say("the prior of the earlier identification is left")
+            anew = replace(settings, earlier=earlier.without_prior(prior.contradiction))
+            return identify_model(
+                model,
+                cases,
+                anew,
+                nominal=nominal,
+                states=states,
+                cad=cad,
+                shape=shape,
+                effort=effort,
+                progress=progress,
+            )
+        names = [*base.names, *[term.name for term in friction.terms]]
+        ridges = np.array([earlier.ridges.get(name, np.nan) for name in names])
 
     terms = (*_terms_of(model, base), *friction.terms)
     problem = IdentificationProblem(
@@ -243,6 +283,7 @@ def identify_model(
         cad=cad,
         constraints=settings.constraints,
         progress=progress,
+        ridges=ridges,
     )
     return _identified(problem, method, friction, settings, say)
 
@@ -518,7 +559,7 @@ def _richer_friction(
         torque_rows=model.torque_rows,
         coupled=frozenset(coupled),
     )
-    return select_friction(candidates, settings.friction, progress), loads
+    return select_friction(candidates, settings.friction, progress, settings.earlier), loads
 
 
 def _with_ripple(

@@ -36,8 +36,9 @@ findings behind them, ``noticed`` (code, values; `calib explain CODE`), ``verdic
 ``advice`` of the finding that decided it, ``error_density`` of each row (variance of its errors over the independent
 rows per second), ``error_growth`` (share of this variance that grows with the variance of the row's torque,
 ``torque_variance``, on another motion), ``error_bands`` (the density in wider bands, with ``rows_per_second``,
-relative to that of the identification, and the ``seconds`` of its recordings), ``seed``, ``schema`` (3; files without
-one are of earlier versions and are read, too). No number: null.
+relative to that of the identification, and the ``seconds`` of its recordings), ``choice`` (friction terms with their
+ridges, sizes of the prior and its tempering, which ``calib identify --after`` carries on), ``seed``, ``schema`` (3;
+files without one are of earlier versions and are read, too). No number: null.
 
 ``joint_compliance.csv``, of recordings with encoders on motors and links: joint, compliance (negative: -1 / stiffness,
 as in the geometric fit's corrections) with sigma, whether it is identified, and the rms difference of the encoders: as

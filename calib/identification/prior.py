@@ -33,7 +33,7 @@ Rods between the joints replace the masses of a robot whose description has none
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -122,6 +122,7 @@ class Prior:
         source: source of u, ``cad`` or ``sizes`` (rods between the joints).
         first: the fit of the base parameters with this prior, without additional friction.
         tempering: weight of the prior for the values, relative to its weight for their covariance.
+        contradiction: logarithm of the evidence of free sizes over that of fixed ones; 0 if none are fixed.
     """
 
     covariance: np.ndarray
@@ -130,6 +131,7 @@ class Prior:
     source: str
     first: FirstFit
     tempering: float = TEMPERING
+    contradiction: float = 0.0
 
     @property
     def rows(self) -> np.ndarray:
@@ -174,6 +176,14 @@ class _Sizes:
     lower: np.ndarray
     upper: np.ndarray
 
+    def fixing(self, fixed: Mapping[str, float]) -> "_Sizes":
+        """Return these sizes, those of the given names with bounds that leave the given value alone."""
+        lower, upper = np.array(self.lower), np.array(self.upper)
+        for name, size in fixed.items():
+            index = self.names.index(name)
+            lower[index] = upper[index] = np.log(size)
+        return replace(self, lower=lower, upper=upper)
+
     def deviations(self, t: np.ndarray) -> np.ndarray:
         """Return the standard deviations (p + k,) at log sizes t."""
         return np.exp(np.clip(t, -40.0, 40.0))[self.member]
@@ -190,6 +200,7 @@ def find_prior(
     start: Prior | None = None,
     effort: np.ndarray | None = None,
     tempering: float = TEMPERING,
+    fixed: Mapping[str, float] | None = None,
 ) -> Prior:
     """Return the prior of the base parameters with sizes that maximise the evidence.
 
@@ -205,6 +216,7 @@ def find_prior(
         start: prior with which the search starts, e.g. without additional friction; None: none.
         effort: (n,) torque limits of the joints, up to a factor; None: equal limits.
         tempering: weight of the prior for the values, relative to its weight for their covariance.
+        fixed: sizes by name that are not estimated; None: all are.
     """
     parts = divided(rows)
     rest_weights = rows[0].rest
@@ -223,7 +235,8 @@ def find_prior(
     single = np.asarray(scipy.linalg.block_diag(transform, identity))
     common = np.vstack([transform @ shared, np.zeros((len(groups), direction_count))])
     columns = np.column_stack([single, common])
-    sizes = _sizes(model, data, columns, shared, groups)
+    free_sizes = _sizes(model, data, columns, shared, groups)
+    sizes = free_sizes.fixing(fixed or {})
 
     squares = np.sum(data.factors[:, :, -1] ** 2, axis=1)
     std = NOISE * np.sqrt(squares / np.maximum(data.rows, 1))
@@ -236,6 +249,7 @@ def find_prior(
         inflation = start.first.inflation
         for name, size in start.sizes.items():
             t[sizes.names.index(name)] = np.log(size)
+    t = np.clip(t, sizes.lower, sizes.upper)
     for _ in range(ROUNDS):
         previous_values, previous_std = values, std
         tempered = tempering * inflation
@@ -251,6 +265,11 @@ def find_prior(
         if still.all() and (np.abs(std / previous_std - 1.0) < SETTLED).all():
             break
 
+    contradiction = 0.0
+    if fixed:
+        free = _most_probable(factor, columns, free_sizes, t)
+        cost = _cost(factor, columns, free_sizes)
+        contradiction = cost(t)[0] - cost(free)[0]
     deviations = sizes.deviations(t)
     single_root = transform * deviations[: model.p]
     common_root = columns[: base.b, -direction_count:] * deviations[-direction_count:]
@@ -266,6 +285,7 @@ def find_prior(
         source=source,
         first=first,
         tempering=tempering,
+        contradiction=contradiction,
     )
 
 
@@ -470,6 +490,21 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
         sizes: sizes with their priors.
         start: (k,) first log sizes.
     """
+    bounds = np.column_stack([sizes.lower, sizes.upper])
+    clipped_start = np.clip(start, sizes.lower, sizes.upper)
+    cost = _cost(factor, columns, sizes)
+    solution = scipy.optimize.minimize(
+        cost, clipped_start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60, "ftol": 1e-8}
+    )
+    return np.asarray(solution.x)
+
+
+def _cost(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
+    """Return the negative logarithm of evidence times prior, with its gradient, as a function of log sizes (k,).
+
+    Args:
+        factor, columns, sizes: as in `_most_probable`.
+    """
     b = len(columns)
     unscaled = factor[:b, :b] @ columns
     target = factor[:b, b]
@@ -488,12 +523,7 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
         evidence_slope = (whitened @ whitened_root) ** 2 - np.einsum("ij,ij->j", whitened_root, whitened_root)
         return value, deviation / sizes.width - np.bincount(sizes.member, evidence_slope, len(t))
 
-    bounds = np.column_stack([sizes.lower, sizes.upper])
-    clipped_start = np.clip(start, sizes.lower, sizes.upper)
-    solution = scipy.optimize.minimize(
-        cost, clipped_start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60, "ftol": 1e-8}
-    )
-    return np.asarray(solution.x)
+    return cost
 
 
 def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.ndarray:

@@ -15,6 +15,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.shapes import V0
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, refuse_option, require
+from calib.identification.earlier import EarlierChoice
 from calib.identification.friction.friction_ladder import NAMES
 from calib.identification.friction.friction_terms import FrictionTerm
 from calib.identification.loop import LoopSettings, check_loop, per_joint
@@ -139,6 +140,7 @@ class IdentificationSettings(Choices):
             these, or else the stated mass and centre, are used where no training recording has the payload.
         seed: seed of random states.
         apart: joints, from 0, whose torque has a different unit, excluded from totals.
+        earlier: choice of an earlier identification, which is carried on; None: none.
     """
 
     sets: tuple[str, ...] = ()
@@ -150,6 +152,7 @@ class IdentificationSettings(Choices):
     payload_values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     seed: int = 0
     apart: tuple[int, ...] = ()
+    earlier: EarlierChoice | None = None
 
 
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:

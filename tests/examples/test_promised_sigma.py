@@ -46,7 +46,7 @@ def test_range_and_factor_of_the_program_are_those_of_the_documents():
 @pytest.mark.slow
 def test_one_pair_of_two_real_robots(data):
     """The median is near the prediction, most ratios are in the stated range, and sampling is not what is missed."""
-    output = run(DATA, "--quick", "Panda", "TX40")
+    output = run(DATA, "--every", "100", "Panda", "TX40")
     rows = ROW.findall(output)
     assert [row[0] for row in rows] == ["Panda", "TX40"]
     for robot, pairs, parameters, median, _, in_range in rows:

@@ -30,6 +30,7 @@ from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import STEPS, RecordedRange
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, one_of
+from calib.identification.earlier import CLEAR_GAIN, EarlierChoice
 from calib.identification.prior import TEMPERING, Prior
 from calib.identification.rows import Case, ObservationRows, observe_terms, triangulate
 from calib.identification.time_folds import CrossValidation, regimes
@@ -172,7 +173,10 @@ class FrictionCandidates:
 
 
 def select_friction(
-    candidates: FrictionCandidates, friction: str = "auto", progress: Progress | None = None
+    candidates: FrictionCandidates,
+    friction: str = "auto",
+    progress: Progress | None = None,
+    earlier: EarlierChoice | None = None,
 ) -> FrictionSelection:
     """Return the friction terms that reduce the error on held-out time, or all terms of a named step.
 
@@ -182,6 +186,7 @@ def select_friction(
             (`calib.identification.friction.ripple` identifies ripple later); the name of a step for the terms of this
             step at all joints.
         progress: function that is called with a short text at each step; None: not called.
+        earlier: choice of an earlier identification, whose terms are kept; None: none.
 
     Raises:
         UsageError: for an unknown name.
@@ -194,16 +199,29 @@ def select_friction(
         sensed = candidates.torque_rows.sensed
         names = [name for name in NAMES[2:-1] if sensed or name != "cable"]
     offered = {name: terms for name, terms in _terms(candidates, names).items() if terms or name == friction}
+    carried = _carried(earlier)
+    if earlier is not None:
+        for name, terms in offered.items():
+            offered[name] = [term for term in terms if term.name not in earlier.ridges]
+        further = {name: terms for name, terms in offered.items() if terms}
+        offered = {**carried, **further}
     all_terms = [term for terms in offered.values() for term in terms]
     validation, columns_of = _cross_validation(candidates, offered, all_terms)
-    bench = _Bench(candidates, validation, all_terms, friction != "auto")
+    min_gain = MIN_GAIN if earlier is None else CLEAR_GAIN
+    bench = _Bench(candidates, validation, all_terms, friction != "auto", min_gain)
 
     say("friction: standard")
     error = bench.errors([])
     joints = tuple(range(candidates.n))
     steps = [bench.trial("standard", [], error, joints)]
-    selected: list[int] = []
-    waiting = list(offered)
+    selected = [column for name in carried for column in columns_of[name]]
+    if selected:
+        error = bench.errors(selected)
+        kept_terms = [bench.term(column) for column in selected]
+        at = _flat([_joints(term) for term in kept_terms])
+        term_names = tuple(term.name for term in kept_terms)
+        steps.append(bench.trial("+ earlier terms", selected, error, at, "carried on", term_names))
+    waiting = [name for name in offered if name not in carried]
     for second_round in (False, True):
         refused = []
         for name in waiting:
@@ -242,12 +260,14 @@ class _Bench:
         validation: cross-validation of the base columns and all terms.
         terms: all candidate terms.
         forced: whether terms are kept without a test.
+        min_gain: share by which a step has to lower a joint's rms error on unseen time.
     """
 
     candidates: FrictionCandidates
     validation: CrossValidation
     terms: Sequence[DriveTerm]
     forced: bool
+    min_gain: float = MIN_GAIN
 
     def term(self, column: int) -> DriveTerm:
         """Return the drive term of a column."""
@@ -294,7 +314,7 @@ class _Bench:
             improved = []
             for joint_set in at:
                 rows = self._rows(joint_set, side)
-                pays = _pays(self._whitened(error, rows), self._whitened(new_error, rows))
+                pays = _pays(self._whitened(error, rows), self._whitened(new_error, rows), self.min_gain)
                 # Halves and ranges take as long again, and most terms do not pay.
                 if pays and self._carries(selected, model, rows) and self._extrapolates(selected, model, rows):
                     improved.append(joint_set)
@@ -402,18 +422,28 @@ def _flat(joint_sets: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
     return tuple(sorted({joint for joint_set in joint_sets for joint in joint_set}))
 
 
-def _pays(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the squared errors fell by a share of `MIN_GAIN` (rms), and in a share `MIN_BLOCKS_WON` of blocks.
+def _pays(before: np.ndarray, after: np.ndarray, min_gain: float) -> bool:
+    """Return whether the squared errors fell by a share of `min_gain` (rms), and in a share `MIN_BLOCKS_WON` of blocks.
 
     Args:
         before, after: squared errors per time block without and with the tested terms.
+        min_gain: the share.
     """
     positive = before > 0.0
     if not positive.any():
         return False
     won = float(np.mean(after[positive] < before[positive]))
-    decreased = after.sum() < (1.0 - MIN_GAIN) ** 2 * before.sum()
+    decreased = after.sum() < (1.0 - min_gain) ** 2 * before.sum()
     return bool(decreased and won >= MIN_BLOCKS_WON)
+
+
+def _carried(earlier: EarlierChoice | None) -> dict[str, list[DriveTerm]]:
+    """Return the terms of an earlier choice, as a step for each of their ridge groups."""
+    steps: dict[str, list[DriveTerm]] = {}
+    if earlier is not None:
+        for term, group in zip(earlier.terms, earlier.choice.groups, strict=True):
+            steps.setdefault(f"earlier group {group}", []).append(term)
+    return steps
 
 
 def _terms(candidates: FrictionCandidates, names: Sequence[str]) -> dict[str, list[DriveTerm]]:

@@ -92,6 +92,8 @@ def _regularised(
     if prior is not None:
         prior_rows = np.sqrt(tempering) * prior.widened(pooled.parameters - base_count)
     _, ridges = estimate(pooled, std, inflation, group, prior_rows)
+    if problem.ridges is not None:
+        ridges = np.where(np.isnan(problem.ridges), ridges, problem.ridges)
     ridge_variances = np.maximum(ridges, 1e-12) ** 2
     variances = np.where(group < 0, np.inf, ridge_variances)
     covariance = np.diag(variances)

@@ -67,6 +67,7 @@ class IdentificationProblem:
         constraints: constraints of the options, for methods that support them; None: the defaults.
         start: (p,) start values of methods that simulate; None: least squares, if that robot can be simulated.
         progress: called with a short text at each round of a method that simulates; None: not called.
+        ridges: (p,) ridges that an earlier identification chose; NaN or None: chosen by evidence.
     """
 
     model: RegressorModel
@@ -83,6 +84,7 @@ class IdentificationProblem:
     constraints: ConstraintSettings | None = None
     start: np.ndarray | None = None
     progress: Callable[[str], None] | None = None
+    ridges: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", frozen(self.groups, int))

@@ -114,6 +114,8 @@ def _information(identification: Identification) -> np.ndarray:
         if identification.prior is not None:
             prior_rows = identification.prior.widened(richer_count)
         _, ridges = estimate(fitted.pooled, fitted.std, fitted.inflation, group, prior_rows)
+        if identification.settings.earlier is not None and fitted.beforehand is not None:
+            ridges = 1.0 / np.linalg.norm(fitted.beforehand, axis=0)
         ridge_rows = np.zeros((richer_count, base_count + richer_count + 1))
         richer_ridges = np.maximum(ridges[base_count:], 1e-12)
         ridge_rows[:, base_count:-1] = np.diag(1.0 / richer_ridges)

@@ -13,12 +13,15 @@ from calib import files, folders
 from calib.data.csv_table import read_table
 from calib.data.signals.fingerprint import Fingerprint, Fingerprints
 from calib.dynamics.base import expressions
+from calib.errors import UsageError, refuse_option, refused_as
 from calib.identification.checks.joint_compliance import JointCompliance, encoder_difference
+from calib.identification.earlier import EarlierChoice
 from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
-from calib.identification.model_file import MODEL, read_dynamics, to_table
+from calib.identification.model_file import MODEL, read_dynamics, refuse_currents, refuse_other_arm, to_table
 from calib.identification.physical_consistency import information
 from calib.identification.prediction import Dynamics, Score, predict
+from calib.identification.registry import method_named
 from calib.identification.rows import Case
 from calib.identification.uncertainty.torque_errors import TorqueErrorModel, read_uncertainty
 from calib.procedure.dynamic_stage import geometry_tables, with_geometry
@@ -34,7 +37,8 @@ from calib.procedure.dynamic_stage.verdict import Resting
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import plain, read_json
 from calib.robot import calibrated
-from calib.units import headings, per_ampere
+from calib.robot.chain import Chain
+from calib.units import TORQUE, headings, per_ampere, without_gains
 
 # of torques_1.csv [Hz]
 TORQUE_RATE = 100.0
@@ -155,6 +159,31 @@ class IdentificationFolder:
         """Read the names of the essential parameters."""
         return tuple(row.name for row in folders.read_estimate(self.path, _Essential) if row.essential is not None)
 
+    def choice(self, chain: Chain) -> EarlierChoice:
+        """Read the friction terms and the prior that the identification chose, for a later one of the same arm.
+
+        Args:
+            chain: the arm of the later identification.
+
+        Raises:
+            UsageError: for the folder of another arm, of an earlier version, or in amperes.
+        """
+        refuse_currents(self.path, "an identification that continues it")
+        refuse_other_arm(self.path, chain)
+        choice = self.metrics().choice
+        if choice is None:
+            raise UsageError(f"{self.path} is of an earlier version and does not state its choice; identify again")
+        term_of = {term.name: term for term in self.dynamics().model.columns}
+        with refused_as(
+            UsageError, KeyError, f"{self.path}: metrics.json and dynamics.json do not agree ({{}}); identify again"
+        ):
+            terms = tuple(term_of[name] for name in choice.terms)
+        return EarlierChoice(str(self.path), terms, choice)
+
+    def switched_off(self) -> tuple[str, ...]:
+        """Read the names of the drive terms that the evidence switched off; none where no metrics are stored."""
+        return self.metrics().switched_off if self.numbers.is_file() else ()
+
     def errors(self) -> TorqueErrorModel | None:
         """Read the model of expected torque errors; None if the folder contains no errors or no covariance."""
         discrepancy = self.findings().errors
@@ -164,6 +193,30 @@ class IdentificationFolder:
         if uncertainty is None:
             return None
         return TorqueErrorModel(uncertainty.columns, uncertainty.covariance, discrepancy)
+
+
+def continuing(inputs: IdentificationInputs, earlier: Path) -> IdentificationInputs:
+    """Return the inputs of an identification that carries on the choice of an earlier one.
+
+    Args:
+        inputs: robot, recordings and options.
+        earlier: folder of the earlier identification.
+
+    Raises:
+        UsageError: for a folder that is not of the same arm, and for options that choose friction or have no prior.
+    """
+    settings = inputs.options.settings
+    if not method_named(settings.method).takes_prior:
+        raise UsageError(f"after: method '{settings.method}' has no prior that could be carried on; use wls")
+    if settings.friction != "auto":
+        raise UsageError(
+            f"after: {earlier} states the friction, and so does friction = '{settings.friction}'; leave one of them out"
+        )
+    if inputs.unit != TORQUE:
+        refuse_option("after", f"torques are {without_gains(inputs.unit)}; state gains = [...] (N m/A)")
+    choice = IdentificationFolder(earlier).choice(inputs.chain)
+    options = replace(inputs.options, settings=replace(settings, earlier=choice))
+    return replace(inputs, options=options)
 
 
 def _number_of_table(path: Path) -> int:

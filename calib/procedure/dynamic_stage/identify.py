@@ -308,7 +308,7 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     """Identify a model and return it with its torque predictions for every recording, and the verdict.
 
     If the torques refute the stated gravity, only the standard friction model is tried, since richer friction, such as
-    couplings between joints, would absorb the gravity error.
+    couplings between joints, would absorb the gravity error. Friction that an earlier identification chose is kept.
 
     Args:
         inputs: robot, recordings and options.
@@ -316,7 +316,8 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     """
     settings = inputs.options.settings
     hypotheses = gravity_hypotheses(inputs)
-    if settings.friction == "auto" and hypotheses is not None and hypotheses.refuted:
+    chosen_anew = settings.friction == "auto" and settings.earlier is None
+    if chosen_anew and hypotheses is not None and hypotheses.refuted:
         settings = replace(settings, friction="standard")
     if settings.with_geometry:
         inputs = replace(inputs, options=replace(inputs.options, settings=settings))

@@ -16,6 +16,7 @@ from calib.config_types import ParsedTable
 from calib.data.signals.motion import Motion
 from calib.errors import Finding
 from calib.estimation.essential import EliminationStep
+from calib.identification.earlier import ModelChoice
 from calib.identification.friction.friction_ladder import FrictionTrial
 from calib.identification.friction.ripple import RippleWaves
 from calib.identification.gains import GainRecord
@@ -182,6 +183,8 @@ class ModelMetrics(JudgedMetrics):
         error_growth, torque_variance: (rows,) share of the density that grows with the torque, and the variance of the
             torques from which it was estimated [N² m² or N²]; None in files of earlier versions.
         error_bands: the density in wider bands; None in files of earlier versions.
+        choice: chosen friction terms and prior, for an identification that carries them on; None in files of earlier
+            versions.
         seed: seed of all random numbers.
         schema: version of the file's format.
     """
@@ -210,6 +213,7 @@ class ModelMetrics(JudgedMetrics):
     error_growth: Array | None = None
     torque_variance: Array | None = None
     error_bands: ErrorBands | None = None
+    choice: ModelChoice | None = None
     seed: int = 0
     schema: int = SCHEMA
 
@@ -276,6 +280,7 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
         error_growth=growth.share,
         torque_variance=growth.torque_variance,
         error_bands=bands,
+        choice=identification.choice,
         seed=outcome.seed,
     )
 

@@ -40,6 +40,8 @@ MAX_CORRELATED_ROWS = 3.0
 MIN_MOTION = 3.0
 # share of the greatest joint's rms torque from which on a joint's torque matters
 MATTERS = 0.1
+# logarithm of a ratio of probabilities, at most, so that the ratio is a number
+LARGEST_LOG = 100.0
 # of the errors within intervals that state 0.95, of all joints and of one: it may be missed twice as often (our choice)
 MIN_COVERED = 0.93
 MIN_COVERED_AT_JOINT = 0.90
@@ -280,6 +282,21 @@ def model_findings(cases: Sequence[Case], identification: Identification) -> tup
     )
 
 
+def _left_earlier(identification: Identification[RegressorModel]) -> list[Finding]:
+    """Return findings on what the recordings contradict in the choice of an earlier identification."""
+    earlier = identification.settings.earlier
+    if earlier is None:
+        return []
+    findings = []
+    if earlier.contradiction > 0.0:
+        ratio = float(np.exp(min(earlier.contradiction, LARGEST_LOG)))
+        findings.append(finding("earlier-prior-left", source=earlier.source, ratio=ratio))
+    names = [term.name for term in identification.friction.terms if term.name not in earlier.ridges]
+    if names:
+        findings.append(finding("earlier-friction-extended", source=earlier.source, names=names))
+    return findings
+
+
 def parameter_findings(identification: Identification[RegressorModel]) -> tuple[Finding, ...]:
     """Return findings on the parameters of any robot: condition number, bounds, signs, and prior.
 
@@ -301,6 +318,7 @@ def parameter_findings(identification: Identification[RegressorModel]) -> tuple[
     )
     if identification.fitted.held is not None:
         findings += identification.fitted.held.findings
+    findings += _left_earlier(identification)
     findings += _negative(identification)
     findings += settle(_payload_masses(identification))
     rests = resting_parameters(identification)

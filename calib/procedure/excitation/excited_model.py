@@ -22,6 +22,7 @@ from calib.errors import UsageError, listing, one_of, refused_as, require
 from calib.folders import COVARIANCE, read_covariance
 from calib.identification.model_file import from_table, read_table, refuse_currents, refuse_other_arm
 from calib.identification.settings import IdentificationSettings, make_model
+from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation.limits import MotionLimits, check_bodies
 from calib.robot.chain import Chain
 
@@ -240,6 +241,8 @@ def _differentiable(model: IdentificationModel) -> tuple[IdentificationModel, li
 def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain | None) -> ExcitedModel:
     """Return the model in an identification's folder, with the payloads that the runs carry, and its covariance.
 
+    Terms that the identification switched off have no torque and are left out: their σ of next to zero is no knowledge.
+
     Args:
         chain: the arm.
         folder: folder of the identification.
@@ -265,7 +268,9 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain
     loads = loads_of(texts, payloads, with_payloads=False)
     run_labels = {label for run in loads for label in run or ()}
     bodies = bodies_with(chain, identified.model.bodies.gravity, [label for label in payloads if label in run_labels])
-    model, notes = _differentiable(IdentificationModel(bodies, identified.model.columns, torque_rows))
+    switched_off = IdentificationFolder(folder).switched_off()
+    terms = tuple(term for term in identified.model.columns if term.name not in switched_off)
+    model, notes = _differentiable(IdentificationModel(bodies, terms, torque_rows))
     value_of = dict(zip(identified.model.names, identified.values))
     parameters = np.array([value_of[name] for name in model.names])
     if not np.isfinite(parameters).all():

@@ -217,11 +217,15 @@ def _bands(folder: Path, model: ExcitedModel) -> ErrorBands | None:
 def _data_information(folder: Path, model: ExcitedModel) -> np.ndarray | None:
     """Return the information (b, b) of an identification's recordings, without priors; None if it is not stored.
 
-    Columns that are not designed are marginalised.
+    Columns that are not designed are marginalised; those of terms that are switched off are zero.
     """
     if not (folder / INFORMATION).is_file():
         return None
     names, factor = read_factor(folder)
+    switched_off = IdentificationFolder(folder).switched_off()
+    estimated = [k for k, name in enumerate(names) if name not in switched_off]
+    names = tuple(names[k] for k in estimated)
+    factor = factor[:, [*estimated, factor.shape[1] - 1]]
     index = places(model.exact.names, names, model.exact.model.names)
     if index is None:
         return None

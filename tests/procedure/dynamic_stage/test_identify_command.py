@@ -256,3 +256,27 @@ def test_two_publisher_bag_equals_archive(robot, tmp_path, kind):
         found.append([(float(row["value"]), float(row["sigma"])) for row in rows])
     of_bag, of_archive = np.array(found[0]), np.array(found[1])
     np.testing.assert_allclose(of_bag[:, 0], of_archive[:, 0], atol=1e-3 * of_archive[:, 1].max())
+
+
+def test_earlier_identification_is_carried_on(robot, tmp_path, capsys):
+    """The folder states the choice, and a later identification keeps it; another friction is refused."""
+    first, second = planted.write(tmp_path, "first.npz", 0), planted.write(tmp_path, "second.npz", 1)
+    earlier, later = tmp_path / "earlier", tmp_path / "later"
+    assert run(robot, f"{first}@0:6", "--out", earlier) == 0
+    assert run(robot, f"{first}@0:6", f"{second}@0:6", "--after", earlier, "--out", later) == 0
+    choice, continued = (json.loads((out / "metrics.json").read_text())["choice"] for out in (earlier, later))
+    assert continued["sizes"] == pytest.approx(choice["sizes"]) and len(choice["sizes"]) > 5
+    assert set(choice["terms"]) <= set(continued["terms"])
+
+    refused = ("--after", earlier, "--out", tmp_path / "refused")
+    for options, message in (
+        (("--friction", "standard"), "states the friction, and so does friction = 'standard'"),
+        (("--method", "ols"), "method 'ols' has no prior that could be carried on; use wls"),
+    ):
+        capsys.readouterr()
+        assert run(robot, f"{second}@0:6", *refused, *options) == 2
+        assert message in capsys.readouterr().err
+    metrics = json.loads((earlier / "metrics.json").read_text())
+    (earlier / "metrics.json").write_text(json.dumps(metrics | {"choice": None}))
+    assert run(robot, f"{second}@0:6", *refused) == 2
+    assert "does not state its choice; identify again" in capsys.readouterr().err

@@ -15,12 +15,20 @@ from calib.identification.identify_options import IdentifyOptions
 from calib.identification.uncertainty.error_bands import ErrorBands
 from calib.identification.uncertainty.geometry_uncertainty import propagate
 from calib.procedure.dynamic_stage import identify, inputs
+from calib.procedure.dynamic_stage.folder import write_folder
 from calib.procedure.excitation import design, prediction, prior_motions
 from calib.procedure.excitation import folder as motion_folder
 from calib.procedure.excitation.excited_model import ExcitedModel
 from calib.procedure.excitation.geometry_spread import geometry_spread
-from calib.procedure.excitation.inputs import ExcitationInputs
-from calib.procedure.excitation.prediction import ADDED_ERRORS, _information_root, _reweighted, _wider
+from calib.procedure.excitation.inputs import ExcitationInputs, read_inputs
+from calib.procedure.excitation.prediction import (
+    ADDED_ERRORS,
+    _information_root,
+    _reweighted,
+    _wider,
+    known_sigmas,
+    task_of,
+)
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.calibrated import CalibratedChain
 
@@ -159,6 +167,33 @@ def test_priors_are_not_weighed_with_the_rows():
     factor = np.array([0.5, 0.25])
     root = _information_root(_stored(data + priors, data), factor)
     np.testing.assert_allclose(root.T @ root, data * np.outer(factor, factor) + priors)
+
+
+def test_switched_off_term_is_no_column_of_a_design(outcome, tmp_path):
+    """Neither of the model, nor of what is known; the other parameters keep their σ."""
+    path = write_folder(outcome, tmp_path / "dynamics")
+    metrics = json.loads((path / "metrics.json").read_text())
+    (path / "metrics.json").write_text(json.dumps(metrics | {"switched_off": ["Fc7"]}))
+    estimated = outcome.found.names
+    factor = np.random.default_rng(0).normal(size=(len(estimated), len(estimated) + 1))
+    np.savetxt(path / "information.csv", factor, delimiter=",", header=",".join([*estimated, "y"]), comments="")
+    inputs = read_inputs("lwr4plus", ExcitationSettings(), after=path)
+    names = inputs.columns.names
+    assert set(estimated) - set(names) == {"Fc7"}
+    # its rows tell the others as if the term were not there
+    index = [estimated.index(name) for name in names]
+    assert inputs.prior is not None and inputs.prior.information.shape == (len(names), len(names))
+    np.testing.assert_allclose(inputs.prior.data, factor[:, index].T @ factor[:, index], atol=1e-9)
+    sigmas = dict(zip(estimated, outcome.found.fitted.estimate.sigma))
+    _, sigmas_before = known_sigmas(inputs, task_of(inputs, 0))
+    assert sigmas_before == pytest.approx([sigmas[name] for name in names], rel=1e-3)
+
+
+def test_what_is_known_to_rounding_does_not_drown_the_rest():
+    """A constraint holds the third parameter; the information on the others is 24 decimals less."""
+    information = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 1e24]])
+    root = _information_root(_stored(information, None))
+    np.testing.assert_allclose((root.T @ root)[:2, :2], information[:2, :2], rtol=1e-9)
 
 
 @pytest.mark.parametrize("data", [None, np.diag([8.0, 1.0])], ids=["no rows stored", "covariance of more than torques"])
