@@ -211,3 +211,13 @@ def test_deliverables_have_separate_verdicts():
     worse = {"a": rows(1.0, 0.06, alone=1.2)}
     assert levels(fit, worse) == {"urdf": "fail", "corrections": "pass"}, "worse than the nominal arm"
     assert levels(rows(1.0, 0.05, False), {"a": rows(1.0, 0.06)}) == {"urdf": "pass"}, "without corrections"
+
+
+@pytest.mark.parametrize(("alone", "level"), [(0.085, "marginal"), (0.095, "pass"), (0.15, "pass")])
+def test_corrections_that_are_worse_than_the_rigid_arm_do_not_pass(alone, level):
+    """Corrections, chosen by cross-validation on few poses, may be refuted by unseen ones: robot.urdf is not."""
+    findings = Findings("geometry + wobble", 1e-4, None, 0.0, 1.0, rigid_cross_validated=1e-4)
+    fit, unseen = rows(1.0, 0.05, False, alone=0.06), {"a": rows(1.0, 0.1, alone=alone)}
+    verdicts = judge_deliverables(fit, unseen, findings, FitSettings())
+    assert {name: verdict.level for name, verdict in verdicts.items()} == {"urdf": "pass", "corrections": level}
+    assert (verdicts["corrections"].code == "corrections-worse") is (level == "marginal")

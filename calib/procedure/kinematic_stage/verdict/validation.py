@@ -95,7 +95,7 @@ def judge(
        ``keep-nominal``, since the nominal arm may have been fitted to these rows;
     5. ``no-unseen-poses``;
     6. ``rigid-misfit`` or ``gross-rows`` of the fit, ``refuted``, ``contradicted``, ``no-transfer``,
-       ``intervals-too-narrow``, ``small-gain``, ``many-outliers``; without any of them: pass.
+       ``intervals-too-narrow``, ``corrections-worse``, ``small-gain``, ``many-outliers``; without any of them: pass.
 
     Three kinds of findings count in every group: the other findings on the fit (`plausibility` beside this module),
     ``gross-unseen-rows``, which replaces ``refuted``, and those on files that prove nothing, but may contradict the
@@ -379,10 +379,25 @@ def _doubts(
             median=np.median(rows.intervals.radius),
             missing=NOMINAL_COVERAGE - chance - covered,
         )
+    yield from _corrections_worse(unseen)
     yield finding("small-gain", left=worst.ratio)
     if not unseen and findings.model != "frames":
         yield from _no_better_known(findings.joint_range)
     yield finding("many-outliers", share=findings.outlier_share)
+
+
+def _corrections_worse(unseen: Mapping[str, Comparison]) -> Iterator[Finding]:
+    """Yield findings that compare the arm with joint corrections with the rigid one, which is simpler.
+
+    Args:
+        unseen: name of a validation file -> errors of both arms.
+    """
+    for name, rows in unseen.items():
+        if rows.alone is None:
+            continue
+        corrected, rigid = rows.errors[1].rms, rows.alone.rms
+        times = corrected / max(rigid, TINY)
+        yield finding("corrections-worse", times=times, where=name, corrected=corrected, rigid=rigid)
 
 
 def _no_better_known(measured_range: JointRange | None) -> Iterator[Finding]:
