@@ -70,9 +70,10 @@ def _ripple_sentence(ripple: RippleWaves) -> str:
     for wave in ripple.waves:
         gear = "" if wave.gear == ripple.joint else f" of joint {wave.gear}"
         orders.append(f"{wave.order_per_turn:g}{gear}")
+    share = f"{100 * ripple.explained_share_on_unseen_blocks:.0f} %"
     return (
         f"ripple at joint {ripple.joint}, orders {', '.join(orders)} per turn: explains "
-        f"{100 * ripple.explained_share_on_unseen_blocks:.0f} % of the fast residual's power on held-out parts of the motion; "
+        f"{share} of the fast residual's power on held-out parts of the motion; "
         "not included in the covariance"
     )
 
