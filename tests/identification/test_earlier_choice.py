@@ -74,8 +74,11 @@ def test_friction_that_is_clearly_missing_is_added(first, both):
     assert "earlier-friction-extended" in codes(found)
 
 
-def test_prior_of_other_parameters_is_refused(first, both):
+@pytest.mark.parametrize("further", [True, False])
+def test_prior_of_other_parameters_is_refused(first, both, further):
+    """Other parameters are those with a size more, as well as those with fewer."""
     choice = after(first)
-    other = replace(choice, choice=replace(choice.choice, sizes={"whole": 1.0}))
+    sizes = {**choice.choice.sizes, "elastic [N m/rad]": 1.0} if further else {"whole": 1.0}
+    other = replace(choice, choice=replace(choice.choice, sizes=sizes))
     with pytest.raises(UsageError, match="other drive terms, torque rows or payloads"):
         identify(planted.arm(), both, replace(SETTINGS, earlier=other))
