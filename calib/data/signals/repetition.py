@@ -92,10 +92,11 @@ class Course:
         size = len(self.recording)
         number = np.zeros(size, dtype=int)
         first = 0
-        for recording in np.unique(self.recording).tolist():
+        recordings = np.unique(self.recording).tolist()
+        for recording in recordings:
             course_indices = np.flatnonzero(self.recording == recording)
             blocks = 1
-            if len(self.course_index) < count:
+            if len(recordings) < count:
                 blocks = max(1, round(count * len(course_indices) / size))
             number[course_indices] = first + (np.arange(len(course_indices)) * blocks) // len(course_indices)
             first += blocks
@@ -110,15 +111,13 @@ class _Path:
         q: (N, k) positions of the joints that move in any recording [rad or m].
         scale: (k,) their standard deviations over all recordings.
         moves: (M,) whether any joint moves, at every `step`-th sample.
-        step: samples per read sample.
-        rate: sampling rate [Hz].
+        step: samples per read sample, the same for all recordings.
     """
 
     q: np.ndarray
     scale: np.ndarray
     moves: np.ndarray
     step: int
-    rate: float
 
     @property
     def rows(self) -> np.ndarray:
@@ -131,7 +130,11 @@ class _Path:
 
 
 def course(motions: Sequence[Motion]) -> Course:
-    """Return the course of recordings of one robot, in the order in which they are given."""
+    """Return the course of recordings of one robot, in the order in which they are given.
+
+    A lag is a number of samples. Recordings of clearly different rates repeat nothing of each other, therefore, and a
+    repetition with a gap is mapped on one side of the gap at most.
+    """
     paths = _paths(motions)
     met = _met_recordings(paths)
     course_indices, news, recordings = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
@@ -169,11 +172,11 @@ def _paths(motions: Sequence[Motion]) -> list[_Path]:
     moving = highest - lowest > MIN_TRAVEL
     deviations = [motion.q.std(axis=0) for motion in motions]
     scale = np.maximum(np.max(deviations, axis=0), MIN_TRAVEL)[moving]
-    paths = []
-    for motion in motions:
-        step = max(1, int(motion.rate / RATE), len(motion) // MAX_SAMPLES)
-        paths.append(_Path(motion.q[:, moving], scale, ~motion.standstill()[::step], step, motion.rate))
-    return paths
+    # one step for all: rates from time stamps differ slightly, and long recordings are read more coarsely
+    highest_rate = max(motion.rate for motion in motions)
+    longest = max(len(motion) for motion in motions)
+    step = max(1, int(highest_rate / RATE), longest // MAX_SAMPLES)
+    return [_Path(motion.q[:, moving], scale, ~motion.standstill()[::step], step) for motion in motions]
 
 
 def _met_recordings(paths: Sequence[_Path]) -> list[list[int]]:
@@ -213,8 +216,6 @@ def _sources(paths: Sequence[_Path], number: int, candidates: Sequence[int]) -> 
     if not path.q.shape[1]:
         return source, row
     for earlier in candidates:
-        if (paths[earlier].rate, paths[earlier].step) != (path.rate, path.step):
-            continue
         repeated = _repeated(path, paths[earlier], within=earlier == number)
         fresh = (source < 0) & (repeated >= 0)
         source[fresh] = earlier
@@ -240,7 +241,7 @@ def _repeated(path: _Path, reference: _Path, within: bool) -> np.ndarray:
         difference = z[overlap] - reference.at(target[overlap])
         alike = overlap[np.sqrt(np.mean(difference**2, axis=1)) < MAX_DISTANCE]
         count = path.moves[alike].sum()
-        if count >= MIN_SHARE * moving and count >= MIN_ALIKE * path.moves[overlap].sum():
+        if count > 0 and count >= MIN_SHARE * moving and count >= MIN_ALIKE * path.moves[overlap].sum():
             result = np.full(len(rows), -1)
             result[alike] = target[alike] // path.step
             return result
