@@ -27,16 +27,18 @@ from calib.records import evenly
 RATE = 100.0
 # largest number of samples that are read of a recording
 MAX_SAMPLES = 100_000
-# D(L) of a lag that is looked at closer: 1 on average for unlike motion
-ALIKE = 0.7
-# D(L) beyond which a motion has left its own neighbourhood
-LEFT = 0.2
+# largest D(L) of a lag that is tested: 1 on average for unlike motion
+MAX_UNLIKENESS = 0.7
+# D(L) up to which a motion is in its own neighbourhood
+NEIGHBOURHOOD = 0.2
 # difference of D(L) within which lags are about as good
 TIE = 0.1
-# number of lags that are looked at closer
-LAGS = 12
-# positions of a recording that are looked up in the others, and the distance there in `MAX_DISTANCE`
-PROBES, NEIGHBOURS = 60, 1.25
+# largest number of lags that are tested
+MAX_LAGS = 12
+# number of positions of a recording that are searched in the others, and the radius there, over `MAX_DISTANCE`
+PROBES, RADIUS = 60, 1.25
+# share of these that another recording has to contain, over `MIN_SHARE`: few positions tell a share only roughly
+MET_SHARE = 0.8
 # share of the moving samples that a repetition has to contain
 MIN_SHARE = 0.25
 # share of the moving samples of the overlap that has to be alike
@@ -128,6 +130,10 @@ class _Path:
         """Return the positions (m, k) at samples (m,), in standard deviations."""
         return self.q[rows] / self.scale
 
+    def at_all_samples(self, values: np.ndarray) -> np.ndarray:
+        """Return values (N,) of all samples from those (M,) of the read ones: others have that of their predecessor."""
+        return np.repeat(values, self.step)[: len(self.q)]
+
 
 def course(motions: Sequence[Motion]) -> Course:
     """Return the course of recordings of one robot, in the order in which they are given.
@@ -137,9 +143,9 @@ def course(motions: Sequence[Motion]) -> Course:
     """
     paths = _paths(motions)
     met = _met_recordings(paths)
-    course_indices, news, recordings = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+    course_indices, fresh, recordings = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
     length = 0
-    for number in range(len(paths)):
+    for number, path in enumerate(paths):
         source, row = _sources(paths, number, met[number])
         size = len(source)
         course_index = np.zeros(size, dtype=int)
@@ -147,22 +153,18 @@ def course(motions: Sequence[Motion]) -> Course:
             selected = source == earlier
             course_index[selected] = course_indices[earlier][row[selected]]
         is_new = source < 0
-        course_index[is_new] = length + np.arange(int(is_new.sum()))
+        new_count = int(is_new.sum())
+        course_index[is_new] = length + np.arange(new_count)
         # a sample may repeat one that itself repeats an earlier one
         origin = np.where(source == number, row, np.arange(size))
         while (origin[origin] != origin).any():
             origin = origin[origin]
-        course_index = course_index[origin]
-        length += int(is_new.sum())
-        # samples between those that are read count as their predecessors
-        path = paths[number]
-        course_indices.append(course_index)
-        news.append(np.repeat(is_new, path.step)[: len(path.q)])
-        recordings.append(np.full(int(is_new.sum()), number))
-    full_indices = tuple(
-        np.repeat(course_index, path.step)[: len(path.q)] for course_index, path in zip(course_indices, paths)
-    )
-    return Course(full_indices, tuple(news), np.concatenate(recordings))
+        course_indices.append(course_index[origin])
+        fresh.append(path.at_all_samples(is_new))
+        recordings.append(np.full(new_count, number))
+        length += new_count
+    full_indices = tuple(path.at_all_samples(indices) for path, indices in zip(paths, course_indices))
+    return Course(full_indices, tuple(fresh), np.concatenate(recordings))
 
 
 def _paths(motions: Sequence[Motion]) -> list[_Path]:
@@ -189,14 +191,14 @@ def _met_recordings(paths: Sequence[_Path]) -> list[list[int]]:
     positions = [path.at(path.rows[path.moves]) for path in paths]
     recording = np.repeat(np.arange(len(paths)), [len(moving) for moving in positions])
     tree = KDTree(np.concatenate(positions))
-    radius = NEIGHBOURS * MAX_DISTANCE * np.sqrt(positions[0].shape[1])
+    radius = RADIUS * MAX_DISTANCE * np.sqrt(positions[0].shape[1])
     result = []
     for number, moving in enumerate(positions):
         probes = moving[evenly(len(moving), PROBES)]
         counts = np.zeros(len(paths))
         for neighbours in tree.query_ball_point(probes, radius):
             counts[np.unique(recording[neighbours])] += 1
-        enough = np.flatnonzero(counts >= 0.8 * MIN_SHARE * len(probes))
+        enough = np.flatnonzero(counts >= MET_SHARE * MIN_SHARE * len(probes))
         result.append([*enough[enough < number].tolist(), number])
     return result
 
@@ -282,20 +284,20 @@ def _lags(z: np.ndarray, reference: np.ndarray, within: bool) -> list[int]:
     usable = overlap >= MIN_SHARE * size
     if within:
         forward = lags > 0
-        distant = np.flatnonzero(forward & (ratio > LEFT))
+        distant = np.flatnonzero(forward & (ratio > NEIGHBOURHOOD))
         if not len(distant):
             return []
         usable &= lags > lags[distant[0]]
     inner = np.zeros(len(lags), dtype=bool)
     inner[1:-1] = (ratio[1:-1] <= ratio[:-2]) & (ratio[1:-1] <= ratio[2:])
-    candidates = np.flatnonzero(usable & inner & (ratio < ALIKE))
+    candidates = np.flatnonzero(usable & inner & (ratio < MAX_UNLIKENESS))
     if within:
         # the shortest of lags that are about as good: multiples of a period are periods, too
         limit = ratio[candidates].min(initial=np.inf) + TIE
         best = candidates[ratio[candidates] <= limit]
     else:
         best = candidates[np.argsort(ratio[candidates], kind="stable")]
-    return lags[best[:LAGS]].tolist()
+    return lags[best[:MAX_LAGS]].tolist()
 
 
 def _unlikeness(z: np.ndarray, reference: np.ndarray, lags: np.ndarray) -> np.ndarray:
