@@ -190,6 +190,9 @@ def _better_than_in_place(nominal: Installation, block: Positions, first: int, s
     if POSITION_ROUNDING**2 < before < MIN_SLIP**2 * after:
         return False
     is_shifted = shifted.rows >= first
+    if not is_shifted.any():
+        # beside a row that is missing, a shift may leave all others without joint values
+        return False
     if is_shifted.all():
         return True
     try:
