@@ -35,6 +35,8 @@ NEIGHBOURHOOD = 0.2
 TIE = 0.1
 # largest number of lags that are tested
 MAX_LAGS = 12
+# distance to a lag between recordings within which a better one is searched, in read samples
+REACH = 128
 # number of positions of a recording that are searched in the others, and the radius there, over `MAX_DISTANCE`
 PROBES, RADIUS = 60, 1.25
 # share of these that another recording has to contain, over `MIN_SHARE`: few positions tell a share only roughly
@@ -43,6 +45,8 @@ MET_SHARE = 0.8
 MIN_SHARE = 0.25
 # share of the moving samples of the overlap that has to be alike
 MIN_ALIKE = 0.5
+# share of the moving samples that a repetition contains where no other lag is tested
+ENOUGH = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +89,9 @@ class Course:
     def blocks(self, count: int) -> list[np.ndarray]:
         """Return for each recording the number (N,) of the block of each sample.
 
-        Blocks are contiguous parts of the course, of about equal length, with their repetitions; at least one begins
-        in each recording that has new motion.
+        Blocks are contiguous parts of the course, of about equal length, with their repetitions. At least one begins in
+        each recording, but in those that repeat others so far that less than half a block is new: this belongs to the
+        block before.
 
         Args:
             count: number of blocks, about.
@@ -97,6 +102,10 @@ class Course:
         recordings = np.unique(self.recording).tolist()
         for recording in recordings:
             course_indices = np.flatnonzero(self.recording == recording)
+            repeats = not self.fresh[recording].all()
+            if first and repeats and len(course_indices) < 0.5 * size / count:
+                number[course_indices] = first - 1
+                continue
             blocks = 1
             if len(recordings) < count:
                 blocks = max(1, round(count * len(course_indices) / size))
@@ -236,41 +245,65 @@ def _repeated(path: _Path, reference: _Path, within: bool) -> np.ndarray:
     rows = path.rows
     moving = path.moves.sum()
     z = path.at(rows)
+    # a lag within a recording may not come near zero
+    reach = path.step * (2 if within else REACH)
+    result = np.full(len(rows), -1)
+    largest_count = 0
     for coarse in _lags(z, reference.at(reference.rows), within):
-        lag = _refined(path, reference, coarse * path.step)
+        lag = _refined(path, reference, coarse * path.step, reach)
         target = rows - lag
         overlap = np.flatnonzero((target >= 0) & (target < len(reference.q)))
         difference = z[overlap] - reference.at(target[overlap])
         alike = overlap[np.sqrt(np.mean(difference**2, axis=1)) < MAX_DISTANCE]
         count = path.moves[alike].sum()
-        if count > 0 and count >= MIN_SHARE * moving and count >= MIN_ALIKE * path.moves[overlap].sum():
+        if count < MIN_SHARE * moving or count < MIN_ALIKE * path.moves[overlap].sum():
+            continue
+        if count > largest_count:
+            largest_count = count
             result = np.full(len(rows), -1)
             result[alike] = target[alike] // path.step
-            return result
-    return np.full(len(rows), -1)
+        if largest_count and (within or count >= ENOUGH * moving):
+            break
+    return result
 
 
-def _refined(path: _Path, reference: _Path, lag: int) -> int:
-    """Return the lag with the smallest distance about a coarse one [samples].
+def _refined(path: _Path, reference: _Path, lag: int, reach: int) -> int:
+    """Return the lag with the smallest distance about a coarse one, searched by steps that halve [samples].
+
+    The distance is the median over the moving samples: unlike parts, as the ways to the start, shift the minimum of
+    D(L), but not its own.
 
     Args:
         path, reference: the recording, and the one that it may repeat.
         lag: the coarse lag [samples].
+        reach: largest distance from the coarse lag, about [samples].
     """
-    best, smallest = lag, np.inf
-    for candidate in range(lag - path.step + 1, lag + path.step):
-        first = max(0, candidate)
-        last = min(len(path.q), len(reference.q) + candidate)
-        rows = np.arange(first, last, path.step)
-        difference = path.at(rows) - reference.at(rows - candidate)
-        distance = float(np.median(np.sum(difference**2, axis=1)))
-        if distance < smallest:
-            best, smallest = candidate, distance
+    best, smallest = lag, _median_distance(path, reference, lag)
+    step = reach // 2
+    while step > 0:
+        for candidate in (best - step, best + step):
+            distance = _median_distance(path, reference, candidate)
+            if distance < smallest:
+                best, smallest = candidate, distance
+        step //= 2
     return best
 
 
+def _median_distance(path: _Path, reference: _Path, lag: int) -> float:
+    """Return the median squared distance of two recordings at a lag [samples]; infinite where nothing moves."""
+    rows = path.rows[path.moves]
+    rows = rows[(rows >= lag) & (rows < len(reference.q) + lag)]
+    if not len(rows):
+        return np.inf
+    difference = path.at(rows) - reference.at(rows - lag)
+    return float(np.median(np.sum(difference**2, axis=1)))
+
+
 def _lags(z: np.ndarray, reference: np.ndarray, within: bool) -> list[int]:
-    """Return lags L with z(t) ≈ reference(t - L), the smallest first within a recording, else the most alike first.
+    """Return lags L with z(t) ≈ reference(t - L), in the order in which they are tested.
+
+    Multiples of a period are about as good as the period. Within a recording the smallest of such lags comes first,
+    else that with the longest overlap; other lags between recordings follow, the most alike first.
 
     Args:
         z, reference: (N, n) and (M, n) positions.
@@ -291,12 +324,13 @@ def _lags(z: np.ndarray, reference: np.ndarray, within: bool) -> list[int]:
     inner = np.zeros(len(lags), dtype=bool)
     inner[1:-1] = (ratio[1:-1] <= ratio[:-2]) & (ratio[1:-1] <= ratio[2:])
     candidates = np.flatnonzero(usable & inner & (ratio < MAX_UNLIKENESS))
+    # multiples of a period are about as good
+    alike = ratio[candidates] <= ratio[candidates].min(initial=np.inf) + TIE
     if within:
-        # the shortest of lags that are about as good: multiples of a period are periods, too
-        limit = ratio[candidates].min(initial=np.inf) + TIE
-        best = candidates[ratio[candidates] <= limit]
+        best = candidates[alike]
     else:
-        best = candidates[np.argsort(ratio[candidates], kind="stable")]
+        shared = np.where(alike, overlap[candidates], 0)
+        best = candidates[np.lexsort((ratio[candidates], -shared))]
     return lags[best[:MAX_LAGS]].tolist()
 
 

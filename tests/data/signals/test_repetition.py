@@ -116,6 +116,38 @@ def test_blocks_of_recordings_that_repeat_one() -> None:
     assert [set(block) for block in blocks] == [set(range(6))] * 8
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_ways_to_the_start_do_not_hide_a_repetition(seed: int) -> None:
+    """Recordings of a motion that begin at other postures repeat it but for the way to its start."""
+    random = np.random.default_rng(seed)
+    motion = periods(10.0, seed, period=23.0).q
+    rise = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 300))[:, None]
+    postures = random.normal(size=(3, 3))
+    logs = [Path(np.concatenate([posture + (motion[0] - posture) * rise, motion])) for posture in postures]
+    result = course(logs)
+    for fresh in result.fresh[1:]:
+        assert fresh[:200].mean() > 0.9
+        assert fresh[320:].mean() < 0.01
+    blocks = result.blocks(6)
+    assert set(blocks[1][320:]) <= set(blocks[0])
+
+
+def test_a_few_new_samples_are_no_block() -> None:
+    """A disturbance of a tenth of a second in a repetition belongs to a block of other motion."""
+    motion = periods(2 * PERIOD).q
+    logs = [Path(motion)]
+    for begin in (300, 500, 700):
+        disturbed = motion.copy()
+        disturbed[begin : begin + 20] += 1.0
+        logs.append(Path(disturbed))
+    result = course(logs)
+    # of lags by whole periods, that of the whole recording is taken, though the disturbance is in its overlap
+    assert [int(fresh.sum()) for fresh in result.fresh] == pytest.approx([800, 20, 20, 20], abs=4)
+    sizes = np.bincount(np.concatenate(result.blocks(6)))
+    assert len(sizes) == 6
+    assert sizes.min() > 0.8 * sizes.mean()
+
+
 def test_blocks_hold_all_repetitions() -> None:
     """Blocks divide one period; every block contains that part of each period."""
     path = periods(4 * PERIOD)
