@@ -15,6 +15,7 @@ import numpy as np
 
 from calib.dynamics.shapes import SHAPES, STEPS, V0, RecordedRange, Shape, TermMotion
 from calib.errors import CalibError, one_of, require
+from calib.records import read_only
 
 Motion = tuple[tuple[int, float], ...]
 STANDARD = {"Ia": "acceleration", "Fv": "velocity", "Fc": "sign", "off": "one"}
@@ -148,13 +149,19 @@ class DriveTerm:
 
         settings, table = self.packed(8)
         acts = np.array([[0.0, *settings, *table]])
-        x = np.ascontiguousarray(joined.x)
-        v = np.ascontiguousarray(joined.v)
-        state = v if joined.state is None else np.ascontiguousarray(joined.state)
+        # read-only all three: numba compiles a kernel for each combination of arrays that may be written and may not
+        x = _to_read(joined.x)
+        v = _to_read(joined.v)
+        state = v if joined.state is None else _to_read(joined.state)
         out = np.empty((rows, len(joined.v)))
         code = getattr(shape_kernels, self.shape.upper())
         shape_kernels.fill(code, acts, x, v, state, out)
         return out
+
+
+def _to_read(values: np.ndarray) -> np.ndarray:
+    """Return a view of an array (N,), or a copy where it is not contiguous, that cannot be written."""
+    return read_only(np.ascontiguousarray(values).view())
 
 
 def term(name: str, shape: str, joint: int, *settings: float, side: str = "motor", linear: bool = False) -> DriveTerm:

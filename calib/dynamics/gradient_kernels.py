@@ -11,6 +11,7 @@ from calib.dynamics.kernels import (
     COORDINATE,
     DEPTH,
     FIXED,
+    INNER,
     KIND,
     OPTIONS,
     PARENT,
@@ -32,7 +33,7 @@ from calib.dynamics.kernels import (
 from calib.records import frozen
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _share(links, order, i, weights, motion, twists, slopes, bars):
     """Add body i's contribution to the derivatives of Σ_j S_j · wrench_i(g_j) by the body's motion and twists.
 
@@ -74,7 +75,7 @@ def _share(links, order, i, weights, motion, twists, slopes, bars):
         increase(slopes, h, 6, add(scaled(mass, s), cross(u, m)))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _unjoint(links, i, rate, motion, slopes):
     """Reverse the joint's part of `advance`; return the derivatives by joint rate and joint acceleration.
 
@@ -100,7 +101,7 @@ def _unjoint(links, i, rate, motion, slopes):
     return by_rate, slopes[h, 8]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _unadvance(links, i, rate, frames, motion, slopes):
     """Add body i's motion derivatives to its parent's; return the derivative by the joint position.
 
@@ -142,7 +143,7 @@ def _unadvance(links, i, rate, frames, motion, slopes):
     return by_amount
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _uncarry(links, i, frames, twists, bars):
     """Add body i's twist derivatives to its parent's; return the derivative by the joint position.
 
@@ -177,7 +178,7 @@ def _uncarry(links, i, frames, twists, bars):
     return by_amount
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _back(links, hung, constants, v, frames, motion, twists, slopes, bars, gq, gv, ga):
     """Add one sample's derivatives to gq, gv, ga (n,), in a backward pass from the last body to the first.
 

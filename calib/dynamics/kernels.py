@@ -18,6 +18,7 @@ parent's frame.
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 FIXED, REVOLUTE = 0, 1
 PARENT = 0
@@ -32,8 +33,14 @@ L = 64
 """Samples side by side in the regressor: 8 to 128 measured, flat from 64 on."""
 ROUND = 6755399441055744.0
 """1.5 · 2^52: adding it and subtracting it again rounds to the nearest whole number."""
-OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
-JOINED = {**OPTIONS, "forceinline": True}
+OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": {"contract"}, "no_cfunc_wrapper": True}
+INNER = {**OPTIONS, "no_cpython_wrapper": True}
+"""Of functions that kernels alone call: without a wrapper for Python they compile faster."""
+joined = register_jitable(
+    error_model="numpy", fastmath={"contract"}, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True
+)
+"""Decorator of functions that are inlined into kernels. Calls with constants, as for columns, compile them once for all
+constants; ``njit`` would compile them for each."""
 
 
 @njit(**OPTIONS)
@@ -61,7 +68,7 @@ def sincos(x):
     return sine, cosine
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def place(links, constants, i, amount, cosine, sine, frames):
     """Write rotation and origin of body i, in its parent's frame, into row i of `frames`.
 
@@ -88,43 +95,43 @@ def place(links, constants, i, amount, cosine, sine, frames):
         frames[i, 9 + r] = t
 
 
-@njit(**JOINED)
+@joined
 def three(x, i, k):
     """Return the vector x[i, k], x[i, k + 1], x[i, k + 2] as a tuple, which the compiler keeps in registers."""
     return x[i, k], x[i, k + 1], x[i, k + 2]
 
 
-@njit(**JOINED)
+@joined
 def write(x, i, k, a):
     """Write vector `a` (3,) into row i of x, from column k on."""
     x[i, k], x[i, k + 1], x[i, k + 2] = a
 
 
-@njit(**JOINED)
+@joined
 def increase(x, i, k, a):
     """Add vector `a` (3,) to row i of x, from column k on."""
     write(x, i, k, add(three(x, i, k), a))
 
 
-@njit(**JOINED)
+@joined
 def add(a, b):
     """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
-@njit(**JOINED)
+@joined
 def scaled(k, a):
     """Return k · a."""
     return k * a[0], k * a[1], k * a[2]
 
 
-@njit(**JOINED)
+@joined
 def dot(a, b):
     """Return a · b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(**JOINED)
+@joined
 def cross(a, b):
     """Return a × b."""
     x = a[1] * b[2] - a[2] * b[1]
@@ -133,7 +140,7 @@ def cross(a, b):
     return x, y, z
 
 
-@njit(**JOINED)
+@joined
 def inertia_times(J, a):
     """Return J a, where J is the symmetric matrix with the six entries XX, XY, XZ, YY, YZ, ZZ."""
     x = dot((J[0], J[1], J[2]), a)
@@ -142,7 +149,7 @@ def inertia_times(J, a):
     return x, y, z
 
 
-@njit(**JOINED)
+@joined
 def turned(frames, i, a, k=0):
     """Return R a for a vector a (3,), with the rotation R stored row by row in row i of `frames`, from column k on."""
     x = dot(three(frames, i, k), a)
@@ -151,7 +158,7 @@ def turned(frames, i, a, k=0):
     return x, y, z
 
 
-@njit(**JOINED)
+@joined
 def turned_back(frames, i, a, k=0):
     """Return Rᵀ a for a vector a (3,), with the rotation R stored row by row in row i of `frames`, from column k on."""
     x = scaled(a[0], three(frames, i, k))
@@ -160,7 +167,7 @@ def turned_back(frames, i, a, k=0):
     return add(add(x, y), z)
 
 
-@njit(**JOINED)
+@joined
 def ten_columns(w, e, a, u, s):
     """Return the ten regressor columns of a body in the torque row of one coordinate.
 
@@ -182,7 +189,7 @@ def ten_columns(w, e, a, u, s):
     return xx, xy + yx, xz + zx, yy, yz + zy, zz, h[0], h[1], h[2], dot(s, a)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def advance(links, i, rate, change, frames, motion):
     """Write w, dw, a of body i, computed from its parent's, into row i + 1 of `motion` (B + 1, 9).
 
@@ -216,7 +223,7 @@ def advance(links, i, rate, change, frames, motion):
         motion[h, 8] += change
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def carry(links, constants, i, frames, twists):
     """Write the twists (u_j, s_j) of body i, computed from its parent's, into row i + 1 of `twists` (B + 1, n, 6).
 
@@ -245,7 +252,7 @@ def carry(links, constants, i, frames, twists):
         twists_here[coordinate, axis] += constants[i, SCALE]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _place_lanes(constants, i, joint, turn):
     """Write rotation (rows 0 to 8) and origin (rows 9 to 11) of body i into `turn`, for L samples.
 
@@ -285,18 +292,18 @@ def _place_lanes(constants, i, joint, turn):
         turn[11 * L + k] = z + shift * c2
 
 
-@njit(**JOINED)
+@joined
 def _lane(x, r, k):
     """Return the vector of sample k, stored in rows r to r + 2 of x; each row of x has L samples."""
     return x[r * L + k], x[(r + 1) * L + k], x[(r + 2) * L + k]
 
 
-@njit(**JOINED)
+@joined
 def _write_lane(x, r, k, a):
     x[r * L + k], x[(r + 1) * L + k], x[(r + 2) * L + k] = a
 
 
-@njit(**JOINED)
+@joined
 def _lane_back(turn, k, a):
     """Return Rᵀ a for sample k, with the rotation R of this sample from `turn`.
 
@@ -311,7 +318,7 @@ def _lane_back(turn, k, a):
     return add(add(x, y), z)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _advance_lanes(turning, joint, turn, up, motion_here):
     """Compute `advance` for L samples, for a joint about z (turning 1), or one along z or a fixed body (turning 0).
 
@@ -340,7 +347,7 @@ def _advance_lanes(turning, joint, turn, up, motion_here):
         _write_lane(motion_here, 6, k, add(_lane_back(turn, k, a), coriolis))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _carry_lanes(turn, up, twist_here):
     """Compute the twist of one coordinate as in `carry`, from the parent's twist `up`, for L samples.
 
@@ -356,7 +363,7 @@ def _carry_lanes(turn, up, twist_here):
         _write_lane(twist_here, 3, k, _lane_back(turn, k, s))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _project_lanes(motion, twist, columns):
     """Write the ten regressor columns of one body in one coordinate's torque row, for L samples.
 
@@ -385,7 +392,7 @@ def _project_lanes(motion, twist, columns):
         ) = ten_columns(w, e, a, u, s)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _load_lanes(kind, scale, amount, v, a, joint):
     """Write cosine, sine, shift, velocity and acceleration of one joint into `joint`, for up to L samples.
 
@@ -464,7 +471,7 @@ def regressor(links, constants, order, amount, v, a, out):
                         out[row, j, start + lane] = columns[r * L + lane]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _wrench(i, parameters, motion, wrench):
     """Write the inertial force and moment of body i about its frame's origin into row i of `wrench` (B, 6).
 
@@ -487,7 +494,7 @@ def _wrench(i, parameters, motion, wrench):
     write(wrench, i, 3, moment)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _return(links, constants, i, frames, wrench, tau):
     """Add body i's joint torque to tau (n,) and its wrench to its parent's (the backward step of Newton-Euler).
 
@@ -544,7 +551,7 @@ def inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, o
             out[sample, j] = tau[j]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _wrench_lanes(parameters, motion, wrench):
     """Compute `_wrench` for L samples of one body.
 
@@ -566,7 +573,7 @@ def _wrench_lanes(parameters, motion, wrench):
         _write_lane(wrench, 3, k, moment)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _return_lanes(turn, wrench, up):
     """Add a body's wrench to that of its parent, for L samples.
 

@@ -10,7 +10,7 @@ from math import cos, exp, isinf, pi, sin, sqrt, tanh
 
 from numba import njit
 
-from calib.dynamics.kernels import JOINED, OPTIONS
+from calib.dynamics.kernels import INNER, OPTIONS, joined
 
 ACCELERATION, VELOCITY, ONE, POSITION, SIGN, DEAD, SPEED, CUBIC, ROOT = range(9)
 STRIBECK, LOAD, LOAD_VELOCITY, STOP, PRESLIDING, SINE, COSINE, SINE_BAND, COSINE_BAND = range(9, 18)
@@ -19,7 +19,7 @@ FADE = 0.1
 """Travel over which ripple of a band fades outside the positions it was identified at [rad]."""
 
 
-@njit(**JOINED)
+@joined
 def smooth_sign(v, v0):
     """Return tanh(v / v0), set to ±1 where it differs only by rounding; the exact sign for v0 = 0."""
     if not v0 > 0.0:
@@ -36,13 +36,13 @@ def smooth_sign(v, v0):
     return tanh(scaled)
 
 
-@njit(**JOINED)
+@joined
 def _sign_slope(sign, v0):
     """Return the derivative of `smooth_sign` with respect to v, given its value `sign` and its width `v0`."""
     return (1.0 - sign * sign) / v0 if v0 > 0.0 else 0.0
 
 
-@njit(**JOINED)
+@joined
 def _band(acts, t, x, v):
     """Return the gain of torque ripple that is identified for one frequency band and one direction of motion.
 
@@ -68,7 +68,7 @@ def _band(acts, t, x, v):
     return gain * min(1.0, max(0.0, 1.0 - excess / FADE))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _tabulated(acts, t, argument):
     """Return value and slope of a table: the cubic between two knots, constant beyond them (Hermite).
 
@@ -103,7 +103,7 @@ def _tabulated(acts, t, argument):
     return value, slope / width
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def shape(code, acts, t, x, v, state):
     """Return the torque of a shape per unit parameter, and its derivatives with respect to position and velocity.
 
@@ -176,7 +176,7 @@ def shape(code, acts, t, x, v, state):
     return 1.0, 0.0, 0.0
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def steepest(code, acts, t):
     """Return four numbers that limit a simulator's step size where a shape is steep.
 
@@ -213,12 +213,13 @@ def fill(code, acts, x, v, state, out):
 
     Args:
         code: code of the shape.
-        acts: settings of the shape in row 0.
+        acts: settings of the shape in the only row.
         x, v, state: (N,) position, velocity and state of the stop operator.
         out: (1, N) for the values, or (3, N) for the values and their derivatives with respect to x and v.
     """
+    row = acts.shape[0] - 1  # for a constant the shape would be compiled anew
     for k in range(v.shape[0]):
-        value, by_x, by_v = shape(code, acts, 0, x[k], v[k], state[k])
+        value, by_x, by_v = shape(code, acts, row, x[k], v[k], state[k])
         out[0, k] = value
         if out.shape[0] == 3:
             out[1, k] = by_x

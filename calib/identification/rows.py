@@ -301,7 +301,7 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
         if len(decimator.taps) == 1 and model.torque_rows != POWER:
             # Nothing to filter: entries need not be turned into series and back.
             for part in parts:
-                matrix[part] = _regressor(model, case, part, states)[:, :, columns]
+                matrix[part] = _regressor(model, case, part, states, columns)[:, :, columns]
             continue
         if model.torque_rows == POWER:
             segment_slice = slice(start, stop)
@@ -353,7 +353,7 @@ def _entry_blocks(
         columns, rows: (k,) column and row of each entry.
     """
     for part in parts:
-        regressor = _regressor(model, case, part, states)
+        regressor = _regressor(model, case, part, states, columns)
         yield regressor.transpose(2, 1, 0)[columns, rows]
 
 
@@ -509,7 +509,7 @@ def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Tri
     return replace(data, factors=np.stack(factors), rows=counts)
 
 
-def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarray) -> np.ndarray:
+def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Return the regressor (N_i, rows, p) for a part of the samples.
 
     Args:
@@ -517,11 +517,14 @@ def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarra
         case: the recording.
         part: slice of its samples.
         states: (s, N) states of friction with hysteresis of all samples.
+        columns: indices of the columns that are read; others may be zero.
     """
     motion = case.motion
     q = motion.q[part]
     v = motion.v[part]
     a = motion.a[part]
+    if isinstance(model, _HasDriveRegressor) and np.all(columns >= model.inertial):
+        return model.drive_regressor(q, v, a)
     deflected = case.deflected(part)
     return model.regressor(q, v, a, None, case.carried, states[:, part], **deflected)
 
@@ -576,6 +579,11 @@ def power_block(
 @runtime_checkable
 class _HasEnergy(Protocol):
     def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray: ...
+
+
+@runtime_checkable
+class _HasDriveRegressor(Protocol):
+    def drive_regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray: ...
 
 
 def thinned(mask: np.ndarray, segment: np.ndarray, decimator: Decimator) -> np.ndarray:

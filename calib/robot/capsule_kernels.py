@@ -18,8 +18,12 @@ from math import cos, sin, sqrt
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
-OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy"}
+OPTIONS = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+INNER = {**OPTIONS, "no_cpython_wrapper": True}  # of functions that kernels alone call
+# of functions that are called with constants, for each of which njit would compile them
+joined = register_jitable(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 @njit(**OPTIONS)
@@ -57,7 +61,7 @@ def clear(q, form, fixed, stand, attached, targets, pairs, radii, faces, margin)
     return is_free
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _lines(q, form, fixed, stand, attached, targets, lines):
     """Write the centre lines of all capsules into `lines`: base, moving bodies, links outside the chain, targets.
 
@@ -113,7 +117,7 @@ def _lines(q, form, fixed, stand, attached, targets, lines):
             lines[first + t, 3 + a] = x[a] + r[a, 0] * targets[t, 0] + r[a, 1] * targets[t, 1] + r[a, 2] * targets[t, 2]
 
 
-@njit(**OPTIONS)
+@joined
 def _carry(r, x, body, attached, lines, first):
     """Write the centre lines of the links fixed to a body into `lines`, from row `first` on.
 
@@ -134,14 +138,14 @@ def _carry(r, x, body, attached, lines, first):
                     )
 
 
-@njit(**OPTIONS)
+@joined
 def _put(x, lines, row, first):
     """Write x (3,) into row `row` of `lines`, starting at column `first` (numba compiles slices slowly)."""
     for a in range(3):
         lines[row, first + a] = x[a]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _apart(first, second):
     """Return the distance [m] between the line segments `first` and `second` (6,), each given by start and end.
 

@@ -97,9 +97,7 @@ def random_fourier(
     scale = np.min([travel_share, velocity_share, acceleration_share], axis=0)
     middle = 0.5 * (lower + upper)
     centre = middle - 0.5 * scale * (low + high)
-    scaled_sines = scale[:, None] * sines
-    scaled_cosines = scale[:, None] * cosines
-    return _fourier(centre, scaled_sines, scaled_cosines, base, duration, rate)
+    return Reference(raw.t, centre + scale * raw.q, scale * raw.v, scale * raw.a)
 
 
 def _project_out(coefficients: np.ndarray, direction: np.ndarray) -> None:

@@ -41,12 +41,15 @@ def lever_products(arm):
     lengths, centres, masses, _ = arm
     reach = np.zeros((3, 3))
     for i in range(3):
-        reach[i, :i], reach[i, i] = lengths[:i], centres[i]
+        reach[i, i] = centres[i]
+        for j in range(i):
+            reach[i, j] = lengths[j]
     products, weights = np.zeros((3, 3)), np.zeros(3)
     for j in range(3):
-        weights[j] = np.sum(masses * reach[:, j])
-        for k in range(3):
-            products[j, k] = np.sum(masses * reach[:, j] * reach[:, k])
+        for i in range(3):
+            weights[j] += masses[i] * reach[i, j]
+            for k in range(3):
+                products[j, k] += masses[i] * reach[i, j] * reach[i, k]
     return products, weights
 
 
@@ -54,7 +57,10 @@ def lever_products(arm):
 def rigid(q, v, levers, inertias):
     """Return the links' inertia matrix (3, 3), and the torques (3,) of their speeds and weights, by joints."""
     products, weights = levers
-    angle, rate = np.cumsum(q), np.cumsum(v)
+    angle, rate = q.copy(), v.copy()
+    for j in range(1, 3):
+        angle[j] += angle[j - 1]
+        rate[j] += rate[j - 1]
     matrix, torque = np.zeros((3, 3)), np.zeros(3)
     for j in range(3):
         matrix[j, j] = inertias[j]
@@ -76,13 +82,15 @@ def rigid(q, v, levers, inertias):
 @njit(cache=True)
 def solve(matrix, right):
     """Return the solution (3,) of a symmetric system by Cramer's rule."""
-    a, b, c = matrix
     minors = np.zeros((3, 3))
-    for k, (one, two) in enumerate(((b, c), (c, a), (a, b))):
-        minors[k, 0] = one[1] * two[2] - one[2] * two[1]
-        minors[k, 1] = one[2] * two[0] - one[0] * two[2]
-        minors[k, 2] = one[0] * two[1] - one[1] * two[0]
-    determinant = a[0] * minors[0, 0] + a[1] * minors[0, 1] + a[2] * minors[0, 2]
+    for k in range(3):
+        one, two = (k + 1) % 3, (k + 2) % 3
+        for j in range(3):
+            left, right_of = (j + 1) % 3, (j + 2) % 3
+            minors[k, j] = matrix[one, left] * matrix[two, right_of] - matrix[one, right_of] * matrix[two, left]
+    determinant = 0.0
+    for j in range(3):
+        determinant += matrix[0, j] * minors[0, j]
     out = np.zeros(3)
     for j in range(3):
         for k in range(3):
@@ -95,9 +103,36 @@ def accelerations(q, v, tau, levers, inertias, drives):
     """Return the joints' accelerations (3,) under motor torques, and the torques (3,) that the links take."""
     matrix, torque = rigid(q, v, levers, inertias)
     motors, viscous, coulomb = drives
-    left = tau - torque - viscous * v - coulomb * np.tanh(v / WIDTH)
-    a = solve(matrix + np.diag(motors), left)
-    return a, matrix @ a + torque
+    left = tau.copy()
+    driven = matrix.copy()
+    for j in range(3):
+        left[j] -= torque[j] + viscous[j] * v[j] + coulomb[j] * np.tanh(v[j] / WIDTH)
+        driven[j, j] += motors[j]
+    a = solve(driven, left)
+    for j in range(3):
+        for k in range(3):
+            torque[j] += matrix[j, k] * a[k]
+    return a, torque
+
+
+# in loops: numba compiles every expression of arrays for itself
+@njit(cache=True)
+def moved(x, step, rate):
+    """Return x + step · rate (3,)."""
+    out = x.copy()
+    for j in range(3):
+        out[j] += step * rate[j]
+    return out
+
+
+@njit(cache=True)
+def stepped(x, step, rates):
+    """Return x (3,) after a Runge–Kutta step with its four rates."""
+    out = x.copy()
+    first, second, third, fourth = rates
+    for j in range(3):
+        out[j] += step / 6.0 * (first[j] + 2.0 * second[j] + 2.0 * third[j] + fourth[j])
+    return out
 
 
 @njit(cache=True)
@@ -105,29 +140,35 @@ def run(q_ref, v_ref, kp, kd, noise, arm, drives):
     """Return true positions, commanded torques and torques behind the drives, each (N, 3)."""
     period, levers, inertias = 1.0 / RATE, lever_products(arm), arm[3]
     q, v, step = q_ref[0].copy(), v_ref[0].copy(), period / STEPS
-    before = q + noise[0] - period * v
+    before = moved(moved(q, 1.0, noise[0]), -period, v)
     out = np.zeros((3, len(q_ref), 3))
     behind = np.zeros((STEPS + 1, 3))
+    tau = np.zeros(3)
     for k in range(len(q_ref)):
-        seen = q + noise[k]
-        tau = kp * (q_ref[k] - seen) + kd * (v_ref[k] - (seen - before) / period)
+        seen = moved(q, 1.0, noise[k])
+        for j in range(3):
+            tau[j] = kp[j] * (q_ref[k, j] - seen[j]) + kd[j] * (v_ref[k, j] - (seen[j] - before[j]) / period)
+            out[0, k, j], out[1, k, j] = q[j], tau[j]
         before = seen
-        out[0, k], out[1, k] = q, tau
-        for part in range(STEPS):
-            a1, behind[part] = accelerations(q, v, tau, levers, inertias, drives)
-            v2 = v + 0.5 * step * a1
-            a2, _ = accelerations(q + 0.5 * step * v, v2, tau, levers, inertias, drives)
-            v3 = v + 0.5 * step * a2
-            a3, _ = accelerations(q + 0.5 * step * v2, v3, tau, levers, inertias, drives)
-            v4 = v + step * a3
-            a4, _ = accelerations(q + step * v3, v4, tau, levers, inertias, drives)
-            q = q + step / 6.0 * (v + 2.0 * v2 + 2.0 * v3 + v4)
-            v = v + step / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
-        _, behind[STEPS] = accelerations(q, v, tau, levers, inertias, drives)
+        for part in range(STEPS + 1):
+            a1, passed = accelerations(q, v, tau, levers, inertias, drives)
+            for j in range(3):
+                behind[part, j] = passed[j]
+            if part == STEPS:
+                break
+            v2 = moved(v, 0.5 * step, a1)
+            a2, _ = accelerations(moved(q, 0.5 * step, v), v2, tau, levers, inertias, drives)
+            v3 = moved(v, 0.5 * step, a2)
+            a3, _ = accelerations(moved(q, 0.5 * step, v2), v3, tau, levers, inertias, drives)
+            v4 = moved(v, step, a3)
+            a4, _ = accelerations(moved(q, step, v3), v4, tau, levers, inertias, drives)
+            q = stepped(q, step, (v, v2, v3, v4))
+            v = stepped(v, step, (a1, a2, a3, a4))
         # the mean from half a period before an instant to half a period after it
-        out[2, k] += (behind[0] + 4.0 * behind[1] + behind[2]) / 12.0
-        if k + 1 < len(q_ref):
-            out[2, k + 1] += (behind[2] + 4.0 * behind[3] + behind[4]) / 12.0
+        for j in range(3):
+            out[2, k, j] += (behind[0, j] + 4.0 * behind[1, j] + behind[2, j]) / 12.0
+            if k + 1 < len(q_ref):
+                out[2, k + 1, j] += (behind[2, j] + 4.0 * behind[3, j] + behind[4, j]) / 12.0
     return out
 
 
@@ -146,6 +187,7 @@ def reference() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return t, q + np.array([0.8, -0.5, 0.3]), np.gradient(q, 1.0 / RATE, axis=0)
 
 
+@cache
 def gains() -> tuple[np.ndarray, np.ndarray]:
     """Return kp and kd (3,) by the mean inertia of the joints."""
     postures = np.random.default_rng(0).uniform(-1.0, 1.0, (100, 3))

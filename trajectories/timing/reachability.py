@@ -182,12 +182,7 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
             float("nan"),
             "N m",
         )
-    x = np.zeros(len(s))
-    for k, step in enumerate(np.diff(s)):
-        u = _largest(rows, k, x[k], step)
-        reached = max(x[k] + 2 * step * u, 0.0)
-        x[k + 1] = min(reached, controllable[k + 1])
-    x[-1] = 0.0
+    x = _forward(rows, s, controllable)
     if (x[1:-1] <= 0).any():
         k = int(np.argmax(x[1:-1] <= 0)) + 1
         raise NothingFeasible(
@@ -200,25 +195,34 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
     return Profile(s, x)
 
 
-def _largest(rows: _Bounded, k: int, x: float, step: float) -> float:
-    """Return the largest path acceleration u on interval k (from 0), which begins with x = ṡ² and is `step` long.
+def _forward(rows: _Bounded, s: np.ndarray, controllable: np.ndarray) -> np.ndarray:
+    """Return x = ṡ² (K + 1,) from rest to rest, with the largest path acceleration u on each interval in turn.
 
     Args:
         rows: limits as inequalities |a u + b x + c| ≤ 1, with u = s̈.
-        k: index of the interval.
-        x: ṡ² at its beginning.
-        step: its length, in the unit of the path parameter s.
+        s: (K + 1,) grid of path parameters.
+        controllable: (K + 1,) largest x from which the end can be reached at rest.
     """
-    right = rows.a[1, k] + 2 * step * rows.b[1, k]
-    a = np.concatenate([rows.a[0, k], right])
-    left_constant = rows.b[0, k] * x + rows.c[0, k]
-    right_constant = rows.b[1, k] * x + rows.c[1, k]
-    constant = np.concatenate([left_constant, right_constant])
+    steps = np.diff(s)
+    right = rows.a[1] + 2 * steps[:, None] * rows.b[1]
+    a = np.concatenate([rows.a[0], right], axis=1)
+    b = np.concatenate([rows.b[0], rows.b[1]], axis=1)
+    c = np.concatenate([rows.c[0], rows.c[1]], axis=1)
+    # the upper limits of u are linear in x: at_rest - per_x x
     with np.errstate(divide="ignore", invalid="ignore"):
-        quotients = (np.sign(a) - constant) / a
-        upper = np.where(a == 0, np.inf, quotients)
-    to_top = (rows.top[k + 1] - x) / (2 * step)
-    return float(min(upper.min(initial=np.inf), to_top))
+        at_rest = np.where(a == 0, np.inf, (np.sign(a) - c) / a)
+        per_x = np.where(a == 0, 0.0, b / a)
+    x = np.zeros(len(s))
+    present = 0.0
+    for k, step in enumerate(steps.tolist()):
+        upper = at_rest[k] - per_x[k] * present
+        to_top = (rows.top[k + 1] - present) / (2 * step)
+        u = min(upper.min(initial=np.inf), to_top)
+        reached = max(present + 2 * step * u, 0.0)
+        present = min(reached, controllable[k + 1])
+        x[k + 1] = present
+    x[-1] = 0.0
+    return x
 
 
 def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:

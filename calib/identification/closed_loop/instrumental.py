@@ -284,7 +284,16 @@ def identify_instrumental(
     # of the last step, and how often it was halved afterwards
     start, returns = plant, 0
     while True:
-        estimate = _estimate_round(task, plant, runs, std, tau)
+        try:
+            estimate = _estimate_round(task, plant, runs, std, tau)
+        except CannotSimulate:
+            # a loop that holds without noise and not with it is hardly stable: take a smaller step
+            returns += 1
+            if returns > MAX_RETREATS or plant is start:
+                raise
+            plant, runs = nearer(start, plant, cases)
+            retreats = returns
+            continue
         task = task.after(estimate)
         residual_std = estimate.fit.estimate.residual_std
         iteration = Round(_change(before, estimate.fit), residual_std, retreats)

@@ -29,7 +29,7 @@ from math import cos, sin, sqrt
 import numpy as np
 from numba import njit
 
-from calib.dynamics.kernels import JOINED, OPTIONS, add, cross, dot, inertia_times, scaled, three, turned, write
+from calib.dynamics.kernels import INNER, OPTIONS, add, cross, dot, inertia_times, joined, scaled, three, turned, write
 from calib.dynamics.shape_kernels import LOAD, LOAD_VELOCITY, PRESLIDING, SIGN, STOP, shape, smooth_sign, steepest
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
@@ -39,7 +39,7 @@ STIFF_REACH = 6.0  # smoothing widths from standstill within which the sign coun
 FINE, SINGULAR, STIFF, DIVERGED = -1, 1, 2, 3
 
 
-@njit(**JOINED)
+@joined
 def twist_cross(w, v, u, s):
     """Return the cross product of two twists, (w, v) × (u, s), as its angular and linear parts.
 
@@ -48,7 +48,7 @@ def twist_cross(w, v, u, s):
     return cross(w, u), add(cross(w, s), cross(v, u))
 
 
-@njit(**JOINED)
+@joined
 def inertia_of(work, i):
     """Return the composite inertia of body i and all bodies behind it.
 
@@ -62,7 +62,7 @@ def inertia_of(work, i):
     return J, three(work, i, 42), work[i, 45]
 
 
-@njit(**JOINED)
+@joined
 def momentum(inertia, w, v):
     """Return the angular and linear momentum of a body with `inertia` and twist (w, v).
 
@@ -74,7 +74,7 @@ def momentum(inertia, w, v):
     return add(inertia_times(J, w), cross(h, v)), add(scaled(mass, v), cross(w, h))
 
 
-@njit(**JOINED)
+@joined
 def wrench(inertia, w, v, e, a):
     """Return moment and force I A + V ×* I V of a body with V = (w, v), A = (e, a), and its linear momentum.
 
@@ -88,7 +88,7 @@ def wrench(inertia, w, v, e, a):
     return add(add(n, cross(w, angular)), cross(v, linear)), add(f, cross(w, linear)), linear
 
 
-@njit(**JOINED)
+@joined
 def _body(tree, body, i, amount, rate, work):
     """Write pose, velocity, twist and acceleration of body i into `work`, computed from its parent's.
 
@@ -124,7 +124,7 @@ def _body(tree, body, i, amount, rate, work):
     write(work, i, 27, s)
 
 
-@njit(**JOINED)
+@joined
 def _load(body, i, work):
     """Write the inertia of body i about the base's origin, and the wrench of its motion, into `work`.
 
@@ -157,7 +157,7 @@ def _load(body, i, work):
     work[i, 45] = mass
 
 
-@njit(**JOINED)
+@joined
 def dynamics(tree, body, linear, q, v, work, matrix, out):
     """Write M(q) plus added inertia into `matrix` (lower triangle), and subtract c(q, v) + g(q) from `out` (n,).
 
@@ -202,7 +202,7 @@ def dynamics(tree, body, linear, q, v, work, matrix, out):
                 work[p, r] += work[i, r]
 
 
-@njit(**JOINED)
+@joined
 def factorise(matrix):
     """Overwrite a matrix M by its factors M = L D Lᵀ: L below the diagonal, 1 / D on it.
 
@@ -225,7 +225,7 @@ def factorise(matrix):
     return True
 
 
-@njit(**JOINED)
+@joined
 def substitute(matrix, vector):
     """Overwrite `vector` (n,) by M⁻¹ vector, where `matrix` contains the factors of M (`factorise`)."""
     n = vector.shape[0]
@@ -241,7 +241,7 @@ def substitute(matrix, vector):
         vector[i] = total
 
 
-@njit(**JOINED)
+@joined
 def seen(acts, t, motion):
     """Return the sum of a motion (n,) over the joints, weighted as friction term t requires.
 
@@ -256,7 +256,7 @@ def seen(acts, t, motion):
     return total
 
 
-@njit(**JOINED)
+@joined
 def _stop(memory, t, place, width):
     """Return the state of friction term t's stop operator at a position, from state and position in `memory`.
 
@@ -269,7 +269,7 @@ def _stop(memory, t, place, width):
     return min(1.0, max(-1.0, memory[t, 0] + (place - memory[t, 1]) / width))
 
 
-@njit(**JOINED)
+@joined
 def act(code, acts, t, memory, q, v):
     """Return friction term t's torque per unit parameter, and its derivatives with respect to position and velocity.
 
@@ -287,7 +287,7 @@ def act(code, acts, t, memory, q, v):
     return shape(code, acts, t, place, seen(acts, t, v), state)
 
 
-@njit(**JOINED)
+@joined
 def _friction(linear, kinds, acts, memory, q, v, out):
     """Subtract friction and offsets, without load-dependent terms, from `out` (n,).
 
@@ -315,7 +315,7 @@ def _friction(linear, kinds, acts, memory, q, v, out):
     return loaded
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
     """Replace the accelerations `out` (n,) by those with load-dependent friction.
 
@@ -359,7 +359,7 @@ def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
     return moved <= 1e-6 * size
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def stiffness(kinds, acts, loads, v, matrix, unit):
     """Return an upper bound [1/s] of the fastest decay rate that friction causes near standstill.
 
@@ -395,7 +395,7 @@ def stiffness(kinds, acts, loads, v, matrix, unit):
     return total + 4.0 * sqrt(springs)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, matrix, out):
     """Write the joint accelerations under drive torques tau (n,) into `out`, and factorise M into `matrix`.
 
@@ -419,7 +419,7 @@ def accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, tau, work, 
     return True
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _unstressed(kinds, acts, q, memory):
     """Reset the states of friction with hysteresis to zero at positions q (n,).
 
@@ -431,7 +431,7 @@ def _unstressed(kinds, acts, q, memory):
         memory[t, 0], memory[t, 1] = 0.0, seen(acts, t, q)
 
 
-@njit(**JOINED)
+@joined
 def _remember(kinds, acts, q, memory):
     """Update the states of friction with hysteresis to positions q (n,).
 
@@ -445,7 +445,7 @@ def _remember(kinds, acts, q, memory):
             memory[t, 0], memory[t, 1] = _stop(memory, t, place, acts[t, 1]), place
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def set_parameters(values, order, entries, shares, owners, body, linear, acts):
     """Write parameters (p,) into the arrays body, linear and acts; their other entries do not change.
 
@@ -490,7 +490,7 @@ def forward_dynamics(tree, body, linear, kinds, acts, order, entries, shares, ow
     return FINE
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _advance(tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate):
     """Advance q, v (n,) by one control period under constant torques (classical Runge-Kutta); return a status.
 
@@ -536,7 +536,7 @@ def _advance(tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, 
     return FINE
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _advance_midpoint(
     tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate
 ):
@@ -612,7 +612,7 @@ def advance_points(tree, body, linear, kinds, acts, order, entries, shares, owne
     return FINE, q.shape[0]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def command(gains, aim, speed, seen, rate, integral, period, wish):
     """Write the controller's feedback command (n,) into `wish`, from reference and measurement.
 
@@ -630,7 +630,7 @@ def command(gains, aim, speed, seen, rate, integral, period, wish):
         wish[j] = gains[0, j] * error + gains[1, j] * (gains[3, j] * speed[j] - rate[j]) + gains[2, j] * integral[j]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def linearise_command(tree, model, linear, ahead, seen, rate, work, matrix, wish):
     """Replace the commanded acceleration a = `wish` (n,) by the model's torque M(q) (a + ahead) + c(q, v) + g(q).
 
@@ -654,7 +654,7 @@ def linearise_command(tree, model, linear, ahead, seen, rate, work, matrix, wish
         wish[j] = total
 
 
-@njit(**JOINED)
+@joined
 def _reading(place, encoder, quantum, k, j):
     """Return the encoder reading of joint j in period k at a true position, with noise and resolution.
 
@@ -749,13 +749,13 @@ def closed_loop(
             here, fast, first = q, v, slopes
             if part >= 1e-9:
                 here, fast, first, past = q.copy(), v.copy(), slopes.copy(), memory.copy()
-                args = (tree, body, linear, kinds, acts, past, loads)
-                status = _advance(*args, here, fast, wish, part * period, first, work, matrix, at, rate)
+                factors = matrix.copy()
+                args = (tree, body, linear, kinds, acts, past, loads.copy())
+                status = _advance(*args, here, fast, wish, part * period, first, work, factors, at, rate)
                 if status != FINE:
                     return status, k
-                if not accelerate(*args, here, fast, wish, work, matrix, first[0]):
+                if not accelerate(*args, here, fast, wish, work, factors, first[0]):
                     return SINGULAR, k
-                accelerate(tree, body, linear, kinds, acts, memory, loads, q, v, wish, work, matrix, slopes[0])
             for j in range(n):
                 out[0, sample, j], out[1, sample, j], out[2, sample, j] = here[j], fast[j], first[0, j]
                 out[3, sample, j], out[4, sample, j] = _reading(here[j], encoder, quantum, k, j), tau[j]

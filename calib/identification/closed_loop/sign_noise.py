@@ -31,6 +31,7 @@ from scipy.interpolate import CubicSpline
 
 from calib.data.signals.bandwidth import USABLE
 from calib.data.signals.filtering import low_pass, slope
+from calib.errors import CannotSimulate, NotConverged
 from calib.identification.closed_loop.loop_recordings import Loop, simulated_case, simulated_samples
 from calib.identification.closed_loop.simulated_runs import simulated_run
 from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun
@@ -172,8 +173,14 @@ def _in_loop(
         case: the recording.
         loop: its closed loop.
         run: the noise-free run of the loop, whose N instants are used.
+
+    Raises:
+        CannotSimulate: if the loop is unstable under the noise.
     """
-    noisy = simulated_run(plant, case, loop, Sensing(sigma_q=sigma, every=HALF), SEED)
+    try:
+        noisy = simulated_run(plant, case, loop, Sensing(sigma_q=sigma, every=HALF), SEED)
+    except NotConverged as error:
+        raise CannotSimulate(f"under the noise of the positions {error}", error.last) from error
     places = np.arange(len(run.t)) * loop.every / HALF
     nearest = np.minimum(places.astype(int), len(noisy.t) - 1)
     error = (noisy.measured - noisy.q)[nearest]

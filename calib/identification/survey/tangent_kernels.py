@@ -25,7 +25,19 @@ Arrays are those of `loop_kernels`, and
 import numpy as np
 from numba import njit
 
-from calib.dynamics.kernels import OPTIONS, add, cross, dot, scaled, ten_columns, three, turned, turned_back, write
+from calib.dynamics.kernels import (
+    INNER,
+    OPTIONS,
+    add,
+    cross,
+    dot,
+    scaled,
+    ten_columns,
+    three,
+    turned,
+    turned_back,
+    write,
+)
 from calib.identification.closed_loop.loop_kernels import (
     DIVERGED,
     FINE,
@@ -47,7 +59,7 @@ from calib.identification.closed_loop.loop_kernels import (
 )
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _outward(tree, body, v, a, work, bodies_own, extended):
     """Write accelerations, ψ̇ and ψ̈, wrench, P and L of each body into `extended`, and its inertia into `bodies_own`.
 
@@ -99,7 +111,7 @@ def _outward(tree, body, v, a, work, bodies_own, extended):
         write(extended, i, 33, linear)
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _slopes(tree, work, extended, by_q, by_v):
     """Add the bodies' part of K and D (n, n) to `by_q` and `by_v`.
 
@@ -142,7 +154,7 @@ def _slopes(tree, work, extended, by_q, by_v):
                 extended[p, r] += extended[i, r]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _columns(tree, order, find, work, extended, out):
     """Add the derivatives Y (n, c) by the bodies' parameters to `out`, for parameters that have a column.
 
@@ -176,7 +188,7 @@ def _columns(tree, order, find, work, extended, out):
             j = tree[j, 0]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _linearise(
     tree,
     body,
@@ -236,7 +248,7 @@ def _linearise(
                 out[entries[e, 0], column] += shares[e] * sees
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
     """Write M⁻¹ (δtau - K δq - D δv - Y) into out (n, c); `matrix` contains the factors of M.
 
@@ -268,7 +280,7 @@ def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
                 out[j, m] -= low * out[k, m]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _advance_tangent(
     plant, layout, memory, loads, q, v, dq, dv, tau, dtau, period, slopes, dslopes, work, matrix, rooms
 ):
@@ -334,7 +346,7 @@ def _advance_tangent(
     return FINE
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _workspace(bodies, n, c):
     """Return the working arrays of `_advance_tangent` for a number of bodies, n joints and c columns.
 
@@ -397,7 +409,7 @@ def advance_linearised(plant, layout, values, q, v, tau, period, gain, dq, dv):
     return status if np.all(np.abs(v) < 1e6) else DIVERGED
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _command_tangent(
     plant,
     layout,

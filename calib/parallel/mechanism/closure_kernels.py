@@ -12,7 +12,7 @@ from math import copysign, sqrt
 import numpy as np
 from numba import njit
 
-from calib.dynamics.kernels import OPTIONS
+from calib.dynamics.kernels import INNER, OPTIONS
 
 # Column of `links` with the kind of the joint, and the kind of revolute joints.
 KIND = 1
@@ -21,7 +21,7 @@ REVOLUTE = 1
 SCALE = 12
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def invert(A, out):
     """Write A⁻¹ (n, n) into `out` by Gauss–Jordan elimination with row pivots; A is overwritten.
 
@@ -54,7 +54,7 @@ def invert(A, out):
                     out[i, k] -= factor * out[j, k]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, carried, gap, lever, frame):
     """Write Jacobians and gap of one leg at one posture; see `calib.parallel.mechanism.closure.LegLinks`.
 

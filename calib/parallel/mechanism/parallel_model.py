@@ -34,7 +34,14 @@ from calib.errors import CalibError, UsageError, require
 from calib.parallel.mechanism.closure import ClosedRobot, Posture
 from calib.parallel.mechanism.parallel_robot import COORDINATES, FORCES
 from calib.parallel.mechanism.platform_columns import energy_columns, wrench_regressor
-from calib.parallel.mechanism.velocities import LoopMotion, distributed, loop_jacobians, of_platform, of_readings
+from calib.parallel.mechanism.velocities import (
+    LoopJacobians,
+    LoopMotion,
+    distributed,
+    loop_jacobians,
+    of_platform,
+    of_readings,
+)
 from calib.records import shaped
 
 # Largest speed [m/s or rad/s] and acceleration [m/s² or rad/s²] of random states (as `IdentificationModel.sample`).
@@ -223,6 +230,14 @@ class ParallelModel:
         motion = self.moved(q, v, a)
         return self.along(motion, carried)
 
+    def drive_regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Return W (N, rows, p) as `regressor`, but with zeros for the bodies, whose columns cost most."""
+        motion = self.moved(q, v, a)
+        count = self._bodies + len(self.terms)
+        out = np.zeros((count, self.mechanism.robot.r, len(motion.v)))
+        self._fill_drives(out, motion)
+        return self.on_rows(self._merged(out).transpose(2, 1, 0), motion)
+
     def along(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
         """Return W (N, rows, p) along a motion of the whole robot."""
         regressor = self.platform_regressor(motion, carried)
@@ -251,12 +266,15 @@ class ParallelModel:
         if start is None:
             robot = self.mechanism.robot
             readings = shaped(q, (None, robot.n), f"readings of '{robot.name}'")
-            posture = _located(self.mechanism, readings.tobytes())
+            values = readings.tobytes()
+            posture = _located(self.mechanism, values)
+            jacobians = _loop_at(self.mechanism, values)
         else:
             posture = self.mechanism.locate(q, start)
+            jacobians = loop_jacobians(self.mechanism, posture)
         v = np.asarray(v, dtype=float)
         a = np.asarray(a, dtype=float)
-        return of_readings(self.mechanism, posture, v, a)
+        return of_readings(self.mechanism, posture, v, a, jacobians)
 
     def platform_regressor(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the regressor W (N, r, p) in platform coordinates, stored in the order (p, r, N)."""
@@ -274,10 +292,7 @@ class ParallelModel:
         platform = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity)
         on_coordinates = J.platform.transpose(0, 2, 1) @ platform
         self._fill_platform(out, on_coordinates.transpose(2, 1, 0), carried)
-        motions = [motion.posture.q.T, motion.v.T, motion.a.T, None]
-        for k, term in enumerate(self.terms):
-            for joint, column in term.acting(motions, np.zeros((0, len(motion.v)))):
-                out[self._bodies + k] += J.joints[:, joint].T * column
+        self._fill_drives(out, motion)
         return self._merged(out).transpose(2, 1, 0)
 
     def platform_force(
@@ -365,7 +380,18 @@ class ParallelModel:
             if label is None or carried is None or label in carried:
                 out[first : first + 10] = platform
 
+    def _fill_drives(self, out: np.ndarray, motion: LoopMotion) -> None:
+        """Add the columns of the drive terms in platform coordinates to `out` (p_1, r, N)."""
+        motions = [motion.posture.q.T, motion.v.T, motion.a.T, None]
+        for k, term in enumerate(self.terms):
+            for joint, column in term.acting(motions, np.zeros((0, len(motion.v)))):
+                out[self._bodies + k] += motion.jacobians.joints[:, joint].T * column
+
     def acting(self) -> np.ndarray:
+        return self._acting
+
+    @cached_property
+    def _acting(self) -> np.ndarray:
         states = self.sample(4, np.random.default_rng(0))
         regressor = self.regressor(states.q, states.v, states.a)
         has_effect = np.abs(regressor) > NO_EFFECT
@@ -562,6 +588,13 @@ def _located(mechanism: ClosedRobot, readings: bytes) -> Posture:
     """Return the postures at readings (N, n) of the actuated joints."""
     values = np.frombuffer(readings)
     return mechanism.locate(values.reshape(-1, mechanism.robot.n))
+
+
+# Jacobians are larger than postures.
+@lru_cache(maxsize=4)
+def _loop_at(mechanism: ClosedRobot, readings: bytes) -> LoopJacobians:
+    """Return the Jacobians at readings (N, n) of the actuated joints."""
+    return loop_jacobians(mechanism, _located(mechanism, readings))
 
 
 def _to_platform(mechanism: ClosedRobot, q: np.ndarray, v: np.ndarray) -> np.ndarray:

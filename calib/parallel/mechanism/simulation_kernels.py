@@ -9,7 +9,18 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from calib.dynamics.kernels import OPTIONS, add, cross, dot, increase, inertia_times, inverse_dynamics, scaled, three
+from calib.dynamics.kernels import (
+    INNER,
+    OPTIONS,
+    add,
+    cross,
+    dot,
+    increase,
+    inertia_times,
+    inverse_dynamics,
+    scaled,
+    three,
+)
 from calib.identification.closed_loop.loop_kernels import (
     DIVERGED,
     FINE,
@@ -25,7 +36,7 @@ from calib.identification.closed_loop.loop_kernels import (
 from calib.parallel.mechanism.closure_kernels import SCALE, invert, one_leg
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _add(A, x, out):
     """Add A x to `out`."""
     for i in range(A.shape[0]):
@@ -33,7 +44,7 @@ def _add(A, x, out):
             out[i] += A[i, k] * x[k]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _platform(body, pose, turn, gravity, M, h):
     """Write the platform's inertia M (6, 6), zero on entry, and its wrench h (6,) where the twist does not change."""
     w = (turn[0], turn[1], turn[2])
@@ -56,7 +67,7 @@ def _platform(body, pose, turn, gravity, M, h):
     M[2, 4] = M[4, 2] = -S[0]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _bent(full, v, turn, lever, leg, shift):
     """Add the right-hand side of a leg's acceleration equations J q̈ = G ṫ - shift to row `leg` of `shift` (L, 6).
 
@@ -73,7 +84,7 @@ def _bent(full, v, turn, lever, leg, shift):
     increase(shift, leg, 0, cross(t, cross(three(lever, leg, 0), t)))
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _freedoms(full, inverse, carried, held, starts, selected, D, back):
     """Write D (6, r) and `back` (L, 6, 6), both zero on entry: platform twists that all legs can follow are t_0 + D v.
 
@@ -131,7 +142,7 @@ def _freedoms(full, inverse, carried, held, starts, selected, D, back):
                     back[leg, others[a], m] += solved[a, k] * through
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _follow(held, inverse, carried, gap, mend, D, q, J):
     """Move a leg's joints q (n,) so that they follow the platform's step `mend` (6,), and close the leg's gap.
 
@@ -148,7 +159,7 @@ def _follow(held, inverse, carried, gap, mend, D, q, J):
                     J[j, i] += inverse[j, m] * carried[m, a] * D[a, i]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _leg_share(links, constants, parameters, drives, held, inverse, carried, shift, still, q, rates, tau, J, M, h):
     """Add a leg's share to the inertia M (r, r) and to the force h (r,), the force if ṫ = `still`.
 
@@ -191,7 +202,7 @@ def _leg_share(links, constants, parameters, drives, held, inverse, carried, shi
                     M[i, m] += J[j, i] * inertia[j, k] * J[k, m]
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
     """Write the accelerations of a state, and correct the gaps of the loops in q and pose.
 
@@ -318,7 +329,7 @@ def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
     return decay
 
 
-@njit(**OPTIONS)
+@njit(**INNER)
 def _turn(factor, twist, pose, out):
     """Write a pose moved by `factor` times a twist [v; ω] (6,): p + v and Exp(ω) R (Rodrigues); `out` may be `pose`."""
     x = factor * twist[3]

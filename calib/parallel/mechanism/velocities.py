@@ -9,7 +9,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.parallel.mechanism.closure import ClosedRobot, LegLinks, Posture, joint_rates, leg_links, times, twists
+from calib.parallel.mechanism.closure import (
+    ClosedRobot,
+    LegLinks,
+    Posture,
+    joint_rates,
+    leg_links,
+    pseudo_inverse,
+    times,
+    twists,
+)
 from calib.records import shaped
 
 
@@ -90,19 +99,19 @@ def of_platform(
     return LoopMotion(posture, loop, v, accelerations, twist, twist_change, rate)
 
 
-def of_readings(mechanism: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarray) -> LoopMotion:
+def of_readings(
+    mechanism: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarray, jacobians: LoopJacobians | None = None
+) -> LoopMotion:
     """Return velocities and accelerations at postures from those of the encoders (eqs 16, 18).
 
     The result covers all joints and the platform; redundant encoders are combined by least squares.
 
     Args:
         v, a: (N, n) velocities and accelerations of the actuated joints.
+        jacobians: Jacobians at the postures; None to compute them.
     """
-    loop = loop_jacobians(mechanism, posture)
-    if mechanism.robot.redundant:
-        back = np.linalg.pinv(loop.readings)
-    else:
-        back = np.linalg.inv(loop.readings)
+    loop = jacobians or loop_jacobians(mechanism, posture)
+    back = pseudo_inverse(loop.readings)
     rate = times(back, v)
     still = of_platform(mechanism, posture, rate, np.zeros_like(rate), loop)
     a_remaining = a - still.a[:, mechanism.robot.actuated]

@@ -295,7 +295,9 @@ def test_a_shorter_period():
 @pytest.mark.slow
 @pytest.mark.parametrize("whom", ["the terminal's group", "the command alone"])
 def test_ctrl_c_in_worker_processes(tmp_path, whom):
-    words = ["excite", "tx40", "--out", str(tmp_path / "e"), "--starts", "20", "--workers", "2"]
+    # short searches, so many that they do not end
+    short = ["--starts", "2000", *map(str, QUICK[2:]), "--no-plots"]
+    words = ["excite", "tx40", "--out", str(tmp_path / "e"), *short, "--workers", "2"]
     for patience in (4, 10, 25, 60):  # [s] until the workers of a busy machine have found something
         run = subprocess.Popen(
             [sys.executable, "-m", "calib", *words], stdout=subprocess.PIPE, text=True, start_new_session=True
