@@ -72,7 +72,8 @@ def _ripple_sentence(ripple: RippleWaves) -> str:
         orders.append(f"{wave.order_per_turn:g}{gear}")
     return (
         f"ripple at joint {ripple.joint}, orders {', '.join(orders)} per turn: explains "
-        f"{100 * ripple.explained_share_on_unseen_blocks:.0f} % of the fast residual's power on held-out parts of the motion; "
+        f"{100 * ripple.explained_share_on_unseen_blocks:.0f} % of the fast residual's power on held-out parts of "
+        "the motion; "
         "not included in the covariance"
     )
 
