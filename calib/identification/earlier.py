@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 from calib.dynamics.drives import DriveTerm
 from calib.errors import UsageError, require
+from calib.records import Number
 
 CLEAR_GAIN = 0.2
 """Share by which a step of the friction ladder has to lower a joint's rms error on unseen time, beside terms that an
@@ -30,14 +31,14 @@ class ModelChoice:
     Attributes:
         terms: names of the additional friction terms, without those that were switched off.
         groups: ridge group of each term.
-        ridges: prior standard deviation of each term's parameter.
+        ridges: prior standard deviation of each term's parameter; NaN by methods without ridges.
         sizes: sizes of the prior of the base parameters by kind; empty without a prior.
         tempering: weight of the prior for the values, relative to its weight for their covariance.
     """
 
     terms: tuple[str, ...]
     groups: tuple[int, ...]
-    ridges: tuple[float, ...]
+    ridges: tuple[Number, ...]
     sizes: Mapping[str, float]
     tempering: float
 

@@ -177,11 +177,11 @@ class _Sizes:
     upper: np.ndarray
 
     def fixing(self, fixed: Mapping[str, float]) -> "_Sizes":
-        """Return these sizes, those of the given names with bounds that leave the given value alone."""
+        """Return these sizes with bounds that leave only the stated values of some; names of no size have no effect."""
         lower, upper = np.array(self.lower), np.array(self.upper)
-        for name, size in fixed.items():
-            index = self.names.index(name)
-            lower[index] = upper[index] = np.log(size)
+        for index, name in enumerate(self.names):
+            if name in fixed:
+                lower[index] = upper[index] = np.log(fixed[name])
         return replace(self, lower=lower, upper=upper)
 
     def deviations(self, t: np.ndarray) -> np.ndarray:

@@ -440,8 +440,8 @@ def with_blocks(
 
     Blocks are contiguous in time, about `count` in all, with at least one per case. Where a motion is repeated, they
     are contiguous parts of the motion, each with all its repetitions: a block of a later period would test nothing.
-    There are then fewer of them if the motion is short. Samples within `CUT_MARGIN` of a cut between blocks get -1,
-    since the filter's window extends across the cut.
+    There are then fewer of them if the motion is short; one that is too short for two blocks is divided in time.
+    Samples within `CUT_MARGIN` of a cut between blocks get -1, since the filter's window extends across the cut.
 
     Args:
         all_rows: rows of all cases.

@@ -20,6 +20,7 @@ from calib.geometry.checks.wrong_rows import (
     _independent,
     _shifted,
     least_error,
+    row_shifts,
 )
 from calib.geometry.diagnosis import wrong_columns
 from calib.geometry.first_guess import install
@@ -138,6 +139,15 @@ def test_a_repeated_reading_of_a_lost_target_is_still_left_out(name):
     visible, findings = without_unseen(arm, replace(block, position=position))
     assert len(visible) == 48
     assert [finding.code for finding in findings] == ["reading-repeated"]
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_row_is_missing_near_the_end_of_a_short_file():
+    """A shift that leaves no row behind its first one with joint values is none."""
+    arm, block = measured(12)
+    gapped = take(block, np.flatnonzero(np.arange(12) != 10))
+    changes = row_shifts(install(arm, [gapped]), [gapped], 0.3)
+    assert all(change.values["first"] < gapped.rows[-1] for change in changes)
 
 
 def test_no_rows_have_no_error():

@@ -8,11 +8,13 @@ import pytest
 
 from calib.dynamics import drives
 from calib.errors import UsageError
-from calib.identification.earlier import DECISIVE, EarlierChoice
+from calib.files import write_json
+from calib.identification.earlier import DECISIVE, EarlierChoice, ModelChoice
 from calib.identification.identify import Identification, identify
 from calib.identification.rows import Case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.verdict import parameter_findings
+from calib.records import plain, read_json
 
 SETTINGS = IdentificationSettings(essential="none")
 STRIBECK = (drives.term("Fs1", "stribeck", 0, 0.3, 1.0, 0.01),)
@@ -74,8 +76,20 @@ def test_friction_that_is_clearly_missing_is_added(first, both):
     assert "earlier-friction-extended" in codes(found)
 
 
-def test_prior_of_other_parameters_is_refused(first, both):
+@pytest.mark.parametrize("further", [True, False])
+def test_prior_of_other_parameters_is_refused(first, both, further):
+    """Other parameters are those with a size more, as well as those with fewer."""
     choice = after(first)
-    other = replace(choice, choice=replace(choice.choice, sizes={"whole": 1.0}))
+    sizes = {**choice.choice.sizes, "elastic [N m/rad]": 1.0} if further else {"whole": 1.0}
+    other = replace(choice, choice=replace(choice.choice, sizes=sizes))
     with pytest.raises(UsageError, match="other drive terms, torque rows or payloads"):
         identify(planted.arm(), both, replace(SETTINGS, earlier=other))
+
+
+def test_choice_of_a_method_without_ridges_is_stored(tmp_path):
+    """Least squares without prior has friction terms, but nothing that regularises them."""
+    choice = identify(planted.arm(), [case("a", 0)], replace(SETTINGS, method="ols")).choice
+    assert choice.terms and not choice.sizes
+    stored = read_json(write_json(tmp_path / "choice.json", plain(choice)), kind=ModelChoice)
+    assert stored.terms == choice.terms
+    assert np.isnan(stored.ridges).all()

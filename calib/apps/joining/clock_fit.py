@@ -135,11 +135,11 @@ def _offsets(chain: Chain, run: Run) -> list[float]:
         chain: the nominal arm.
         run: the recordings of controller and instrument.
     """
-    arm = forward(chain, _even(run.log))
+    arm = forward(chain, _resampled(run.log))
     arm_steps = _step_lengths(arm[:, :3, 3])
     rotations = invert(arm[:-1])[:, :3, :3] @ arm[1:, :3, :3]
     turns = np.linalg.norm(rotation_vector(rotations), axis=1)
-    point_steps = _step_lengths(_even(run.stream)[:, :3])
+    point_steps = _step_lengths(_resampled(run.stream)[:, :3])
 
     arm_count, point_count = len(arm_steps), len(point_steps)
     lags = GRID * correlation_lags(point_count, arm_count) + run.stream.t[0] - run.log.t[0]
@@ -147,9 +147,9 @@ def _offsets(chain: Chain, run: Run) -> list[float]:
     possible = shared > OVERLAP * min(point_count, arm_count)
     offsets = list[float]()
     for lever in LEVERS:
-        arm_speed = _cut(np.hypot(arm_steps, lever * turns))
+        arm_speed = _clipped(np.hypot(arm_steps, lever * turns))
         # a correlation over a longer overlap counts more
-        score = _alike(_cut(point_steps), arm_speed) * np.sqrt(shared / shared.max())
+        score = _correlation(_clipped(point_steps), arm_speed) * np.sqrt(shared / shared.max())
         score[~possible] = -np.inf
         for _ in range(PEAKS):
             best = float(lags[int(np.argmax(score))])
@@ -167,18 +167,18 @@ def _step_lengths(positions: np.ndarray) -> np.ndarray:
     return np.linalg.norm(np.diff(positions, axis=0), axis=1)
 
 
-def _even(stream: Stream) -> np.ndarray:
+def _resampled(stream: Stream) -> np.ndarray:
     """Return a stream's values (m, k) interpolated at times `GRID` [s] apart."""
     t = np.arange(stream.t[0], stream.t[-1], GRID)
     return interpolated(t, stream.t, stream.values)
 
 
-def _cut(speed: np.ndarray) -> np.ndarray:
+def _clipped(speed: np.ndarray) -> np.ndarray:
     """Return speeds (m,) minus their median, with outliers clipped."""
     return np.minimum(speed, 2.0 * np.quantile(speed, 0.95)) - np.median(speed)
 
 
-def _alike(series_a: np.ndarray, series_b: np.ndarray) -> np.ndarray:
+def _correlation(series_a: np.ndarray, series_b: np.ndarray) -> np.ndarray:
     """Return the correlation coefficient of two time series at every lag, over the samples where they overlap.
 
     Args:
@@ -278,7 +278,7 @@ def fitted(
         linear = _linearised(cell, run, rows, clock, unknowns, loss)
         prior = unknowns.guess
         if arm:
-            prior = _sized(linear, pulled, unknowns)
+            prior = _prior_deviations(linear, pulled, unknowns)
         solution = _solved(linear, pulled, prior)
         offset_change, drift_change = solution.change[-2:]
         cell = step(cell, unknowns.free, solution.change[: len(unknowns.free)])
@@ -387,7 +387,7 @@ def _solved(linear: _Rows, pulled: np.ndarray, prior: np.ndarray) -> _Step:
     return _Step(change / scale, sigma, matrix, target)
 
 
-def _sized(linear: _Rows, pulled: np.ndarray, unknowns: _Unknowns) -> np.ndarray:
+def _prior_deviations(linear: _Rows, pulled: np.ndarray, unknowns: _Unknowns) -> np.ndarray:
     """Return the prior standard deviations (p,), with those of each family of terms scaled by the most probable factor.
 
     Args:

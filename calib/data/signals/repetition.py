@@ -27,20 +27,26 @@ from calib.records import evenly
 RATE = 100.0
 # largest number of samples that are read of a recording
 MAX_SAMPLES = 100_000
-# D(L) of a lag that is looked at closer: 1 on average for unlike motion
-ALIKE = 0.7
-# D(L) beyond which a motion has left its own neighbourhood
-LEFT = 0.2
+# largest D(L) of a lag that is tested: 1 on average for unlike motion
+MAX_UNLIKENESS = 0.7
+# D(L) up to which a motion is in its own neighbourhood
+NEIGHBOURHOOD = 0.2
 # difference of D(L) within which lags are about as good
 TIE = 0.1
-# number of lags that are looked at closer
-LAGS = 12
-# positions of a recording that are looked up in the others, and the distance there in `MAX_DISTANCE`
-PROBES, NEIGHBOURS = 60, 1.25
+# largest number of lags that are tested
+MAX_LAGS = 12
+# distance to a lag between recordings within which a better one is searched, in read samples
+REACH = 128
+# number of positions of a recording that are searched in the others, and the radius there, over `MAX_DISTANCE`
+PROBES, RADIUS = 60, 1.25
+# share of these that another recording has to contain, over `MIN_SHARE`: few positions tell a share only roughly
+MET_SHARE = 0.8
 # share of the moving samples that a repetition has to contain
 MIN_SHARE = 0.25
 # share of the moving samples of the overlap that has to be alike
 MIN_ALIKE = 0.5
+# share of the moving samples that a repetition contains where no other lag is tested
+ENOUGH = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +89,9 @@ class Course:
     def blocks(self, count: int) -> list[np.ndarray]:
         """Return for each recording the number (N,) of the block of each sample.
 
-        Blocks are contiguous parts of the course, of about equal length, with their repetitions; at least one begins
-        in each recording that has new motion.
+        Blocks are contiguous parts of the course, of about equal length, with their repetitions. At least one begins in
+        each recording, but in those that repeat others so far that less than half a block is new: this belongs to the
+        block before.
 
         Args:
             count: number of blocks, about.
@@ -92,10 +99,15 @@ class Course:
         size = len(self.recording)
         number = np.zeros(size, dtype=int)
         first = 0
-        for recording in np.unique(self.recording).tolist():
+        recordings = np.unique(self.recording).tolist()
+        for recording in recordings:
             course_indices = np.flatnonzero(self.recording == recording)
+            repeats = not self.fresh[recording].all()
+            if first and repeats and len(course_indices) < 0.5 * size / count:
+                number[course_indices] = first - 1
+                continue
             blocks = 1
-            if len(self.course_index) < count:
+            if len(recordings) < count:
                 blocks = max(1, round(count * len(course_indices) / size))
             number[course_indices] = first + (np.arange(len(course_indices)) * blocks) // len(course_indices)
             first += blocks
@@ -110,15 +122,13 @@ class _Path:
         q: (N, k) positions of the joints that move in any recording [rad or m].
         scale: (k,) their standard deviations over all recordings.
         moves: (M,) whether any joint moves, at every `step`-th sample.
-        step: samples per read sample.
-        rate: sampling rate [Hz].
+        step: samples per read sample, the same for all recordings.
     """
 
     q: np.ndarray
     scale: np.ndarray
     moves: np.ndarray
     step: int
-    rate: float
 
     @property
     def rows(self) -> np.ndarray:
@@ -129,14 +139,22 @@ class _Path:
         """Return the positions (m, k) at samples (m,), in standard deviations."""
         return self.q[rows] / self.scale
 
+    def at_all_samples(self, values: np.ndarray) -> np.ndarray:
+        """Return values (N,) of all samples from those (M,) of the read ones: others have that of their predecessor."""
+        return np.repeat(values, self.step)[: len(self.q)]
+
 
 def course(motions: Sequence[Motion]) -> Course:
-    """Return the course of recordings of one robot, in the order in which they are given."""
+    """Return the course of recordings of one robot, in the order in which they are given.
+
+    A lag is a number of samples. Recordings of clearly different rates repeat nothing of each other, therefore, and a
+    repetition with a gap is mapped on one side of the gap at most.
+    """
     paths = _paths(motions)
     met = _met_recordings(paths)
-    course_indices, news, recordings = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
+    course_indices, fresh, recordings = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
     length = 0
-    for number in range(len(paths)):
+    for number, path in enumerate(paths):
         source, row = _sources(paths, number, met[number])
         size = len(source)
         course_index = np.zeros(size, dtype=int)
@@ -144,22 +162,18 @@ def course(motions: Sequence[Motion]) -> Course:
             selected = source == earlier
             course_index[selected] = course_indices[earlier][row[selected]]
         is_new = source < 0
-        course_index[is_new] = length + np.arange(int(is_new.sum()))
+        new_count = int(is_new.sum())
+        course_index[is_new] = length + np.arange(new_count)
         # a sample may repeat one that itself repeats an earlier one
         origin = np.where(source == number, row, np.arange(size))
         while (origin[origin] != origin).any():
             origin = origin[origin]
-        course_index = course_index[origin]
-        length += int(is_new.sum())
-        # samples between those that are read count as their predecessors
-        path = paths[number]
-        course_indices.append(course_index)
-        news.append(np.repeat(is_new, path.step)[: len(path.q)])
-        recordings.append(np.full(int(is_new.sum()), number))
-    full_indices = tuple(
-        np.repeat(course_index, path.step)[: len(path.q)] for course_index, path in zip(course_indices, paths)
-    )
-    return Course(full_indices, tuple(news), np.concatenate(recordings))
+        course_indices.append(course_index[origin])
+        fresh.append(path.at_all_samples(is_new))
+        recordings.append(np.full(new_count, number))
+        length += new_count
+    full_indices = tuple(path.at_all_samples(indices) for path, indices in zip(paths, course_indices))
+    return Course(full_indices, tuple(fresh), np.concatenate(recordings))
 
 
 def _paths(motions: Sequence[Motion]) -> list[_Path]:
@@ -169,11 +183,11 @@ def _paths(motions: Sequence[Motion]) -> list[_Path]:
     moving = highest - lowest > MIN_TRAVEL
     deviations = [motion.q.std(axis=0) for motion in motions]
     scale = np.maximum(np.max(deviations, axis=0), MIN_TRAVEL)[moving]
-    paths = []
-    for motion in motions:
-        step = max(1, int(motion.rate / RATE), len(motion) // MAX_SAMPLES)
-        paths.append(_Path(motion.q[:, moving], scale, ~motion.standstill()[::step], step, motion.rate))
-    return paths
+    # one step for all: rates from time stamps differ slightly, and long recordings are read more coarsely
+    highest_rate = max(motion.rate for motion in motions)
+    longest = max(len(motion) for motion in motions)
+    step = max(1, int(highest_rate / RATE), longest // MAX_SAMPLES)
+    return [_Path(motion.q[:, moving], scale, ~motion.standstill()[::step], step) for motion in motions]
 
 
 def _met_recordings(paths: Sequence[_Path]) -> list[list[int]]:
@@ -186,14 +200,14 @@ def _met_recordings(paths: Sequence[_Path]) -> list[list[int]]:
     positions = [path.at(path.rows[path.moves]) for path in paths]
     recording = np.repeat(np.arange(len(paths)), [len(moving) for moving in positions])
     tree = KDTree(np.concatenate(positions))
-    radius = NEIGHBOURS * MAX_DISTANCE * np.sqrt(positions[0].shape[1])
+    radius = RADIUS * MAX_DISTANCE * np.sqrt(positions[0].shape[1])
     result = []
     for number, moving in enumerate(positions):
         probes = moving[evenly(len(moving), PROBES)]
         counts = np.zeros(len(paths))
         for neighbours in tree.query_ball_point(probes, radius):
             counts[np.unique(recording[neighbours])] += 1
-        enough = np.flatnonzero(counts >= 0.8 * MIN_SHARE * len(probes))
+        enough = np.flatnonzero(counts >= MET_SHARE * MIN_SHARE * len(probes))
         result.append([*enough[enough < number].tolist(), number])
     return result
 
@@ -213,8 +227,6 @@ def _sources(paths: Sequence[_Path], number: int, candidates: Sequence[int]) -> 
     if not path.q.shape[1]:
         return source, row
     for earlier in candidates:
-        if (paths[earlier].rate, paths[earlier].step) != (path.rate, path.step):
-            continue
         repeated = _repeated(path, paths[earlier], within=earlier == number)
         fresh = (source < 0) & (repeated >= 0)
         source[fresh] = earlier
@@ -233,41 +245,65 @@ def _repeated(path: _Path, reference: _Path, within: bool) -> np.ndarray:
     rows = path.rows
     moving = path.moves.sum()
     z = path.at(rows)
+    # a lag within a recording may not come near zero
+    reach = path.step * (2 if within else REACH)
+    result = np.full(len(rows), -1)
+    largest_count = 0
     for coarse in _lags(z, reference.at(reference.rows), within):
-        lag = _refined(path, reference, coarse * path.step)
+        lag = _refined(path, reference, coarse * path.step, reach)
         target = rows - lag
         overlap = np.flatnonzero((target >= 0) & (target < len(reference.q)))
         difference = z[overlap] - reference.at(target[overlap])
         alike = overlap[np.sqrt(np.mean(difference**2, axis=1)) < MAX_DISTANCE]
         count = path.moves[alike].sum()
-        if count >= MIN_SHARE * moving and count >= MIN_ALIKE * path.moves[overlap].sum():
+        if count < MIN_SHARE * moving or count < MIN_ALIKE * path.moves[overlap].sum():
+            continue
+        if count > largest_count:
+            largest_count = count
             result = np.full(len(rows), -1)
             result[alike] = target[alike] // path.step
-            return result
-    return np.full(len(rows), -1)
+        if largest_count and (within or count >= ENOUGH * moving):
+            break
+    return result
 
 
-def _refined(path: _Path, reference: _Path, lag: int) -> int:
-    """Return the lag with the smallest distance about a coarse one [samples].
+def _refined(path: _Path, reference: _Path, lag: int, reach: int) -> int:
+    """Return the lag with the smallest distance about a coarse one, searched by steps that halve [samples].
+
+    The distance is the median over the moving samples: unlike parts, as the ways to the start, shift the minimum of
+    D(L), but not its own.
 
     Args:
         path, reference: the recording, and the one that it may repeat.
         lag: the coarse lag [samples].
+        reach: largest distance from the coarse lag, about [samples].
     """
-    best, smallest = lag, np.inf
-    for candidate in range(lag - path.step + 1, lag + path.step):
-        first = max(0, candidate)
-        last = min(len(path.q), len(reference.q) + candidate)
-        rows = np.arange(first, last, path.step)
-        difference = path.at(rows) - reference.at(rows - candidate)
-        distance = float(np.median(np.sum(difference**2, axis=1)))
-        if distance < smallest:
-            best, smallest = candidate, distance
+    best, smallest = lag, _median_distance(path, reference, lag)
+    step = reach // 2
+    while step > 0:
+        for candidate in (best - step, best + step):
+            distance = _median_distance(path, reference, candidate)
+            if distance < smallest:
+                best, smallest = candidate, distance
+        step //= 2
     return best
 
 
+def _median_distance(path: _Path, reference: _Path, lag: int) -> float:
+    """Return the median squared distance of two recordings at a lag [samples]; infinite where nothing moves."""
+    rows = path.rows[path.moves]
+    rows = rows[(rows >= lag) & (rows < len(reference.q) + lag)]
+    if not len(rows):
+        return np.inf
+    difference = path.at(rows) - reference.at(rows - lag)
+    return float(np.median(np.sum(difference**2, axis=1)))
+
+
 def _lags(z: np.ndarray, reference: np.ndarray, within: bool) -> list[int]:
-    """Return lags L with z(t) ≈ reference(t - L), the smallest first within a recording, else the most alike first.
+    """Return lags L with z(t) ≈ reference(t - L), in the order in which they are tested.
+
+    Multiples of a period are about as good as the period. Within a recording the smallest of such lags comes first,
+    else that with the longest overlap; other lags between recordings follow, the most alike first.
 
     Args:
         z, reference: (N, n) and (M, n) positions.
@@ -281,20 +317,21 @@ def _lags(z: np.ndarray, reference: np.ndarray, within: bool) -> list[int]:
     usable = overlap >= MIN_SHARE * size
     if within:
         forward = lags > 0
-        distant = np.flatnonzero(forward & (ratio > LEFT))
+        distant = np.flatnonzero(forward & (ratio > NEIGHBOURHOOD))
         if not len(distant):
             return []
         usable &= lags > lags[distant[0]]
     inner = np.zeros(len(lags), dtype=bool)
     inner[1:-1] = (ratio[1:-1] <= ratio[:-2]) & (ratio[1:-1] <= ratio[2:])
-    candidates = np.flatnonzero(usable & inner & (ratio < ALIKE))
+    candidates = np.flatnonzero(usable & inner & (ratio < MAX_UNLIKENESS))
+    # multiples of a period are about as good
+    alike = ratio[candidates] <= ratio[candidates].min(initial=np.inf) + TIE
     if within:
-        # the shortest of lags that are about as good: multiples of a period are periods, too
-        limit = ratio[candidates].min(initial=np.inf) + TIE
-        best = candidates[ratio[candidates] <= limit]
+        best = candidates[alike]
     else:
-        best = candidates[np.argsort(ratio[candidates], kind="stable")]
-    return lags[best[:LAGS]].tolist()
+        shared = np.where(alike, overlap[candidates], 0)
+        best = candidates[np.lexsort((ratio[candidates], -shared))]
+    return lags[best[:MAX_LAGS]].tolist()
 
 
 def _unlikeness(z: np.ndarray, reference: np.ndarray, lags: np.ndarray) -> np.ndarray:

@@ -30,7 +30,7 @@ from calib.transforms import from_quaternion
 
 # shifts in rows between measurements and joint values that are tried, as by a lost point or a header line
 SHIFTS = (1, -1, 2, -2)
-# smallest number of shifted rows that have joint values: within a few mm, of a range of a metre, none fits by chance
+# smallest number of shifted rows with joint values: hardly a row of another pose fits within millimetres by chance
 MIN_SHIFTED = 1
 # largest rms error of the shifted rows, over that of the rows in place: the errors of a nominal arm at different poses
 # (our choice)
@@ -165,7 +165,7 @@ class _Cut(NamedTuple):
 
     @property
     def may_be_slip(self) -> bool:
-        """Whether the error falls as much as a slip needs, if all of it were that of the rows which a shift keeps."""
+        """Whether a slip is possible: at best, rows that lose their joint values have none of the error in place."""
         least = MIN_PAIRED * MIN_SLIP**2 * self.after
         return self.in_place >= least or self.in_place <= POSITION_ROUNDING**2
 
@@ -190,6 +190,9 @@ def _better_than_in_place(nominal: Installation, block: Positions, first: int, s
     if POSITION_ROUNDING**2 < before < MIN_SLIP**2 * after:
         return False
     is_shifted = shifted.rows >= first
+    if not is_shifted.any():
+        # beside a row that is missing, a shift may leave all others without joint values
+        return False
     if is_shifted.all():
         return True
     try:
@@ -239,14 +242,14 @@ def _best_cut(columns: np.ndarray, block: Positions, shift: int) -> _Cut | None:
     if len(numbers) < MIN_SHIFTED or len(_shifted(block, 0, shift)) < MIN_PAIRED * len(block):
         return None
 
-    errors = _CutErrors.of(columns, block, shift)
+    cut_errors = _CutErrors.of(columns, block, shift)
     coarse = numbers[evenly(len(numbers), MAX_CUTS)]
-    best = coarse[np.argmin(errors.at(coarse))]
+    best = coarse[np.argmin(cut_errors.at(coarse))]
     around = numbers[np.abs(numbers - best) < max(len(numbers) // MAX_CUTS, 1)]
-    best = int(around[np.argmin(errors.at(around))])
+    best = int(around[np.argmin(cut_errors.at(around))])
     later = numbers[numbers >= best]
-    squares = errors.at(later)
-    in_place = errors.at(np.array([block.rows.max() + 1]))
+    squares = cut_errors.at(later)
+    in_place = cut_errors.at(np.array([block.rows.max() + 1]))
     return _Cut(_last_as_good(squares, later, len(block)), float(squares[0]), float(in_place[0]))
 
 

@@ -66,7 +66,7 @@ def unlearnt_share(fit: GeometricFit, measured: Sequence[PoseMeasurements]) -> f
     loads = np.concatenate([block.load for block in measured])
     weighed = replace(chain, inertias=reference_masses(chain))
     rows, motions = [], []
-    for number, (block, prepared) in enumerate(zip(measured, fit.blocks)):
+    for block, prepared, sigmas in zip(measured, fit.blocks, fit.used_sigmas(), strict=True):
         part = next(part for part in observe(cell, prepared, fit.free) if part.label == "position")
         by_load = load_motions(cell, block)
         by_mean = load_motions(cell, replace(block, load=np.tile(loads.mean(axis=0), (len(block), 1))))
@@ -75,7 +75,7 @@ def unlearnt_share(fit: GeometricFit, measured: Sequence[PoseMeasurements]) -> f
         columns *= np.tile(usual[elements], 3)[:, None, None]
         in_station = np.einsum("ij,kjm->kim", cell.stations[prepared.station][:3, :3], columns)[:, :, part.index]
         stacked = np.concatenate([part.jacobian, in_station, part.value[None]])
-        rows.append(stacked.reshape(len(stacked), -1) / max(fit.used_sigmas()[number]["position"], MIN_NOISE))
+        rows.append(stacked.reshape(len(stacked), -1) / max(sigmas["position"], MIN_NOISE))
         motions.append(in_station[: len(elements)].reshape(len(elements), -1))
     matrix = project_out(np.concatenate(rows, axis=1), np.arange(len(fit.free)))[len(fit.free) :]
     columns, residual = matrix[:-1], matrix[-1]
@@ -83,8 +83,8 @@ def unlearnt_share(fit: GeometricFit, measured: Sequence[PoseMeasurements]) -> f
     mean = covariance @ (columns @ residual)
     moments = (covariance + np.outer(mean, mean))[: len(elements), : len(elements)]
     effect = np.concatenate(motions, axis=1)
-    share = np.sum((moments @ effect) * effect) / max(float(np.sum(effect**2)), 1e-300)
-    return float(min(np.sqrt(share), 1.0))
+    square_share = np.sum((moments @ effect) * effect) / max(float(np.sum(effect**2)), 1e-300)
+    return float(min(np.sqrt(square_share), 1.0))
 
 
 def load_variance(

@@ -267,7 +267,7 @@ class _Bench:
     validation: CrossValidation
     terms: Sequence[DriveTerm]
     forced: bool
-    min_gain: float = MIN_GAIN
+    min_gain: float
 
     def term(self, column: int) -> DriveTerm:
         """Return the drive term of a column."""

@@ -135,7 +135,7 @@ class GearTravel:
 
     Attributes:
         q, v: (N, n) positions [rad or m] and velocities [per s].
-        block: (N,) time block of each sample.
+        block: (N,) number of the block of each sample: a part of the motion with all its repetitions.
         moving: joints, from 0, that move enough.
     """
 
@@ -146,7 +146,7 @@ class GearTravel:
 
     @cached_property
     def blocks(self) -> tuple[int, np.ndarray]:
-        """Number of time blocks, and the index (N,) of each sample's block among them."""
+        """Number of blocks, and the index (N,) of each sample's block among them."""
         numbers, index = np.unique(self.block, return_inverse=True)
         return len(numbers), index
 
@@ -329,7 +329,8 @@ class _WaveCrossValidation:
     def __init__(self, track: GearTravel, residual: np.ndarray) -> None:
         self._track = track
         self.residual = residual
-        self._blocks = [np.flatnonzero(track.block == number) for number in np.unique(track.block)]
+        count, block = track.blocks
+        self._blocks = [np.flatnonzero(block == number) for number in range(count)]
         self._columns: dict[tuple[Wave, tuple[float, ...]], np.ndarray] = {}
 
     def columns(self, waves: Sequence[Wave], nodes: tuple[float, ...]) -> np.ndarray:
@@ -353,8 +354,9 @@ class _WaveCrossValidation:
         """
         matrix = self.columns(waves, nodes)
         residual = self.residual
-        squares = np.array([matrix[block].T @ matrix[block] for block in self._blocks])
-        crosses = np.array([matrix[block].T @ residual[block] for block in self._blocks])
+        parts = [matrix[block] for block in self._blocks]
+        squares = np.array([part.T @ part for part in parts])
+        crosses = np.array([part.T @ residual[block] for part, block in zip(parts, self._blocks)])
         square = np.sum(squares, axis=0)
         cross = np.sum(crosses, axis=0)
         unit = float(np.trace(square)) / len(square)

@@ -147,10 +147,10 @@ def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
 
 
 def _at_control_rate(series: np.ndarray, periods: float) -> np.ndarray:
-    """Return samples (N, k) of a series interpolated at the control instants (M, k).
+    """Return the values (M, k) of a sampled series at the M control instants, interpolated by splines.
 
     Args:
-        series: the samples.
+        series: (N, k) samples.
         periods: control periods per sample; with 1, the samples are the values at the instants.
     """
     if periods == 1:

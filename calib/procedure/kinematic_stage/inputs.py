@@ -99,7 +99,7 @@ class Inputs:
         held_out = [rows.block for rows in self.unseen.values() if rows.held_out]
         if not held_out:
             return self.fit
-        return tuple(map(reunited, self.fit, held_out))
+        return tuple(reunited(block, remainder) for block, remainder in zip(self.fit, held_out, strict=True))
 
     def driven_by(self, source: str) -> "Inputs":
         """Return the inputs whose compliance is driven by measured or by modelled torques.

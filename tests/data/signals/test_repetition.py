@@ -23,7 +23,7 @@ class Path:
 
     def standstill(self) -> np.ndarray:
         speed = np.abs(np.gradient(self.q, axis=0))
-        return (speed < 0.01 * speed.max(axis=0)).all(axis=1)
+        return (speed <= 0.01 * speed.max(axis=0)).all(axis=1)
 
 
 def periods(seconds: float, seed: int = 0, period: float = PERIOD, rate: float = RATE, noise: float = 1e-5) -> Path:
@@ -89,6 +89,63 @@ def test_recording_of_the_same_motion_is_a_repetition() -> None:
     assert result.fresh[1][:repeated].mean() < 0.01
     assert result.fresh[1][repeated + 5 :].all()
     assert np.abs(result.course_index[1][:1000:2] - result.course_index[0][round(3.3 * RATE) :][:1000:2]).max() <= 1
+
+
+def test_rates_that_differ_by_rounding_are_alike() -> None:
+    """Rates are estimated from time stamps: those of one controller differ in the fifth digit."""
+    first = periods(2 * PERIOD)
+    second = Path(first.q, RATE * (1.0 + 1e-5))
+    assert new_share([first, second]) == pytest.approx(0.25, rel=0.02)
+
+
+def test_long_recording_is_searched_for_short_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fewer samples are read of long recordings, and then of those beside them, too."""
+    monkeypatch.setattr("calib.data.signals.repetition.MAX_SAMPLES", 800)
+    motion = periods(24.0, period=30.0)
+    assert course([motion, Path(motion.q[1000:2200])]).fresh[1].mean() < 0.02
+
+
+def test_rests_in_two_postures_are_new() -> None:
+    """Recordings in which no joint moves repeat nothing, though every lag explains them."""
+    assert not course([Path(np.zeros((100, 3))), Path(np.ones((100, 3)))]).repeats
+
+
+def test_blocks_of_recordings_that_repeat_one() -> None:
+    """However often a motion was recorded, it is divided."""
+    blocks = course([periods(2 * PERIOD) for _ in range(8)]).blocks(6)
+    assert [set(block) for block in blocks] == [set(range(6))] * 8
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_ways_to_the_start_do_not_hide_a_repetition(seed: int) -> None:
+    """Recordings of a motion that begin at other postures repeat it but for the way to its start."""
+    random = np.random.default_rng(seed)
+    motion = periods(10.0, seed, period=23.0).q
+    rise = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, 300))[:, None]
+    postures = random.normal(size=(3, 3))
+    logs = [Path(np.concatenate([posture + (motion[0] - posture) * rise, motion])) for posture in postures]
+    result = course(logs)
+    for fresh in result.fresh[1:]:
+        assert fresh[:200].mean() > 0.9
+        assert fresh[320:].mean() < 0.01
+    blocks = result.blocks(6)
+    assert set(blocks[1][320:]) <= set(blocks[0])
+
+
+def test_a_few_new_samples_are_no_block() -> None:
+    """A disturbance of a tenth of a second in a repetition belongs to a block of other motion."""
+    motion = periods(2 * PERIOD).q
+    logs = [Path(motion)]
+    for begin in (300, 500, 700):
+        disturbed = motion.copy()
+        disturbed[begin : begin + 20] += 1.0
+        logs.append(Path(disturbed))
+    result = course(logs)
+    # of lags by whole periods, that of the whole recording is taken, though the disturbance is in its overlap
+    assert [int(fresh.sum()) for fresh in result.fresh] == pytest.approx([800, 20, 20, 20], abs=4)
+    sizes = np.bincount(np.concatenate(result.blocks(6)))
+    assert len(sizes) == 6
+    assert sizes.min() > 0.8 * sizes.mean()
 
 
 def test_blocks_hold_all_repetitions() -> None:
