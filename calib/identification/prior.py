@@ -177,11 +177,14 @@ class _Sizes:
     upper: np.ndarray
 
     def fixing(self, fixed: Mapping[str, float]) -> "_Sizes":
-        """Return these sizes, those of the given names with bounds that leave the given value alone."""
+        """Return these sizes, those of the given names with bounds that leave the given value alone.
+
+        Names of other models' sizes are passed over: `EarlierChoice.check_sizes` refuses them.
+        """
         lower, upper = np.array(self.lower), np.array(self.upper)
-        for name, size in fixed.items():
+        for name in set(fixed).intersection(self.names):
             index = self.names.index(name)
-            lower[index] = upper[index] = np.log(size)
+            lower[index] = upper[index] = np.log(fixed[name])
         return replace(self, lower=lower, upper=upper)
 
     def deviations(self, t: np.ndarray) -> np.ndarray:

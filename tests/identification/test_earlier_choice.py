@@ -74,8 +74,10 @@ def test_friction_that_is_clearly_missing_is_added(first, both):
     assert "earlier-friction-extended" in codes(found)
 
 
-def test_prior_of_other_parameters_is_refused(first, both):
+@pytest.mark.parametrize("sizes", [{"whole": 1.0}, {"motors of others [kg]": 1.0}])
+def test_prior_of_other_parameters_is_refused(first, both, sizes):
+    """Fewer sizes than those of these parameters, or sizes that these parameters do not have."""
     choice = after(first)
-    other = replace(choice, choice=replace(choice.choice, sizes={"whole": 1.0}))
+    other = replace(choice, choice=replace(choice.choice, sizes={**sizes}))
     with pytest.raises(UsageError, match="other drive terms, torque rows or payloads"):
         identify(planted.arm(), both, replace(SETTINGS, earlier=other))
