@@ -42,6 +42,14 @@ class ModelChoice:
     sizes: Mapping[str, float]
     tempering: float
 
+    @property
+    def is_valid(self) -> bool:
+        """Whether each term has a group and a ridge, and all sizes are positive; without a prior, ridges are NaN."""
+        sizes = (self.tempering, *self.sizes.values())
+        positive = all(math.isfinite(size) and size > 0.0 for size in sizes)
+        counted = len(self.groups) == len(self.ridges) == len(self.terms)
+        return positive and counted and not any(ridge <= 0.0 for ridge in self.ridges)
+
 
 @dataclass(frozen=True)
 class EarlierChoice:
@@ -53,12 +61,14 @@ class EarlierChoice:
         choice: groups and ridges of these terms, and the prior.
         contradiction: logarithm of the evidence of other sizes over that of the earlier ones, where these were left; 0
             where they are kept.
+        seen: names of the validation recordings from which this choice was made.
     """
 
     source: str
     terms: tuple[DriveTerm, ...]
     choice: ModelChoice
     contradiction: float = 0.0
+    seen: tuple[str, ...] = ()
 
     @property
     def ridges(self) -> dict[str, float]:

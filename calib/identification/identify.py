@@ -399,6 +399,7 @@ def _observed(
     rows_as_moving = rows
     if isinstance(method, LeastSquares) and isinstance(model, IdentificationModel):
         width = np.array(per_joint(settings.v0, cases[0].motion.n, "v0"))
+        rows_as_moving = with_standstills(rows, cases, decimator, model, base.kept, width, marks=False)
         rows = with_standstills(rows, cases, decimator, model, base.kept, width)
     count = sum(int(part.present.sum()) for part in rows)
     message = (

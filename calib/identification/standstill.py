@@ -88,8 +88,12 @@ def with_standstills(
     model: RegressorModel,
     columns: np.ndarray,
     v0: np.ndarray,
+    marks: bool = True,
 ) -> list[ObservationRows]:
     """Return the rows with their standstills marked, and with the columns of Coulomb friction zero in standstills.
+
+    Standstills of joints that hardly move are not marked, but their columns are zero, too: the velocity's sign is that
+    of the encoder's noise.
 
     Args:
         all_rows: rows of all recordings.
@@ -98,6 +102,7 @@ def with_standstills(
         model: the model.
         columns: indices of the model's columns in the rows.
         v0: (n,) width of Coulomb's sign [rad/s or m/s].
+        marks: False leaves rows of joints that move as they are.
     """
     rows, n = all_rows[0].target.shape[1], cases[0].motion.n
     held = _held_rows(model, n, rows)
@@ -116,13 +121,17 @@ def with_standstills(
     counts = [(part.present & ~mask).sum(axis=0) for part, mask in zip(all_rows, masks)]
     moving = np.sum(counts, axis=0)
     result = []
+    moves = moving >= MIN_MOVING
     for part, case, mask in zip(all_rows, cases, masks):
-        segment = case.motion.segment[kept(case.motion.segment, decimator)]
-        share = _shares(mask & (moving >= MIN_MOVING), segment)
+        undecided = mask if marks else mask & ~moves
         matrix = part.matrix
-        if share.any():
-            undecided = (share > 0.0)[:, :, None] & coulomb
-            matrix = np.where(undecided, 0.0, matrix)
+        if undecided.any():
+            matrix = np.where(undecided[:, :, None] & coulomb, 0.0, matrix)
+        if not marks:
+            result.append(replace(part, matrix=matrix))
+            continue
+        segment = case.motion.segment[kept(case.motion.segment, decimator)]
+        share = _shares(mask & moves, segment)
         swing = _swings(share > 0.0, part.target, segment)
         result.append(
             replace(part, matrix=matrix, standing=frozen(share), swing=frozen(swing), coulomb=frozen(coulomb, bool))

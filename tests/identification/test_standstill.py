@@ -57,11 +57,11 @@ def stop_and_go(seed: int, pauses=PAUSES, noise: float = 0.2) -> Case:
     return make_case(f"log{seed}", replace(motion, effort=effort))
 
 
-def rows_of(case: Case, settings: IdentificationSettings = PLAIN) -> list[ObservationRows]:
+def rows_of(case: Case, settings: IdentificationSettings = PLAIN, marks: bool = True) -> list[ObservationRows]:
     model, decimator = make_model(planted.arm(), settings), common_decimator([case], settings)
     base = find_base(model, [case], chain_states(planted.arm(), model))
     plain = with_blocks([observe(model, base.kept, case, decimator)], 6)
-    return with_standstills(plain, [case], decimator, model, base.kept, WIDTH)
+    return with_standstills(plain, [case], decimator, model, base.kept, WIDTH, marks=marks)
 
 
 def wrong_friction(found: Identification) -> float:
@@ -185,6 +185,19 @@ def test_joint_that_never_moves_keeps_rows():
     still = replace(case, motion=replace(motion, q=motion.q * moves, v=motion.v * moves, a=motion.a * moves))
     standing = rows_of(still)[0].standing
     assert not standing[:, 1].any() and standing[:, [0, 2]].any(axis=0).all()
+
+
+@pytest.mark.parametrize("marks", [True, False])
+def test_noise_of_a_joint_that_never_moves_tells_no_friction(marks):
+    """The sign of its velocity is that of noise: its column of Coulomb friction is zero, and its rows stay."""
+    case = stop_and_go(0)
+    motion = case.motion
+    v = motion.v.copy()
+    v[:, 1] = 1e-3 * np.random.default_rng(0).normal(size=len(v))
+    part = rows_of(replace(case, motion=replace(motion, v=v)), marks=marks)[0]
+    name = list(part.names).index
+    assert not part.matrix[:, 1, name("Fc2")].any() and not part.standing[:, 1].any()
+    assert part.matrix[:, 0, name("Fc1")].any()
 
 
 @pytest.mark.slow

@@ -11,9 +11,9 @@ import numpy as np
 
 from calib import files, folders
 from calib.data.csv_table import read_table
-from calib.data.signals.fingerprint import Fingerprint, Fingerprints
+from calib.data.signals.fingerprint import Fingerprint, Fingerprints, common_share
 from calib.dynamics.base import expressions
-from calib.errors import UsageError, refuse_option, refused_as
+from calib.errors import UsageError, refuse_option, refused_as, require
 from calib.identification.checks.joint_compliance import JointCompliance, encoder_difference
 from calib.identification.earlier import EarlierChoice
 from calib.identification.gains import GainRecord
@@ -173,6 +173,12 @@ class IdentificationFolder:
         choice = self.metrics().choice
         if choice is None:
             raise UsageError(f"{self.path} is of an earlier version and does not state its choice; identify again")
+        require(
+            choice.is_valid,
+            f"{self.numbers}: sizes, ridges and tempering of its choice are not positive numbers, or not one ridge and "
+            "group per term; identify again",
+            UsageError,
+        )
         term_of = {term.name: term for term in self.dynamics().model.columns}
         with refused_as(
             UsageError, KeyError, f"{self.path}: metrics.json and dynamics.json do not agree ({{}}); identify again"
@@ -208,15 +214,34 @@ def continuing(inputs: IdentificationInputs, earlier: Path) -> IdentificationInp
     settings = inputs.options.settings
     if not method_named(settings.method).takes_prior:
         raise UsageError(f"after: method '{settings.method}' has no prior that could be carried on; use wls")
+    if settings.prior == "none":
+        raise UsageError(f"after: prior = 'none' leaves nothing of the prior of {earlier}; leave one of them out")
     if settings.friction != "auto":
         raise UsageError(
             f"after: {earlier} states the friction, and so does friction = '{settings.friction}'; leave one of them out"
         )
     if inputs.unit != TORQUE:
         refuse_option("after", f"torques are {without_gains(inputs.unit)}; state gains = [...] (N m/A)")
-    choice = IdentificationFolder(earlier).choice(inputs.chain)
+    folder = IdentificationFolder(earlier)
+    seen = _identified_before(inputs.unseen, folder.identified_from())
+    choice = replace(folder.choice(inputs.chain), seen=seen)
     options = replace(inputs.options, settings=replace(settings, earlier=choice))
     return replace(inputs, options=options)
+
+
+def _identified_before(cases: Sequence[Case], recordings: Sequence[Fingerprint]) -> tuple[str, ...]:
+    """Return the names of the recordings whose samples are among those that a model was identified from.
+
+    Args:
+        cases: recordings, recognised under any name.
+        recordings: fingerprints of those that the model was identified from.
+    """
+    known = []
+    for case in cases:
+        hashes = case.motion.hashes
+        if hashes is not None and any(common_share(hashes, recording.hashes) for recording in recordings):
+            known.append(case.name)
+    return tuple(known)
 
 
 def _number_of_table(path: Path) -> int:

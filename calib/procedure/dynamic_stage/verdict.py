@@ -283,7 +283,7 @@ def model_findings(cases: Sequence[Case], identification: Identification) -> tup
 
 
 def _left_earlier(identification: Identification[RegressorModel]) -> list[Finding]:
-    """Return findings on what the recordings contradict in the choice of an earlier identification."""
+    """Return findings on what contradicts the choice of an earlier identification, and on what it has seen."""
     earlier = identification.settings.earlier
     if earlier is None:
         return []
@@ -294,6 +294,8 @@ def _left_earlier(identification: Identification[RegressorModel]) -> list[Findin
     names = [term.name for term in identification.friction.terms if term.name not in earlier.ridges]
     if names:
         findings.append(finding("earlier-friction-extended", source=earlier.source, names=names))
+    if earlier.seen:
+        findings.append(finding("earlier-recording-validates", source=earlier.source, files=list(earlier.seen)))
     return findings
 
 

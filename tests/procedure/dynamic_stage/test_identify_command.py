@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -276,7 +277,30 @@ def test_earlier_identification_is_carried_on(robot, tmp_path, capsys):
         capsys.readouterr()
         assert run(robot, f"{second}@0:6", *refused, *options) == 2
         assert message in capsys.readouterr().err
+    (tmp_path / "identify.toml").write_text('prior = "none"\n')
+    assert run(robot, f"{second}@0:6", *refused, "--options", tmp_path / "identify.toml") == 2
+    assert "prior = 'none' leaves nothing of the prior" in capsys.readouterr().err
     metrics = json.loads((earlier / "metrics.json").read_text())
-    (earlier / "metrics.json").write_text(json.dumps(metrics | {"choice": None}))
-    assert run(robot, f"{second}@0:6", *refused) == 2
-    assert "does not state its choice; identify again" in capsys.readouterr().err
+    damaged = {name: -size for name, size in choice["sizes"].items()}
+    for stated, message in (
+        (None, "does not state its choice; identify again"),
+        (choice | {"sizes": damaged}, "are not positive numbers"),
+        (choice | {"tempering": 0.0}, "are not positive numbers"),
+        (choice | {"ridges": [*choice["ridges"], 1.0]}, "not one ridge and group per term"),
+    ):
+        (earlier / "metrics.json").write_text(json.dumps(metrics | {"choice": stated}))
+        assert run(robot, f"{second}@0:6", *refused) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_validation_on_the_earlier_recording_is_named(robot, tmp_path):
+    """The friction terms that are carried on were chosen from it: under any name it is not wholly unseen."""
+    first, second = planted.write(tmp_path, "first.npz", 0), planted.write(tmp_path, "second.npz", 1)
+    copy = shutil.copy(first, tmp_path / "copy.npz")
+    earlier = tmp_path / "earlier"
+    assert run(robot, f"{first}@0:6", "--out", earlier) == 0
+    for validated, named in ((copy, True), (planted.write(tmp_path, "third.npz", 2), False)):
+        out = tmp_path / f"later_{named}"
+        run(robot, f"{second}@0:6", "--after", earlier, "--validate", validated, "--out", out)
+        codes = [noticed["code"] for noticed in json.loads((out / "metrics.json").read_text())["noticed"]]
+        assert ("earlier-recording-validates" in codes) == named
