@@ -33,7 +33,7 @@ from calib.robot.chain import Chain
 def with_link_motion(robot: CalibratedChain, case: Case, settings: IdentificationSettings) -> Case:
     """Return a case with the motion of its links (`Case.link`) according to the robot's joint corrections.
 
-    Without joint corrections, or if the settings ignore them, or for rows without bodies, the case is returned unchanged.
+    Without joint corrections, for rows without bodies, or if the settings ignore them, the case is returned as it is.
 
     Args:
         robot: the calibrated robot, with or without joint corrections.
