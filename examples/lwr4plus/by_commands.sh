@@ -21,11 +21,11 @@ python examples/practice.py log other_loaded.csv lwr4plus other both load
 sed 's/^rows = .*/rows = "link"/' two_loads.toml > link.toml
 sed 's/^rows = .*/rows = "drive"/' two_loads.toml > drive.toml
 calib identify fit B.csv B_loaded.csv --options link.toml --validate other.csv --validate other_loaded.csv --no-plots --out link
-calib identify fit B.csv B_loaded.csv --options drive.toml --validate other.csv --no-plots --out drive
+calib identify fit B.csv B_loaded.csv --options drive.toml --validate other.csv --validate other_loaded.csv --no-plots --out drive
 calib identify fit B.csv B_loaded.csv --options two_loads.toml --validate other.csv --validate other_loaded.csv --no-plots --out both
 grep ^M8, both/estimate.csv | cut -d, -f1,3-5
 cat two_loads.toml loop.toml > iv.toml
-calib identify fit B.csv@0:27 B_loaded.csv@0:27 --options iv.toml --method iv --excitation B --validate other.csv --no-plots --out iv
+calib identify fit B.csv@0:27 B_loaded.csv@0:27 --options iv.toml --method iv --excitation B --validate other.csv --validate other_loaded.csv --no-plots --out iv
 calib plan fit --model both --waypoints waypoints.csv --no-plots --out plan
 calib export both --into calibrated
 printf 'rows = "both"\nfriction = "standard"\n' > short.toml
