@@ -33,7 +33,7 @@ from calib.robot.chain import Chain
 def with_link_motion(robot: CalibratedChain, case: Case, settings: IdentificationSettings) -> Case:
     """Return a case with the motion of its links (`Case.link`) according to the robot's joint corrections.
 
-    Without joint corrections, or if the settings ignore them, the case is returned unchanged.
+    Without joint corrections, for rows without bodies, or if the settings ignore them, the case is returned as it is.
 
     Args:
         robot: the calibrated robot, with or without joint corrections.
@@ -41,7 +41,8 @@ def with_link_motion(robot: CalibratedChain, case: Case, settings: Identificatio
         settings: settings, which may ignore corrections (`deflections`).
     """
     simulated = settings.loop is not None or method_named(settings.method).needs_simulation
-    rigid = simulated or not settings.deflections or settings.torque_rows == POWER
+    rows = settings.torque_rows
+    rigid = simulated or not settings.deflections or rows == POWER or not rows.has_bodies
     chain = robot.complete
     terms = joint_terms(robot.complete, robot.deflection)
     if rigid or not terms.terms or len(chain.driven) != chain.n:

@@ -24,6 +24,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,9 @@ from calib.estimation.triangles import collect, combine
 from calib.estimation.whiteness import examine
 from calib.identification.closed_loop.controllers import identify_controller, pd
 from calib.identification.closed_loop.instrumental import Instrumental, identify_instrumental
+from calib.identification.closed_loop.instrumental_variables import projected
 from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
+from calib.identification.methods.constraint_settings import Held
 from calib.identification.methods.parameter_constraints import hold, make_constraints
 from calib.identification.rows import ObservationRows
 from calib.simulation import known_robots
@@ -248,13 +251,12 @@ def with_measured(log: Log, values: np.ndarray) -> Prediction:
     return Prediction(log.rows.target, log.rows.matrix @ values)
 
 
-def with_simulated(study: Study, log: Log, values: np.ndarray, controller: LoopController) -> Prediction:
-    """Return decimated torque and prediction Z x, Z from a noise-free simulation with x itself."""
+def simulated_rows(study: Study, log: Log, values: np.ndarray, controller: LoopController) -> ObservationRows:
+    """Return the decimated rows of a log with the regressor Z of a noise-free simulation with the parameters x."""
     plant = Plant(study.model.bodies, study.model.terms, study.base.to_standard(values))
     run = simulate(plant, controller, log.reference, Sensing(every=EVERY))
     case = simulated_case(log.case, run, Loop(controller, log.reference, EVERY))
-    rows = observe(study.model, study.base.kept, case, log.case.motion.decimator)
-    return Prediction(rows.target, rows.matrix @ values)
+    return observe(study.model, study.base.kept, case, log.case.motion.decimator)
 
 
 def torque_error(study: Study, reference: Reference, values: np.ndarray) -> list[float]:
@@ -264,7 +266,12 @@ def torque_error(study: Study, reference: Reference, values: np.ndarray) -> list
 
 
 def judge(
-    study: Study, training: Log, validation: list[Log], results: dict[str, Instrumental], controller: LoopController
+    study: Study,
+    training: Log,
+    validation: list[Log],
+    results: dict[str, Instrumental],
+    controller: LoopController,
+    figure: Path | None = None,
 ) -> Metrics:
     """Return the errors of least squares and of instrumental methods (direct and cross), and the test results.
 
@@ -274,28 +281,40 @@ def judge(
         validation: logs of other motions.
         results: name of an instrumental method to its result.
         controller: the controller that the methods assume.
+        figure: picture of the residuals of LS and IV to write; None: none.
     """
     first = next(iter(results.values()))
     values = {"LS": first.ordinary.estimate.values, "PC-LS": constrained(study, first).estimate.values}
     for name, result in results.items():
         values[name] = result.fit.estimate.values
 
-    def prediction(name: str, log: Log) -> Prediction:
-        if name.endswith("LS"):
-            return with_measured(log, values[name])
-        return with_simulated(study, log, values[name], controller)
+    logs = [training, *validation]
 
-    def cross_error(name: str, log: Log) -> float | None:
+    @cache
+    def simulated(name: str, number: int) -> ObservationRows:
+        return simulated_rows(study, logs[number], values[name], controller)
+
+    def prediction(name: str, number: int) -> Prediction:
+        if name.endswith("LS"):
+            return with_measured(logs[number], values[name])
+        # constraints change IV's robot too little for a simulation of its own
+        rows = simulated(name.removeprefix("PC-"), number)
+        return Prediction(rows.target, rows.matrix @ values[name])
+
+    def cross_error(name: str, number: int) -> float | None:
         try:
-            return prediction(name, log).error
+            return prediction(name, number).error
         except calib.CalibError:
             # A poor estimate need not be physically consistent along every motion.
             return None
 
     metrics: Metrics = {"direct": {}, "cross": {}, "torque_error": {}}
+    direct = {name: prediction(name, 0) for name in values}
+    if figure is not None:
+        draw({name: direct[name].residual for name in ("LS", "IV")}, figure)
     for name in values:
-        metrics["direct"][name] = prediction(name, training).joint_errors
-        metrics["cross"][name] = [cross_error(name, log) for log in validation]
+        metrics["direct"][name] = direct[name].joint_errors
+        metrics["cross"][name] = [cross_error(name, number) for number in range(1, len(logs))]
         metrics["torque_error"][name] = torque_error(study, validation[0].reference, values[name])
     return metrics | {
         "estimated": len(first.names),
@@ -307,13 +326,29 @@ def judge(
 
 def constrained(study: Study, result: Instrumental) -> LinearFit:
     """Return the least-squares estimate of the same rows with the sign constraints of PC-IV (PC-IDIM-LS)."""
-    data = result.problem.least_squares()
     std = result.ordinary.group_std
+    factor = combine(result.problem.least_squares(), std)
+    fit, _ = under_signs(study, result, result.ordinary, factor, std, stated_noise=True)
+    return fit
+
+
+def under_signs(
+    study: Study, result: Instrumental, fit: LinearFit, factor: np.ndarray, std: np.ndarray, stated_noise: bool = False
+) -> tuple[LinearFit, Held]:
+    """Return a fit of a result's rows under the sign constraints, and the constraints that bind.
+
+    Args:
+        study: model and base parameters.
+        result: an instrumental estimate, with the rows.
+        fit: the estimate without constraints.
+        factor: (p + 1, p + 1) R factor of its criterion.
+        std: (n,) standard deviations of the joints' torques [N m].
+        stated_noise: whether they are the noise that the covariance follows from.
+    """
     bounds = dict.fromkeys(positive_names(result.names), (0.0, np.inf))
     settings = ConstraintSettings(signs=False, inertia=0, bounds=bounds)
     constraints = make_constraints(settings, study.model, study.base, result.names, [None] * study.base.b)
-    fit, _ = hold(result.ordinary, combine(data, std), data, std, constraints, stated_noise=True)
-    return fit
+    return hold(fit, factor, result.problem.least_squares(), std, constraints, stated_noise=stated_noise)
 
 
 def finite_rounds(result: Instrumental) -> list[dict[str, Any]]:
@@ -339,22 +374,39 @@ def verdict(result: Instrumental) -> Metrics:
     }
 
 
+def estimates(study: Study, log: Log, controller: LoopController, methods: Sequence[str]) -> dict[str, Instrumental]:
+    """Return the estimates of instrumental methods from a log, with an assumed controller.
+
+    PC-IV is IV's last round under the constraints: further rounds would change no error by more than 0.01 %.
+
+    Args:
+        study: robot and model.
+        log: the log.
+        controller: the assumed controller.
+        methods: some of `METHODS`, IV among them.
+    """
+    results = {method: estimate(study, log, controller, method) for method in methods if method != "PC-IV"}
+    if "PC-IV" in methods:
+        free = results["IV"]
+        fit, bound = under_signs(study, free, free.fit, projected(free.problem, free.std), free.std)
+        results["PC-IV"] = replace(free, fit=fit, constrained=bound)
+    # in the order asked for
+    return {method: results[method] for method in methods}
+
+
 def estimate(study: Study, log: Log, controller: LoopController, method: str) -> Instrumental:
-    """Return the estimate of IV, PC-IV or DIDIM from a log, with an assumed controller.
+    """Return the estimate of IV or DIDIM from a log, with an assumed controller.
 
     The regular robot they start from has the motors' inertia, as on a data sheet.
     """
-    recording = (log.case, Loop(controller, log.reference, EVERY))
-    positive = positive_names(study.base.names) if method == "PC-IV" else ()
     return identify_instrumental(
         study.model,
         study.base,
-        [recording],
+        [(log.case, Loop(controller, log.reference, EVERY))],
         log.case.motion.decimator,
-        method="didim" if method == "DIDIM" else "iv",
+        method=method.lower(),
         limit=MAX_ROUNDS,
         inertia=np.array(known_robots.truth("tx40")["drives"]["Ia"]),
-        positive=positive,
     )
 
 
@@ -393,7 +445,7 @@ def run_controllers(study: Study, log: Log, validation: list[Log], names: Contai
         if name not in names:
             continue
         try:
-            results = {method: estimate(study, log, controller, method) for method in ("IV", "PC-IV")}
+            results = estimates(study, log, controller, METHODS[:2])
         except NotConverged as error:
             # A wrong controller need not hold the robot.
             metrics[name] = {"failed": str(error)}
@@ -433,9 +485,9 @@ def run(
         log, *validation = logs
         if kind == "clean":
             metrics["essential"] = essential_count(study, log)
-        results = {name: estimate(study, log, study.controller, name) for name in methods}
-        metrics[kind] = judge(study, log, validation, results, study.controller)
-        draw(study, log, results["IV"], out / f"residuals_{kind.replace(' ', '_')}.png")
+        results = estimates(study, log, study.controller, methods)
+        figure = out / f"residuals_{kind.replace(' ', '_')}.png"
+        metrics[kind] = judge(study, log, validation, results, study.controller, figure)
         if kind == "degraded":
             metrics["wrong controllers"] = run_controllers(study, log, validation, tried)
     metrics["parameters"]["essential"] = metrics["essential"]["F"]
@@ -486,13 +538,15 @@ def show_errors(title: str, metrics: Metrics, slides: Metrics) -> None:
             print(line)
 
 
-def draw(study: Study, log: Log, result: Instrumental, path: Path) -> None:
-    """Draw autocorrelation, partial autocorrelation and histogram of residuals, joint by joint, as the slides do."""
+def draw(series: dict[str, np.ndarray], path: Path) -> None:
+    """Draw autocorrelation, partial autocorrelation and histogram of residuals, joint by joint, as the slides do.
+
+    Args:
+        series: name of a method to its residuals (N, n) [N m].
+        path: picture to write.
+    """
     import matplotlib.pyplot as plt
 
-    least_squares = with_measured(log, result.ordinary.estimate.values)
-    instrumental = with_simulated(study, log, result.fit.estimate.values, study.controller)
-    series = {"LS": least_squares.residual, "IV": instrumental.residual}
     x = np.linspace(-4.0, 4.0, 100)
     normal_density = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
     figure, axes = plt.subplots(3, 6, figsize=(15, 7))

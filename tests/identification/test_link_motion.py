@@ -83,6 +83,8 @@ def test_link_moves_as_motor_and_deflection():
     np.testing.assert_allclose(a[5:-5], np.gradient(v, 1 / rate, axis=0)[5:-5], atol=1e-7)
     assert with_link_motion(robot(), soft(1), replace(SETTINGS, deflections=False)).link is None
     assert with_link_motion(robot().without_corrections(), soft(1), SETTINGS).link is None
+    # rows without bodies, whose torques bend nothing
+    assert with_link_motion(robot(), soft(1), replace(SETTINGS, torque_rows=DRIVE)).link is None
 
 
 def test_deflection_improves_prediction():

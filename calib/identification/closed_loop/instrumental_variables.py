@@ -307,7 +307,7 @@ def by_free_instruments(
     Ω = diag(std²), and Z_U are the instruments of the directions in the null space of A. Janot's slides on the TX40
     give the criterion ½ ‖P_Z (y - W x)‖² (`projected`), in which all instruments count, but for bounds x_C = d the
     relation x_U = x_U^IV + (Z_UᵀW_U)⁻¹ Z_UᵀW_C (x_C^IV - d), which is the one computed here. Both are consistent if the
-    constraint is true. On a simulated TX40 they differ by at most 0.011 σ (`examples/tx40`), in simulated problems with
+    constraint is true. On a simulated TX40 they differ by at most 0.007 σ (`examples/tx40`), in simulated problems with
     weak instruments by 0.24 σ, and by 2.4 σ if the bound is wrong by 6 σ: there the estimate by free instruments has
     the smaller error (`tests/identification/closed_loop/test_instruments.py`).
 
