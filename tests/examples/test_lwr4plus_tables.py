@@ -1,7 +1,7 @@
 """The tables of the LWR4+ study's README are those that its scripts make, within stated bounds.
 
 Searches by processor time, the many seeds of the designs and the 500 calibrations are not run again: of the designs
-that of one seed, which has to lie in the range that README gives for three.
+the kept one, of one seed, is judged, which has to lie in the range that README gives for three.
 """
 
 import json
