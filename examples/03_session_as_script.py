@@ -10,7 +10,7 @@ import calib
 practice.enter(__file__)
 
 # little effort for the motions, to be quick: the defaults search longer
-quick_search = {"period": 10.0, "starts": 2, "evaluations": 150, "repeats": 2}
+quick_search = {"period": 6.0, "starts": 1, "evaluations": 100, "repeats": 2}
 session = calib.new_session("cell7", "lwr4plus", "cmm", poses=40, validation=20, torques="both", **quick_search)
 
 outcome = next(calib.run_sessions(session))

@@ -551,23 +551,43 @@ def power_block(
     if not isinstance(model, _HasEnergy):
         raise UsageError("rows = 'power' is not supported by this model, which has no energies: use rows = 'motor'")
     motion = case.motion
-    start = max(segment.start, part.start - DIFFERENCE_REACH)
-    stop = min(segment.stop, part.stop + DIFFERENCE_REACH)
-    q = motion.q[start:stop]
-    v = motion.v[start:stop]
-    all_energies = model.energy_columns(q, v, case.carried)
-    energies = all_energies[:, columns]
-    power = slope(energies, motion.rate)
-    plain_power = np.zeros_like(energies)
-    if len(energies) > 1:
-        plain_power = np.gradient(energies, 1.0 / motion.rate, axis=0)
-    power = np.where(np.isfinite(power), power, plain_power)
-    power = power[part.start - start :][: part.stop - part.start].T
-
+    span = power_span(part, segment)
+    all_energies = model.energy_columns(motion.q[span], motion.v[span], case.carried)
     q = motion.q[part]
     v = motion.v[part]
     no_acceleration = np.zeros_like(v)
     regressor = model.regressor(q, v, no_acceleration, None, case.carried, states[:, part])
+    before = part.start - span.start
+    return power_entries(model, columns, all_energies, regressor, before, motion.rate)
+
+
+def power_span(part: slice, segment: slice) -> slice:
+    """Return the samples that the differences of a part reach, within its gap-free segment."""
+    start = max(segment.start, part.start - DIFFERENCE_REACH)
+    stop = min(segment.stop, part.stop + DIFFERENCE_REACH)
+    return slice(start, stop)
+
+
+def power_entries(
+    model: RegressorModel, columns: np.ndarray, energies: np.ndarray, regressor: np.ndarray, before: int, rate: float
+) -> np.ndarray:
+    """Return entries (k, N) of the power regressor of a part, as `power_block`.
+
+    Args:
+        model: the model.
+        columns: (k,) indices of the columns.
+        energies: (M, p) energies h at the samples of `power_span`.
+        regressor: (N, 1, p) power vᵀ W at the samples of the part.
+        before: samples of the span before the part.
+        rate: sampling rate [Hz].
+    """
+    chosen = energies[:, columns]
+    power = slope(chosen, rate)
+    plain_power = np.zeros_like(chosen)
+    if len(chosen) > 1:
+        plain_power = np.gradient(chosen, 1.0 / rate, axis=0)
+    power = np.where(np.isfinite(power), power, plain_power)
+    power = power[before:][: len(regressor)].T
     losses = regressor.transpose(2, 1, 0)[columns, 0]
     stores_energy = []
     for column in columns:

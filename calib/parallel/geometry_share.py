@@ -21,7 +21,7 @@ import scipy.linalg
 from calib.data.signals.filtering import Decimator, decimate, spread
 from calib.dynamics.torque_rows import POWER
 from calib.identification.identify import Identification
-from calib.identification.rows import Case, power_block, segments
+from calib.identification.rows import Case, power_entries, power_span, segments
 from calib.identification.uncertainty.geometry_uncertainty import TILTS, GeometryUncertainty, solve_sensitivity
 from calib.parallel.mechanism.closure import Posture, closed
 from calib.parallel.mechanism.geometric_fit import LoopCovariance, LoopParameter, changed, visible_directions
@@ -143,11 +143,15 @@ class _Differences:
         columns = self.identification.base.kept
         values = self.identification.fitted.estimate.values
         rows = model.rows
-        posture = model.mechanism.locate(case.motion.q[span])
+        reach = span
+        if model.torque_rows.name == POWER.name:
+            reach = power_span(span, _segment_of(case, span))
+        posture = model.mechanism.locate(case.motion.q[reach])
         if weighed.shape[1] != rows:
             weighed = weighed.sum(axis=1)[:, None]
-        felt = spread(weighed, decimator, len(posture))
-        change = np.empty((len(posture), rows, len(self.pairs)))
+        count = span.stop - span.start
+        felt = spread(weighed, decimator, count)
+        change = np.empty((count, rows, len(self.pairs)))
         pulled = np.empty((len(columns), len(self.pairs)))
         for k, (forth, back) in enumerate(self.pairs):
             W, target = self._observed(forth, case, span, posture)
@@ -168,15 +172,13 @@ class _Differences:
     ) -> tuple[np.ndarray, np.ndarray | float]:
         """Return W (N, rows, b) and the target (N, rows) of a part of a case by a model.
 
-        The target is 0 for rows whose target does not depend on the geometry.
+        The target is 0 for rows whose target does not depend on the geometry. `posture`: postures near those of the
+        model, of rows of power at all samples that their differences reach.
         """
         columns = self.identification.base.kept
         recorded = case.motion
         if model.torque_rows.name == POWER.name:
-            segment = _segment_of(case, span)
-            no_payloads = np.zeros((0, len(recorded)))
-            block = power_block(model, columns, case, span, no_payloads, segment)
-            return block.T[:, None], 0.0
+            return self._power(model, case, span, posture), 0.0
         q = np.asarray(recorded.q[span])
         v = np.asarray(recorded.v[span])
         a = np.asarray(recorded.a[span])
@@ -188,6 +190,19 @@ class _Differences:
         torques = self.torques(case)[span]
         forces = np.einsum("nar,na->nr", motion.jacobians.readings, torques)
         return W, forces
+
+    def _power(self, model: ParallelModel, case: Case, span: slice, posture: Posture) -> np.ndarray:
+        """Return the power regressor W (N, 1, b) of a part of a case, solved from nearby postures."""
+        recorded = case.motion
+        reach = power_span(span, _segment_of(case, span))
+        v = np.asarray(recorded.v[reach])
+        motion = model.moved(np.asarray(recorded.q[reach]), v, np.zeros_like(v), posture)
+        energies = model.energies(motion, case.carried)
+        before = span.start - reach.start
+        # of the bodies' columns the energies count alone
+        losses = model.drives_along(motion)[before:][: span.stop - span.start]
+        block = power_entries(model, self.identification.base.kept, energies, losses, before, recorded.rate)
+        return block.T[:, None]
 
 
 def _segment_of(case: Case, span: slice) -> slice:

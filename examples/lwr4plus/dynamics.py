@@ -23,7 +23,7 @@ import geometry
 import numpy as np
 import study_options
 import study_tables
-from excitation import RATE
+from excitation import RATE, trajectory_b
 from matplotlib.figure import Figure
 from simulated_arm import TABLE_4, Data, collected, controller, model, nominal_base, record, true_chain, true_parameters
 
@@ -31,7 +31,6 @@ from calib import files
 from calib.dynamics import base as bases
 from calib.dynamics.torque_rows import MODELS
 from calib.estimation.essential import Elimination, Rule, eliminate
-from calib.procedure.excitation import coefficients
 from calib.procedure.report.figures.sheets import save, sheet, styled
 from calib.simulation import lwr4plus
 from calib.toolkit.chains import Chain
@@ -70,13 +69,6 @@ def counts() -> dict[str, int]:
         "without effect": len(base.without_effect),
         "regrouped": len(base.regrouped),
     }
-
-
-def trajectory_b() -> Reference:
-    """Return one period of Trajectory B, 44 columns, as kept of `excitation.py`'s first seed."""
-    series = coefficients.read(Path(__file__).parent)
-    t = np.arange(round(series.period * RATE)) / RATE
-    return Reference(t, *series.orders(t))
 
 
 def fourier(seed: list[int]) -> Reference:

@@ -274,6 +274,13 @@ def write_trajectory(period: Reference, folder: Path) -> Path:
     return files.write(folder / coefficients.NAME, dumps(coefficients.table(motion, "lwr4plus", ())))
 
 
+def trajectory_b() -> Reference:
+    """Return one period of Trajectory B, 44 columns, as kept of the first seed."""
+    series = coefficients.read(Path(__file__).parent)
+    t = np.arange(round(series.period * RATE)) / RATE
+    return Reference(t, *series.orders(t))
+
+
 def repeated(period: Reference, seconds: float = SECONDS) -> Reference:
     """Return as many whole periods of a motion as fit into a log [s]."""
     count = max(1, round(seconds / (len(period.t) / RATE)))
@@ -350,19 +357,23 @@ def fit_metrics(rows: Triangles, true: np.ndarray) -> Metrics:
     }
 
 
+Kind = Plan | Reference | float | None
+
+
 @dataclass(frozen=True, eq=False)
 class Task:
     """One motion to make, log and identify from.
 
     Attributes:
-        motion: a plan, the speed of plain moves, or None for the waypoints' spline.
+        motion: a plan, one period of the motion that the others are compared with, the speed of plain moves, or None
+            for the waypoints' spline.
         seed: seed of motion and noise.
         arm: the arm as it is known.
         starts: starts of a design.
         evaluations: evaluations of each start.
     """
 
-    motion: Plan | float | None
+    motion: Kind
     seed: int
     arm: Arm
     starts: int
@@ -372,6 +383,8 @@ class Task:
     def name(self) -> str:
         if isinstance(self.motion, Plan):
             return self.motion.name
+        if isinstance(self.motion, Reference):
+            return REFERENCE
         if self.motion is None:
             return SPLINE
         return f"moves at {self.motion:g}"
@@ -381,6 +394,8 @@ class Task:
         arm = self.arm
         if isinstance(self.motion, Plan):
             return self._design(self.motion)
+        if isinstance(self.motion, Reference):
+            return self.motion, []
         if self.motion is None:
             spline, _ = waypoint_spline(arm.chain, arm.torque, self.seed, RATE, PERIOD)
             return spline, []
@@ -406,19 +421,20 @@ def run_task(task: Task) -> tuple[Reference, Metrics]:
     return motion, merits_of(motion) | identify(task.arm, data) | {"front": front}
 
 
-def quick_motions(seed: int) -> list[tuple[Plan | float | None, int]]:
-    """Return motions and seeds of the quick form: B of 44 columns without its front, two moves and the spline."""
-    return [(Plan("B", 44, seed=seed), seed), (0.45, seed), (0.9, seed), (None, seed)]
+def quick_motions(seed: int) -> list[tuple[Kind, int]]:
+    """Return motions and seeds of the quick form: B of 44 columns as kept, a shorter B, two moves and the spline."""
+    kinds: list[Kind] = [trajectory_b(), Plan("B", 44, seed=seed, period=PERIODS[0]), 0.45, 0.9, None]
+    return [(kind, seed) for kind in kinds]
 
 
-def all_motions(seed: int, seeds: int) -> list[tuple[Plan | float | None, int]]:
+def all_motions(seed: int, seeds: int) -> list[tuple[Kind, int]]:
     """Return motions and seeds of the whole study.
 
     Args:
         seed: the first seed, with which D, other periods, the known truth and the CAD geometry are designed too.
         seeds: number of seeds.
     """
-    motions: list[tuple[Plan | float | None, int]] = []
+    motions: list[tuple[Kind, int]] = []
     for k in range(seed, seed + seeds):
         for knowledge in ("estimate", "truth"):
             if knowledge == "truth" and k > seed:
@@ -564,7 +580,7 @@ def geometries(arm: Arm, motions: dict[str, Reference], seed: int) -> Metrics:
 def main() -> None:
     arguments = study_options.read(
         __doc__,
-        quick="B of 44 columns without its front, and a few baselines, one seed",
+        quick="B of 44 columns as kept, a shorter B without a front, and a few baselines, one seed",
         seeds=(3, "of designs, waypoints and noise"),
         starts=(STARTS, "of each design"),
         evaluations=(EVALUATIONS, "of each start; twice as many for D"),

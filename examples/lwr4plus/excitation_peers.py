@@ -20,7 +20,7 @@ masses are not in the library, so its torque is not limited).
     python examples/lwr4plus/excitation_peers.py --out lwr4plus-peers [--seconds 30] [--quick] [--seed 0]
 
 Some quarter of an hour of processor time; what rows.json holds already is not run again. --quick: two seconds per
-peer, one seed, no other robots, of the peers exact gradients, differences and chance; two starts of the default search.
+peer, one seed, no other robots, of the peers exact gradients, differences and chance; one start of the default search.
 """
 
 from __future__ import annotations
@@ -326,7 +326,7 @@ class Extent:
     robots: tuple[str, ...] = ("panda", "tx40")
 
 
-QUICK = Extent(2.0, ("slsqp", "slsqp, differences", "random"), 1, (10.0,), 1, 2, ())
+QUICK = Extent(2.0, ("slsqp", "slsqp, differences", "random"), 1, (10.0,), 1, 1, ())
 
 
 def verified_condition(robot: Robot, problem: ExcitationProblem, result: SearchResult) -> dict[str, float]:
@@ -451,7 +451,7 @@ def main() -> None:
     arguments = study_options.read(
         __doc__,
         seconds=(30.0, "of processor time per peer"),
-        quick="two seconds for each of three peers, one seed, two starts",
+        quick="two seconds for each of three peers, one seed, a start",
     )
     extent = QUICK if arguments.quick else Extent(arguments.seconds)
     rows = arguments.out / "rows.json"

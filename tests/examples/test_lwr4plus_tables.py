@@ -1,7 +1,7 @@
 """The tables of the LWR4+ study's README are those that its scripts make, within stated bounds.
 
 Searches by processor time, the many seeds of the designs and the 500 calibrations are not run again: of the designs
-that of one seed, which has to lie in the range that README gives for three.
+the kept one, of one seed, is judged, which has to lie in the range that README gives for three.
 """
 
 import json
@@ -25,6 +25,8 @@ BOUNDS = {  # relative, of numbers that hang on the last digits of a search or o
 # tables of many seeds or of the 500 calibrations, which a fresh run of this test does not make
 UNBOUNDED = ("geometry-selection", "geometry-ceiling", "consistency-coverage")
 SMALL = {"geometry-beside": 1e-3, "dynamics-torque": 5e-3, "consistency-geometries": 2e-3, "planning": 0.5}
+# designed afresh by a short search
+SHORT = "B, 44 columns, T0 = 10 s"
 _NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e-?\d+)?")
 
 
@@ -127,20 +129,24 @@ def test_fresh_run_makes_readme_tables(tmp_path: Path, name: str, options: tuple
 
 def test_trajectory_b_is_the_readmes() -> None:
     """The stored trajectory B is the README's."""
-    import dynamics
     import excitation
 
     _, least, most = numbers(rows(README["excitation-designs"])["B, 44 columns"][1])
-    assert least - 0.1 <= excitation.merits_of(dynamics.trajectory_b())["cond"]["44"]["raw"] <= most + 0.1
+    assert least - 0.1 <= excitation.merits_of(excitation.trajectory_b())["cond"]["44"]["raw"] <= most + 0.1
 
 
 def check_excitation(found: dict) -> None:
-    """The designed motion attains the paper's goals, and what halving is against."""
+    """The kept motion attains the paper's goals, a short search beats what halving is against."""
     assert found["columns"] == 102
     rows = {name: runs[0] for name, runs in found["motions"].items()}
-    b, plain = rows.pop("B, 44 columns"), [one for name, one in rows.items() if name.startswith("moves")]
+    b, short = rows.pop("B, 44 columns"), rows.pop(SHORT)
+    plain = [one for name, one in rows.items() if name.startswith("moves")]
     assert b["cond"]["44"]["raw"] < 40 < min(one["cond"]["44"]["raw"] for one in rows.values())  # the paper asks for 35
-    assert min(b["torque_share"][5:]) >= 0.1 and b["peak"] < 1.0 + 0.02  # designed without knowing the truth
+    for designed in (b, short):
+        # designed without knowing the truth
+        assert min(designed["torque_share"][5:]) >= 0.1 and designed["peak"] < 1.0 + 0.02
+    # a start of 40 evaluations: 34 to 48 with three seeds, the plain moves 66 to 165
+    assert short["cond"]["44"]["raw"] < 0.8 * min(one["cond"]["44"]["raw"] for one in rows.values())
     slow, fast = (one["102 fitted"]["median_rsd"] / b["102 fitted"]["median_rsd"] for one in plain)
     assert slow > 1.3 > 0.9 > fast  # that of the baseline's speed, 0.45 and 0.9 of the limits: README has 1.38 to 1.56
     for one in (b, *plain):
@@ -165,14 +171,14 @@ def test_front_of_the_readme_is_drawn() -> None:
     assert {(motion["share"], motion["cond"]) for motion in front if motion["best"] or motion["designed"]} <= drawn
 
 
-@pytest.mark.long
 @pytest.mark.slow
-def test_fresh_design_attains_paper_goals(tmp_path: Path) -> None:
-    """A fresh design attains the paper's goals and lies in the README's ranges.
+def test_kept_design_attains_paper_goals(tmp_path: Path) -> None:
+    """The kept design attains the paper's goals and lies in the README's ranges, as do the moves that it is against.
 
-    Its front, which costs more than the design, is left out: `tests/procedure/session/test_dynamic_session.py` has one.
+    A fresh design is a short one. Searches to the end: `docs/tutorials/lwr_logs.md`, and with a front
+    `tests/procedure/session/test_dynamic_session.py`.
     """
-    found = fresh(tmp_path, "excitation", "--quick")
+    found = fresh(tmp_path, "excitation", "--quick", "--starts", "1", "--evaluations", "40")
     check_excitation(found)
     assert {path.name for path in tmp_path.glob("*.png")} == {
         "plot_paths.png", "plot_estimates.png", "plot_speeds.png",
@@ -180,6 +186,7 @@ def test_fresh_design_attains_paper_goals(tmp_path: Path) -> None:
     for key, columns in (("excitation-designs", (0, 1)), ("excitation-rsd", (2, 6))):
         ours, theirs = rows(study_tables.excitation(found)[key]), rows(README[key])
         assert set(ours) <= set(theirs)
+        ours.pop(SHORT)
         for row, cells in list(ours.items())[1:]:  # below the head
             for column in columns:
                 value, (_, least, most) = numbers(cells[column])[0], numbers(theirs[row][column])

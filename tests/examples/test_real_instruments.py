@@ -7,6 +7,9 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 TABLE = (ROOT / "examples/real_recordings.md").read_text().split("<!-- examples/real_instruments.py -->")[1]
+# rows of a table that share a recording, and so its least squares; the UR10e's 50 s are the code path of its 30 s,
+# series of few and of many harmonics, on a longer log
+COMPARED = ((0,), (1, 2), (5,), (6,))
 NEAR = 0.05  # relative: what another processor's rounding may change, beside the last digit printed
 
 
@@ -32,13 +35,14 @@ def test_every_row_stands_in_the_document(script):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", range(7))
-def test_document_states_fresh_results(script, number, data, monkeypatch):
-    """The document states what a fresh run gives."""
+@pytest.mark.parametrize("numbers", COMPARED)
+def test_document_states_fresh_results(script, numbers, data, monkeypatch):
+    """The document states what a fresh run gives: of each robot a recording."""
     monkeypatch.setattr(script, "DATA", data)
-    told, fresh = cells(TABLE.strip().splitlines()[2 + number]), cells(script.study(script.ROWS[number]))
-    assert told[0] == fresh[0]
-    for one, other in zip(told, fresh, strict=True):
-        values, new = (re.findall(r"\d+\.?\d*(?:e[+-]\d+)?", cell) for cell in (one, other))
-        digit = max((10.0 ** -len(value.partition(".")[2]) for value in values), default=0.0)
-        assert [float(value) for value in new] == pytest.approx([float(value) for value in values], NEAR, digit)
+    for number in numbers:
+        told, fresh = cells(TABLE.strip().splitlines()[2 + number]), cells(script.study(script.ROWS[number]))
+        assert told[0] == fresh[0]
+        for one, other in zip(told, fresh, strict=True):
+            values, new = (re.findall(r"\d+\.?\d*(?:e[+-]\d+)?", cell) for cell in (one, other))
+            digit = max((10.0 ** -len(value.partition(".")[2]) for value in values), default=0.0)
+            assert [float(value) for value in new] == pytest.approx([float(value) for value in values], NEAR, digit)

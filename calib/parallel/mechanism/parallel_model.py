@@ -232,7 +232,10 @@ class ParallelModel:
 
     def drive_regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return W (N, rows, p) as `regressor`, but with zeros for the bodies, whose columns cost most."""
-        motion = self.moved(q, v, a)
+        return self.drives_along(self.moved(q, v, a))
+
+    def drives_along(self, motion: LoopMotion) -> np.ndarray:
+        """Return W (N, rows, p) as `along`, but with zeros for the bodies."""
         count = self._bodies + len(self.terms)
         out = np.zeros((count, self.mechanism.robot.r, len(motion.v)))
         self._fill_drives(out, motion)

@@ -79,8 +79,8 @@ def test_demo_of_other_robots(robot: str, tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.slow
 def test_demo_by_camera_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """To the end, and again by `calib view`: validation images measure no positions, which are empty cells."""
-    monkeypatch.setattr(demo, "FIT", 24)
-    monkeypatch.setattr(demo, "VALIDATION", 8)
+    monkeypatch.setattr(demo, "FIT", 16)
+    monkeypatch.setattr(demo, "VALIDATION", 6)
     out = tmp_path / "cell"
     assert run("demo", "--instrument", "camera", "--geometry-only", "--plots", "png", "--out", out) == 0
     truth = errors(out)
