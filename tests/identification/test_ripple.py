@@ -95,3 +95,33 @@ def test_residual_that_repeats_with_the_motion_is_no_ripple(seed):
     motion = replace(once, t=t, segment=np.zeros(len(t), dtype=int), **series)
     residual = random.normal(size=once.q.shape)[repeated]
     assert ripple.find_all([replace(case, motion=motion)], [residual]) == []
+
+
+def test_periods_at_other_speeds_are_no_proof_of_ripple():
+    """Periods played a few percent faster or slower pass through the same states, too, without a common lag."""
+    random = np.random.default_rng(0)
+    case = planted_motion.case("once", 0, duration=4.0)
+    once = case.motion.part(slice(0, round(3.0 * case.motion.rate)))
+    disturbance = random.normal(size=once.q.shape)
+    places, speeds = [], []
+    for speed in (1.0, 0.97, 1.04, 0.98):
+        place = np.arange(0.0, len(once) - 1, speed)
+        places.append(place)
+        speeds.append(np.full(len(place), speed))
+    place, speed = np.concatenate(places), np.concatenate(speeds)[:, None]
+
+    def played(values):
+        return np.stack([np.interp(place, np.arange(len(once)), column) for column in values.T], axis=1)
+
+    count = len(place)
+    motion = replace(
+        once,
+        t=np.arange(count) / once.rate,
+        segment=np.zeros(count, dtype=int),
+        weight=frozen(np.ones(count)),
+        q=frozen(played(once.q)),
+        v=frozen(played(once.v) * speed),
+        a=frozen(played(once.a) * speed**2),
+        effort=frozen(played(once.effort)),
+    )
+    assert ripple.find_all([replace(case, motion=motion)], [played(disturbance)]) == []

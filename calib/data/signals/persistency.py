@@ -17,6 +17,8 @@ SINE = 0.98
 MIN_TRAVEL = 1e-3
 # States of a motion that are compared.
 MAX_STATES = 20_000
+# States of a block that are looked up in the other blocks.
+MAX_TESTED = 500
 # Samples beyond which positions are thinned to what their own low-pass filter passes: four times f_q.
 MAX_SAMPLES = 100_000
 # Share of the largest singular value from which on a function of time counts.
@@ -118,6 +120,27 @@ def repeats(training: Motion, test: Motion) -> float:
     limit = MAX_DISTANCE * np.sqrt(training_states.shape[1])
     distance, _ = KDTree(training_states).query(test_states, distance_upper_bound=limit)
     return float(np.isfinite(distance).mean())
+
+
+def met_elsewhere(states: np.ndarray, block: np.ndarray) -> float:
+    """Return the share (0 to 1) of a block's states that other blocks pass through, too; the median over the blocks.
+
+    States are the same as in `repeats`.
+
+    Args:
+        states: (N, k) states.
+        block: (N,) number of the block of each state.
+    """
+    scaled = states / np.maximum(states.std(axis=0), 1e-12)
+    limit = MAX_DISTANCE * np.sqrt(scaled.shape[1])
+    shares = []
+    for number in np.unique(block):
+        inside = block == number
+        tests = scaled[inside]
+        tests = tests[:: max(1, len(tests) // MAX_TESTED)]
+        distance, _ = KDTree(scaled[~inside]).query(tests, distance_upper_bound=limit)
+        shares.append(float(np.isfinite(distance).mean()))
+    return float(np.median(shares))
 
 
 def _moving_states(motion: Motion, max_states: int) -> np.ndarray:

@@ -19,7 +19,8 @@ between time blocks:
 
 over speed bins b with N_b samples and time blocks c, for all integer orders at once by FFT over the position (our
 choice: neither noise nor a single short disturbance contributes). Held-out time blocks decide how strongly the columns
-are regularised towards zero, how finely frequency is resolved, and whether an order is kept.
+are regularised towards zero, how finely frequency is resolved, and whether an order is kept. Where blocks repeat the
+states of others, no ripple is claimed: any residual that the motion repeats would be confirmed.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -29,6 +30,7 @@ from functools import cached_property
 import numpy as np
 
 from calib.data.signals.filtering import low_pass
+from calib.data.signals.persistency import MAX_STATES, met_elsewhere
 from calib.data.signals.repetition import course
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import TermMotion
@@ -57,6 +59,8 @@ MIN_FREE_GAIN = 0.04
 """The same of free orders, where no family pays: 2 % of the rms (our choice)."""
 MIN_TOTAL_GAIN = 0.03
 """The same of all waves together: 1.5 % of the rms (our choice)."""
+REPEATED = 0.5
+"""Share of a block's states that others pass through, too, from which it is no proof (our choice)."""
 MAX_SETS = 12
 """Sets of waves, at most."""
 MAX_FREE_SETS = 3
@@ -175,11 +179,14 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
         cases: recordings.
         residuals: for each case, the unexplained torque (N, n) at the full rate; its slow part is removed here.
     """
+    numbered = _blocks(cases)
+    if _repeats_between(cases, numbered):
+        return []
     step = max(1, sum(len(case.motion) for case in cases) // MAX_SAMPLES)
     case_blocks = []
     positions = []
     speeds = []
-    for case, numbers in zip(cases, _blocks(cases)):
+    for case, numbers in zip(cases, numbered):
         motion = case.motion
         valid = motion.weight[::step] > 0.5
         case_blocks.append(np.where(valid, numbers[::step], -1))
@@ -549,3 +556,25 @@ def _blocks(cases: Sequence[Case]) -> list[np.ndarray]:
     for case, block in zip(cases, course([case.motion for case in cases]).blocks(TIME_BLOCKS)):
         numbers.append(np.where(case.motion.t < SKIPPED_START, -1, block))
     return numbers
+
+
+def _repeats_between(cases: Sequence[Case], numbered: Sequence[np.ndarray]) -> bool:
+    """Return whether blocks mostly repeat the states of others, so that nothing is held out.
+
+    Periods that are repeated at slightly other speeds have no common lag by which `course` would find them.
+
+    Args:
+        cases: recordings.
+        numbered: for each case, the block (N,) of each sample; -1 for samples that are not used.
+    """
+    step = max(1, sum(len(case.motion) for case in cases) // MAX_STATES)
+    states, blocks = [], []
+    for case, block in zip(cases, numbered):
+        motion = case.motion
+        rows = np.flatnonzero(~motion.standstill() & (block >= 0))[::step]
+        states.append(np.hstack([motion.q[rows], motion.v[rows]]))
+        blocks.append(block[rows])
+    number = np.concatenate(blocks)
+    if len(np.unique(number)) < 2:
+        return False
+    return met_elsewhere(np.concatenate(states), number) >= REPEATED
