@@ -164,6 +164,16 @@ def test_two_files_have_two_stations(cell, calib):
     assert (placed.station_names, placed.tool_names) == (("station",), ("a tool", "b tool"))
 
 
+def test_stations_with_tools_of_their_own_are_not_held_out_whole(cell, calib):
+    """The other station's rows do not determine a station's own tool: regions of it are held out, which is said."""
+    file, other = cell.write("a.csv", cell.measure(40)), cell.write("b.csv", cell.measure(40, 1))
+    code, _, err = calib("fit", "ur5", file, other, "--tools", "each", "--model", "frames", "--out", "o")
+    assert code == 0 and installation.read("o").tool_names == ("a tool", "b tool"), err
+    noticed = json.loads(Path("o/metrics.json").read_text())["noticed"]
+    (by_regions,) = [item["values"] for item in noticed if item["code"] == "transfer-by-regions"]
+    assert by_regions["stations"] == ["a", "b"]
+
+
 @pytest.mark.slow
 def test_one_station_of_a_moved_instrument(cell, calib):
     """One station for an instrument that was moved is said."""
