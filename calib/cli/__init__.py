@@ -27,8 +27,8 @@ from calib.workers.threads import limit_process
 COMMANDS: Point[typer.Typer] = Point("commands", "commands of calib, one Typer application")
 
 # A command makes a million objects as it loads and hardly a cycle: walking all of them again and again for garbage was
-# 8 % of its time (numbers of new objects, of young and of middle-aged collections; Python's own are 700, 10, 10).
-GARBAGE = (300_000, 10, 10)
+# 6 % of its time (numbers of new objects, of young and of middle-aged collections; Python's own are 700, 10, 10).
+GARBAGE = (20_000, 10, 10)
 
 EXIT_CODES = (
     "Exit codes: 0 done (the verdict is pass or marginal), 1 the verdict is fail, 2 input or usage, 3 not identifiable "

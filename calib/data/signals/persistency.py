@@ -29,6 +29,8 @@ MIN_CORRELATION = 0.98
 FREQUENCY_SPREAD = 0.1
 # A state is met again if it differs by less than this share of the motion's spread, in the rms over all.
 MAX_DISTANCE = 0.05
+# Share of a motion's states that are met in other motion, from which it is a repeat and proves nothing.
+REPEATED = 0.5
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ def repeats(training: Motion, test: Motion) -> float:
     motion's standard deviation, rms over the coordinates. A repeat is recognised in spite of a shift in time, another
     number of cycles or another order of parts. The same path at another speed is no repeat. A repeat is no independent
     test, since the fit has already absorbed the model's errors along that path. Our choice is to refuse a test motion
-    with a share of a half or more.
+    with a share of `REPEATED` or more.
 
     Args:
         training: the motion that was fitted.
@@ -117,29 +119,34 @@ def repeats(training: Motion, test: Motion) -> float:
     test_states = _moving_states(test, MAX_STATES // 10) / spread
     if not len(training_states) or not len(test_states):
         return 0.0
-    limit = MAX_DISTANCE * np.sqrt(training_states.shape[1])
-    distance, _ = KDTree(training_states).query(test_states, distance_upper_bound=limit)
+    return share_met(KDTree(training_states), test_states)
+
+
+def share_met(tree: KDTree, states: np.ndarray) -> float:
+    """Return the share (0 to 1) of states whose nearest neighbour differs by less than `MAX_DISTANCE`, rms.
+
+    Args:
+        tree: the states to search, over their standard deviations.
+        states: (N, k) states, over the same deviations.
+    """
+    distance, _ = tree.query(states, distance_upper_bound=MAX_DISTANCE * np.sqrt(states.shape[1]))
     return float(np.isfinite(distance).mean())
 
 
 def met_elsewhere(states: np.ndarray, block: np.ndarray) -> float:
     """Return the share (0 to 1) of a block's states that other blocks pass through, too; the median over the blocks.
 
-    States are the same as in `repeats`.
-
     Args:
         states: (N, k) states.
         block: (N,) number of the block of each state.
     """
     scaled = states / np.maximum(states.std(axis=0), 1e-12)
-    limit = MAX_DISTANCE * np.sqrt(scaled.shape[1])
     shares = []
     for number in np.unique(block):
         inside = block == number
         tests = scaled[inside]
         tests = tests[:: max(1, len(tests) // MAX_TESTED)]
-        distance, _ = KDTree(scaled[~inside]).query(tests, distance_upper_bound=limit)
-        shares.append(float(np.isfinite(distance).mean()))
+        shares.append(share_met(KDTree(scaled[~inside]), tests))
     return float(np.median(shares))
 
 

@@ -30,7 +30,7 @@ from functools import cached_property
 import numpy as np
 
 from calib.data.signals.filtering import low_pass
-from calib.data.signals.persistency import MAX_STATES, met_elsewhere
+from calib.data.signals.persistency import MAX_STATES, REPEATED, met_elsewhere
 from calib.data.signals.repetition import course
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.shapes import TermMotion
@@ -59,8 +59,6 @@ MIN_FREE_GAIN = 0.04
 """The same of free orders, where no family pays: 2 % of the rms (our choice)."""
 MIN_TOTAL_GAIN = 0.03
 """The same of all waves together: 1.5 % of the rms (our choice)."""
-REPEATED = 0.5
-"""Share of a block's states that others pass through, too, from which it is no proof (our choice)."""
 MAX_SETS = 12
 """Sets of waves, at most."""
 MAX_FREE_SETS = 3

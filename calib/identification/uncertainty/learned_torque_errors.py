@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 from scipy.special import stdtrit
 
 from calib.data.signals.filtering import kept
+from calib.data.signals.persistency import REPEATED, share_met
 from calib.dynamics.idim import IdentificationModel
 from calib.estimation.robust import variance_weights
 from calib.estimation.triangles import Triangles
@@ -47,12 +48,6 @@ BORROWED = 4.0
 
 CHANCES = (np.arange(41) + 0.5) / 41
 """Probabilities at which the t distribution of the errors' size is evaluated."""
-SAME_STATE = 0.05
-"""Distance of two states that count as the same, per coordinate, in standard deviations of the states."""
-
-
-MIN_REPEATED = 0.5
-"""Share of a block's states in which another block has been, from which it is a repetition."""
 FINER_BY = 8
 """Samples of the trajectory per decimated sample, at most, in which states are looked up."""
 
@@ -274,7 +269,6 @@ def _independent_runs(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarr
         blocks: numbers of the time blocks.
     """
     spread = np.maximum(samples.trajectory.std(axis=0), 1e-6)
-    max_distance = SAME_STATE * np.sqrt(len(spread))
     trees = {}
     for block in blocks:
         trees[block] = KDTree(samples.trajectory[samples.trajectory_block == block] / spread)
@@ -284,8 +278,7 @@ def _independent_runs(samples: _Samples, blocks: Sequence[int]) -> list[np.ndarr
         visited = positions_and_speeds.reshape(-1, len(spread)) / spread
         run = []
         for candidate, tree in trees.items():
-            distance, _ = tree.query(visited, distance_upper_bound=max_distance)
-            if candidate == block or np.isfinite(distance).mean() >= MIN_REPEATED:
+            if candidate == block or share_met(tree, visited) >= REPEATED:
                 run.append(candidate)
         if tuple(run) not in runs and len(run) < len(blocks):
             runs.append(tuple(run))

@@ -11,7 +11,7 @@ from typing import TypeVar, cast
 
 import numpy as np
 
-from calib.data.signals.persistency import ExcitationReport, repeats, report_excitation
+from calib.data.signals.persistency import REPEATED, ExcitationReport, repeats, report_excitation
 from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, finding
 from calib.identification.checks.gravity import GravityHypotheses
@@ -31,9 +31,6 @@ from calib.procedure.findings import Verdict, lines_of
 from calib.procedure.robot_kinds import stage_of
 from calib.records import field_values
 from calib.units import TORQUE, without_gains
-
-# share of states met in training from which on a validation file proves nothing (our choice)
-REPEAT = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +109,7 @@ class DynamicsAssessment(RecordingErrors):
 def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, float]:
     """Return the held-out recordings that repeat training motion: name -> share of their states in the training.
 
-    A state is a position with its velocity. A recording counts as a repeat from a share of `REPEAT`.
+    A state is a position with its velocity. A recording counts as a repeat from a share of `REPEATED`.
 
     Args:
         cases: training recordings.
@@ -121,7 +118,7 @@ def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, 
     repeated = {}
     for case in unseen:
         share = max(repeats(training.motion, case.motion) for training in cases)
-        if share >= REPEAT:
+        if share >= REPEATED:
             repeated[case.name] = share
     return repeated
 
