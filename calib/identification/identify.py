@@ -20,7 +20,7 @@ from calib.errors import MeasurementError, UsageError, refuse_data, require
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.triangles import condition_numbers
 from calib.identification.closed_loop.simulated import loop_results
-from calib.identification.earlier import DECISIVE, ModelChoice
+from calib.identification.earlier import DECISIVE, EarlierChoice, ModelChoice
 from calib.identification.friction.friction_ladder import FrictionCandidates, FrictionSelection, select_friction
 from calib.identification.friction.ripple import Ripple, find_all
 from calib.identification.loop import LoopResults, per_joint
@@ -202,17 +202,105 @@ def identify_model(
     decimator = common_decimator(cases, settings)
 
     say("observation matrix")
-    rows_as_moving, rows = _observed(model, base, cases, decimator, settings, method)
+    observed = _observed(model, base, cases, decimator, settings, method)
 
-    say("first fit")
     if cad is None:
         robot, source = shape, "sizes"
     else:
         robot, source = cad, "cad"
-    earlier = settings.earlier
-    fixed = None if earlier is None else earlier.choice.sizes
-    find = partial(find_prior, model, base, robot=robot, source=source, noise=noise, effort=effort, fixed=fixed)
+    find = partial(find_prior, model, base, robot=robot, source=source, noise=noise, effort=effort)
     takes_prior = _takes_prior(method, model, settings, source)
+    choose = partial(_chosen, model, base, cases, decimator, observed, find, method, takes_prior, noise, progress)
+    chosen = choose(settings)
+    earlier, prior = settings.earlier, chosen.prior
+    if earlier is not None and prior is not None and prior.contradiction > np.log(DECISIVE):
+        say("the prior of the earlier identification is left")
+        settings = replace(settings, earlier=earlier.without_prior(prior.contradiction))
+        chosen = choose(settings)
+
+    problem = IdentificationProblem(
+        model=model,
+        base=base,
+        cases=cases,
+        decimator=decimator,
+        rows=tuple(chosen.rows),
+        terms=(*_terms_of(model, base), *chosen.friction.terms),
+        groups=chosen.groups,
+        noise=noise,
+        prior=chosen.prior,
+        loop=settings.loop,
+        cad=cad,
+        constraints=settings.constraints,
+        progress=progress,
+        ridges=chosen.ridges(base, settings.earlier),
+    )
+    return _identified(problem, method, chosen.friction, settings, say)
+
+
+@dataclass(frozen=True, eq=False)
+class _Choice:
+    """Prior and friction terms that were chosen for recordings.
+
+    Attributes:
+        rows: rows of all recordings, in the base columns and the columns of friction.
+        prior: prior of the base parameters; None if the method uses none.
+        friction: additional friction terms.
+        groups: (p,) ridge group of each column; -1 for base columns.
+    """
+
+    rows: list[ObservationRows]
+    prior: Prior | None
+    friction: FrictionSelection
+    groups: np.ndarray
+
+    def ridges(self, base: Base, earlier: EarlierChoice | None) -> np.ndarray | None:
+        """Return the ridge (p,) of each column that an earlier identification chose, NaN for others; None without one.
+
+        Args:
+            base: base parameters.
+            earlier: choice of the earlier identification.
+        """
+        if self.prior is None or earlier is None:
+            return None
+        names = [*base.names, *[term.name for term in self.friction.terms]]
+        return np.array([earlier.ridges.get(name, np.nan) for name in names])
+
+
+def _chosen(
+    model: RegressorModel,
+    base: Base,
+    cases: Sequence[Case],
+    decimator: Decimator,
+    observed: tuple[list[ObservationRows], list[ObservationRows]],
+    find: Callable[..., Prior],
+    method: Method,
+    takes_prior: bool,
+    noise: np.ndarray | None,
+    progress: Progress | None,
+    settings: IdentificationSettings,
+) -> _Choice:
+    """Return prior and friction terms for recordings, with the rows in all columns.
+
+    Args:
+        model: the model.
+        base: its base parameters.
+        cases: recordings.
+        decimator: filter and decimation of the rows.
+        observed: rows in the base columns, without and with marked standstills.
+        find: function of rows that returns their prior.
+        method: the method.
+        takes_prior: whether to use a prior.
+        noise: (rows,) stated standard deviation of the torque noise, up to a common factor; None: from the residuals.
+        progress: function that is called with a short text at each stage; None: not called.
+        settings: settings of the identification, with the choice of an earlier one if it is carried on.
+    """
+    say = progress or (lambda message: None)
+    earlier = settings.earlier
+    if earlier is not None:
+        find = partial(find, fixed=earlier.choice.sizes)
+    rows_as_moving, rows = observed
+
+    say("first fit")
     rows, prior, first = _first_fit(rows, find, takes_prior, noise)
     rows = with_weights(rows, first.rest_weights)
     marks_standstills = isinstance(method, LeastSquares) and isinstance(model, IdentificationModel)
@@ -224,7 +312,7 @@ def identify_model(
         if error_as_moving < CLEARLY_LESS**2 * error:
             rows, prior, first = as_moving
             marks_standstills = False
-    if prior is not None and earlier is not None and fixed:
+    if prior is not None and earlier is not None and earlier.choice.sizes:
         earlier.check_sizes(tuple(prior.sizes))
         prior = find(rows, start=prior, tempering=earlier.choice.tempering)
     elif prior is not None:
@@ -249,43 +337,7 @@ def identify_model(
         say("sizes beside richer friction")
         prior = find(richer_rows, groups=groups, start=prior, tempering=prior.tempering)
         richer_rows = with_weights(richer_rows, prior.first.rest_weights)
-    ridges = None
-    if prior is not None and earlier is not None:
-        if prior.contradiction > np.log(DECISIVE):
-            say("the prior of the earlier identification is left")
-            anew = replace(settings, earlier=earlier.without_prior(prior.contradiction))
-            return identify_model(
-                model,
-                cases,
-                anew,
-                nominal=nominal,
-                states=states,
-                cad=cad,
-                shape=shape,
-                effort=effort,
-                progress=progress,
-            )
-        names = [*base.names, *[term.name for term in friction.terms]]
-        ridges = np.array([earlier.ridges.get(name, np.nan) for name in names])
-
-    terms = (*_terms_of(model, base), *friction.terms)
-    problem = IdentificationProblem(
-        model=model,
-        base=base,
-        cases=cases,
-        decimator=decimator,
-        rows=tuple(richer_rows),
-        terms=terms,
-        groups=column_groups,
-        noise=noise,
-        prior=prior,
-        loop=settings.loop,
-        cad=cad,
-        constraints=settings.constraints,
-        progress=progress,
-        ridges=ridges,
-    )
-    return _identified(problem, method, friction, settings, say)
+    return _Choice(richer_rows, prior, friction, column_groups)
 
 
 def _first_fit(
