@@ -5,12 +5,11 @@ This module supplies a robot's observation Jacobian and limits to the optimisati
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -20,10 +19,9 @@ from calib.config_types import Plots
 from calib.data.poses.fit_options import FitOptions
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.pose_lists import read_poses, write_poses
-from calib.errors import CalibError, UsageError, refused_as, require
+from calib.errors import UsageError, require
 from calib.geometry.observability import Observation, observation, targets_of
 from calib.poses.candidates import draw_candidates
-from calib.poses.errors import NothingFeasible
 from calib.poses.indices import observability
 from calib.poses.select import SearchSettings, Selection, select_poses
 from calib.poses.space import SearchSpace, is_feasible
@@ -36,6 +34,7 @@ from calib.procedure.kinematic_stage.loads import (
     loaded_run,
     without_masses,
 )
+from calib.procedure.kinematic_stage.possible_poses import METHODS_BY_CANDIDATES, Candidates, Progress, possible_poses
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
 from calib.procedure.measuring import prediction as forecast
 from calib.procedure.measuring.measuring_run import Drivable, Exchange, MeasuringRun, RunSettings, drivable
@@ -46,24 +45,12 @@ from calib.procedure.robot_kinds import joints_of
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
 
-if TYPE_CHECKING:
-    from calib.procedure.measuring.camera_view import CameraView
-
-Progress = Callable[[int, int, str], None]
-Candidates = str | Path | np.ndarray | Sequence[Sequence[float]] | Callable[[int], np.ndarray]
-"""Poses to choose from: a CSV, joint values (N, n) [rad or m], or a function of a count that returns joint values."""
-METHODS_BY_CANDIDATES = ("detmax",)
-"""Methods whose poses are among the candidates."""
-# postures that see a camera's board, to choose from (our choice)
-VIEWS = 600
 # sigma of the tool over the workspace, and by the number of poses
 FIGURES = ("predicted", "outlook")
 # end of the name of the page with them, after the stem of the CSV
 FIGURES_PAGE = "_figures.html"
 # poses all over the workspace, seen or not, at which the tool's sigma is predicted (our choice)
 TYPICAL = 300
-# random postures by which the share is estimated that keeps each constraint
-RANDOM_POSTURES = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +169,7 @@ def choose(
     else:
         jacobian = view.observation(limits.lower, limits.upper, settings.seed)
     space = limits.space(jacobian)
-    possible, numbers, remarks = _possible_poses(candidates, chain, space, limits, settings, m, progress)
+    possible, numbers, remarks = possible_poses(candidates, chain, space, limits, settings, m, progress)
     earlier = None
     if existing is not None:
         earlier = _earlier_poses(read_poses(existing, joints_of(chain)), space, settings)
@@ -356,39 +343,6 @@ def _replacements(driven: Drivable) -> tuple[str, ...]:
     return (driven.words,)
 
 
-def _possible_poses(
-    candidates: Candidates | None,
-    chain: Chain,
-    space: SearchSpace,
-    limits: Limits,
-    settings: SelectionSettings,
-    m: int,
-    progress: Progress | None,
-) -> tuple[np.ndarray, np.ndarray | None, list[str]]:
-    """Return the poses (N, n) [rad or m] to choose from, with their numbers among the candidates, and notes.
-
-    The numbers are None where poses are drawn.
-
-    Args:
-        candidates, settings, m, progress: arguments of `choose`.
-        chain: the arm.
-        space: the space of poses.
-        limits: limits of poses, with the camera's.
-    """
-    view = limits.camera
-    if candidates is not None:
-        require(view is None, "candidates: with a [camera], views of the board are drawn; leave them out", UsageError)
-        offered, numbers = _feasible_candidates(candidates, space, chain, settings, m)
-        infeasible = len(offered) - len(numbers)
-        notes = [f"{infeasible} of the {len(offered)} candidates break the constraints"] * bool(infeasible)
-        return offered[numbers], numbers, notes
-    if view is None:
-        return _draw_feasible(space, limits, settings), None, []
-    if progress:
-        progress(0, 1, "views of the board")
-    return _draw_views(view, space, limits, settings, m), None, []
-
-
 def _check_loads(settings: SelectionSettings, limits: Limits) -> None:
     """Raise a UsageError where loads cannot be chosen together with poses."""
     require(settings.method in METHODS_BY_CANDIDATES, "--loads: give --method detmax", UsageError)
@@ -412,65 +366,6 @@ def _remarks_on_loads(chain: Chain, loads: LoadOutlook, has_existing: bool) -> l
     if loads.excluded:
         notes.append(f"{loads.excluded} pairs of pose and load exceed a joint's largest torque and were left out")
     return notes
-
-
-def _feasible_candidates(
-    candidates: Candidates, space: SearchSpace, chain: Chain, settings: SelectionSettings, m: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the user's candidates (N, n) [rad or m], and the numbers, from 0, of those that keep the constraints.
-
-    Args:
-        candidates: a CSV, joint values, or a function of a count.
-        space: search space with all constraints.
-        chain: the arm.
-        settings: settings of the selection.
-        m: number of poses to select.
-
-    Raises:
-        UsageError: a method whose poses are not candidates; wrong joint values; too few feasible candidates.
-    """
-    if settings.method not in METHODS_BY_CANDIDATES:
-        raise UsageError(
-            f"candidates: the method '{settings.method}' moves poses away from the candidates: give method = "
-            f"{' or '.join(METHODS_BY_CANDIDATES)}"
-        )
-    source = candidates(settings.candidates) if callable(candidates) else candidates
-    with refused_as(UsageError, CalibError, "candidates: {}"):
-        q = read_poses(source, joints_of(chain))  # ty: ignore[invalid-argument-type]
-    numbers = np.flatnonzero(is_feasible(space, q))
-    if len(numbers) < m:
-        exceeding = int(((q < space.lower) | (q > space.upper)).any(axis=1).sum())
-        raise UsageError(
-            f"candidates: {len(numbers)} of {len(q)} keep the constraints, and {m} are to be chosen: {exceeding} "
-            "exceed the joint limits [rad or m]; give more candidates, or loosen the constraints"
-        )
-    return q, numbers
-
-
-def _draw_views(
-    view: CameraView, space: SearchSpace, limits: Limits, settings: SelectionSettings, m: int
-) -> np.ndarray:
-    """Return feasible postures (N, n) at which the camera sees the board, at least twice as many as shall be selected.
-
-    Args:
-        view: camera and board.
-        space: search space with all constraints.
-        limits: joint limits and constraints.
-        settings: settings of the selection.
-        m: number of poses to select.
-
-    Raises:
-        UsageError: if fewer postures are found.
-    """
-    count = min(settings.candidates, VIEWS)
-    feasible = partial(is_feasible, space)
-    candidates = view.draw(count, feasible, limits.lower, limits.upper, settings.seed)
-    if len(candidates) < 2 * m:
-        raise UsageError(
-            f"{len(candidates)} feasible postures see the board, but {2 * m} are needed to choose {m}: "
-            "check carried, stands, tilt and range in [camera]"
-        )
-    return candidates
 
 
 def _search_settings(settings: SelectionSettings) -> SearchSettings:
@@ -515,35 +410,6 @@ def _in_driving_order(selection: Selection, driven: Drivable) -> Selection:
         history=history,
         efficiency=selection.efficiency * float(np.exp(driven.gain)),
     )
-
-
-def _draw_feasible(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> np.ndarray:
-    """Return random feasible poses as candidates.
-
-    Args:
-        space: search space with all constraints.
-        limits: joint limits and constraints.
-        settings: settings of the selection.
-
-    Raises:
-        UsageError: if too few poses are feasible; the message lists the constraints.
-    """
-    feasible = partial(is_feasible, space)
-    try:
-        return draw_candidates(space.lower, space.upper, settings.candidates, feasible, seed=settings.seed)
-    except NothingFeasible as error:
-        stream = np.random.default_rng(settings.seed)
-        q = stream.uniform(limits.lower, limits.upper, (RANDOM_POSTURES, len(limits.lower)))
-        shares = []
-        for constraint in space.constraints:
-            satisfied = (np.asarray(constraint.function(q)) <= 0.0).all(1)
-            shares.append((constraint.name, satisfied.mean()))
-        shares.sort(key=itemgetter(1))
-        listed = ", ".join(f"{name} {100 * share:.2g} %" for name, share in shares)
-        hint = ""
-        if limits.sight is not None:
-            hint = " (does the target face the arm? check facing in [target])"
-        raise UsageError(f"{error}; share of random postures that keep each constraint: {listed}{hint}") from error
 
 
 def _outlook(
