@@ -104,10 +104,7 @@ def _information(identification: Identification) -> np.ndarray:
 
     fitted = identification.fitted
     base_count = identification.base.b
-    data, std, inflation = fitted.pooled, fitted.std, fitted.inflation
-    if fitted.alone:
-        # the rows do not give this estimate
-        data, std, inflation = fitted.testable()
+    data, std, inflation = fitted.testable()
     factors = [combine(data, std * np.sqrt(inflation))]
     richer_count = len(identification.names) - base_count
     if richer_count:
@@ -117,7 +114,7 @@ def _information(identification: Identification) -> np.ndarray:
         if identification.prior is not None:
             prior_rows = identification.prior.widened(richer_count)
         _, ridges = estimate(fitted.pooled, fitted.std, fitted.inflation, group, prior_rows)
-        if fitted.beforehand is not None:
+        if identification.settings.earlier is not None and fitted.beforehand is not None:
             ridges = 1.0 / np.linalg.norm(fitted.beforehand, axis=0)
         ridge_rows = np.zeros((richer_count, base_count + richer_count + 1))
         richer_ridges = np.maximum(ridges[base_count:], 1e-12)
