@@ -1,8 +1,9 @@
-"""Information of an identification's data on the standard parameters, without a prior: ‖R T χ - z‖².
+"""Information of an identification on the standard parameters: ‖R T χ - z‖².
 
 T regroups the p standard parameters χ of the model into the b parameters β that the motion identifies. R and z express
 the estimate β with its covariance Σ as rows, RᵀR = Σ⁻¹ and z = R β. If the estimate includes a prior or constraints, R
-and z are instead the R factor of the data alone (``information.csv``), so that prior knowledge is not used twice.
+and z are instead the R factor of the rows that were fitted (``information.csv``), those of the prior included. Prior
+knowledge is therefore used twice. Of the data alone, the consistent parameters of a real Panda did not converge.
 """
 
 from __future__ import annotations
@@ -95,10 +96,10 @@ def of(identification: Identification, chain: Chain) -> Information:
 
 
 def _information(identification: Identification) -> np.ndarray:
-    """Return the R factor [R z] (b + 1, b + 1) of an identification's data, without prior or constraints.
+    """Return the R factor [R z] (b + 1, b + 1) of an identification's rows, without constraints.
 
-    Rows are weighted according to their residuals' autocorrelation. The ridges of additional friction are included,
-    since these terms have no other prior.
+    Rows are weighted according to their residuals' autocorrelation. They include those of the prior, and the ridges of
+    additional friction once more.
     """
     from calib.identification.time_folds import estimate
 

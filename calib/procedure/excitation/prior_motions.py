@@ -66,7 +66,7 @@ class PriorMotions:
         information: (b, b) ∫ ωᵀω dt of the regressor ω (rows, b), restricted to the columns of the design, with the
             rows divided by `sigmas`.
         sigmas: (rows,) square root of the torque errors' spectral density that an identification states; None: 1.
-        data: (b, b) part of the information that is due to recordings, without priors; None: all of it.
+        data: (b, b) part of the information that is stored for the recordings; None: all of it.
         growth: how the errors of the torques grow with the motion; None if unknown.
         bands: how their density depends on the identification band; None if unknown.
     """
@@ -215,7 +215,7 @@ def _bands(folder: Path, model: ExcitedModel) -> ErrorBands | None:
 
 
 def _data_information(folder: Path, model: ExcitedModel) -> np.ndarray | None:
-    """Return the information (b, b) of an identification's recordings, without priors; None if it is not stored.
+    """Return the information (b, b) that an identification stores for its recordings; None if there is none.
 
     Columns that are not designed are marginalised; those of terms that are switched off are zero.
     """
